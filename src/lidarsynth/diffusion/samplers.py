@@ -1,0 +1,206 @@
+"""Samplers: one loop that yields its state, and steps that carry x_t from time t to an earlier time s.
+
+A step has the signature `step(denoiser, x_t, t, s, rng, previous) -> (x_s, x_0_hat)`: x (B, C, H, W), times t > s (B,),
+`previous` the state before this one (None at the start), of use to multistep methods only.
+
+| name | method | network calls | order |
+|---|---|---|---|
+| ddpm | ancestral sampling (Ho et al. 2020; R2DM eq. 4) | 1 | - |
+| ddim | DDIM (Song et al. 2021); Euler's step when the schedule is `flow` | 1 | 1 |
+| dpmpp-2m | DPM-Solver++(2M) (Lu et al. 2022) | 1 | 2 |
+| heun | Heun's method, exponential form (Hochbruck & Ostermann 2010) | 2 | 2 |
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lidarsynth.diffusion.denoiser import Denoiser
+from lidarsynth.diffusion.schedule import Schedule
+
+Rng = torch.Generator | Sequence[torch.Generator] | Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class State:
+    """What a sampler knows after a step; all images (B, C, H, W), times (B,). The last state's x_s is the sample."""
+
+    index: int  # number of the step, from 0
+    t: Tensor  # the time before the step
+    s: Tensor  # the time after it, s < t
+    x_t: Tensor  # the noisy images before the step
+    x_s: Tensor  # the images after it
+    x_0_hat: Tensor  # the clean images as estimated from x_t
+
+
+Step = Callable[[Denoiser, Tensor, Tensor, Tensor, Rng, State | None], tuple[Tensor, Tensor]]
+Grid = Callable[[Schedule, int], Tensor]
+
+
+def generators(seed: int, count: int, offset: int = 0) -> list[torch.Generator]:
+    """One CPU generator per sample: sample i of the whole run draws from seed + i, here i = offset .. offset + count - 1.
+
+    With seed 0 these are the generators of R2DM's evaluation (seed = sample index). Draws do not depend on the batch
+    size or the device.
+    """
+    return [torch.Generator().manual_seed(seed + offset + index) for index in range(count)]
+
+
+def noise_like(x: Tensor, rng: Rng) -> Tensor:
+    """Unit Gaussian noise of the shape, dtype and device of x (B, C, H, W).
+
+    rng: one generator for the batch; or B generators, each drawing (C, H, W) in turn, so that a sample does not depend
+    on its batch; or any function of x. Generators draw float32 on their own device. Raises ValueError when the number
+    of generators is not B.
+    """
+    if isinstance(rng, torch.Generator):
+        return torch.randn(x.shape, generator=rng, device=rng.device).to(x)
+    if callable(rng):
+        return rng(x)
+    if len(rng) != len(x):
+        raise ValueError(f"rng must be one generator or {len(x)}, one per sample, got {len(rng)}")
+    return torch.stack([torch.randn(x.shape[1:], generator=one, device=one.device) for one in rng]).to(x)
+
+
+def starting_noise(denoiser: Denoiser, x: Tensor, rng: Rng) -> Tensor:
+    """x_1 ~ N(0, sigma_1^2), like x (B, C, H, W): where sampling begins; sigma_1 is 1 but for the schedule `ve`."""
+    _, _, sigma = denoiser.schedule.at(torch.ones(len(x), device=x.device), x)
+    return sigma * noise_like(x, rng)
+
+
+def even_times(schedule: Schedule, steps: int) -> Tensor:
+    """steps + 1 times from 1 to 0, equally far apart (R2DM)."""
+    return torch.linspace(1, 0, steps + 1, dtype=torch.float64)
+
+
+def even_log_snr(schedule: Schedule, steps: int) -> Tensor:
+    """steps + 1 times from 1 to 0, equally far apart in log_snr (DPM-Solver, Lu et al. 2022)."""
+    first, last = schedule.log_snr(torch.tensor([1.0, 0.0], dtype=torch.float64)).tolist()
+    times = schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64))
+    times[0], times[-1] = 1, 0  # the inverse is exact to rounding only
+    return times
+
+
+@torch.no_grad()
+def sample(
+    denoiser: Denoiser,
+    x_1: Tensor,  # (B, C, H, W) noise, see starting_noise
+    step: Step,  # one of STEPS
+    steps: int,
+    rng: Rng,
+    grid: Grid = even_times,  # one of GRIDS
+) -> Iterator[State]:
+    """Carry x_1 to x_0 in `steps` steps and yield the state after each; `functools.partial` sets a step's options.
+
+    The result lies in about [-1, 1], and is not clamped: some steps leave noise of sigma_0 behind.
+
+    Example:
+        >>> rng = generators(seed=0, count=4)
+        >>> x_1 = starting_noise(denoiser, torch.zeros(4, 2, 64, 1024), rng)
+        >>> *_, last = sample(denoiser, x_1, ddpm, 256, rng)
+        >>> x_0 = last.x_s.clamp(-1, 1)
+    """
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, got {steps}")
+    times = times_for(grid(denoiser.schedule, steps), x_1)
+    x_t, state = x_1, None
+    for index in range(steps):
+        t, s = times[index], times[index + 1]
+        x_s, x_0_hat = step(denoiser, x_t, t, s, rng, state)
+        state = State(index, t, s, x_t, x_s, x_0_hat)
+        yield state
+        x_t = x_s
+
+
+def times_for(times: Tensor, x: Tensor) -> Tensor:
+    """Times (T,) repeated for the samples of x: (T, B) on its device, in float32, or float64 if x is float64."""
+    dtype = torch.promote_types(x.dtype, torch.float32)
+    return times.to(dtype).to(x.device)[:, None].repeat(1, len(x))
+
+
+def ddim(
+    denoiser: Denoiser,
+    x_t: Tensor,
+    t: Tensor,
+    s: Tensor,
+    rng: Rng,
+    previous: State | None = None,
+    eta: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """DDIM (Song et al. 2021, eq. 12): eta = 0 is deterministic, eta = 1 is ancestral sampling.
+
+    On the schedule alpha = 1 - t, sigma = t with eta = 0 it is Euler's step of rectified flow. Noise is drawn whatever
+    eta is, as in R2DM's program, so that one seed names one sequence of noise.
+    """
+    x_0_hat = denoiser(x_t, t)
+    log_snr_t, alpha_t, sigma_t = denoiser.schedule.at(t, x_t)
+    log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
+    eps_hat = (x_t - alpha_t * x_0_hat) / sigma_t
+    drawn = -(eta**2) * torch.expm1(log_snr_t - log_snr_s)  # shares of the variance sigma_s^2
+    kept = 1 - eta**2 + eta**2 * torch.exp(log_snr_t - log_snr_s)  # = 1 - drawn, without cancellation
+    x_s = alpha_s * x_0_hat + sigma_s * (drawn.sqrt() * noise_like(x_t, rng) + kept.sqrt() * eps_hat)
+    return x_s, x_0_hat
+
+
+def ddpm(
+    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
+) -> tuple[Tensor, Tensor]:
+    """Ancestral sampling (Ho et al. 2020; R2DM eq. 4): a draw from q(x_s | x_t, x_0 = x_0_hat), noise in the last step too.
+
+    Mean alpha_s (x_t (1 - c) / alpha_t + c x_0_hat) and variance sigma_s^2 c, where c = 1 - snr_t / snr_s: DDIM, eta = 1.
+    """
+    return ddim(denoiser, x_t, t, s, rng, eta=1.0)
+
+
+def dpmpp_2m(
+    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
+) -> tuple[Tensor, Tensor]:
+    """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2), on a line through this and the previous x_0_hat over log_snr.
+
+    The first step has no previous estimate, and the last must not extrapolate over its huge range of log_snr: both
+    are of first order, which leaves the method of second order.
+    """
+    x_0_hat = denoiser(x_t, t)
+    log_snr_t, _, sigma_t = denoiser.schedule.at(t, x_t)
+    log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
+    h = log_snr_s - log_snr_t
+    estimate = x_0_hat
+    if previous is not None:
+        h_previous = log_snr_t - denoiser.schedule.at(previous.t, x_t)[0]
+        weight = torch.where(s.view_as(h) > 0, h / (2 * h_previous), 0)
+        estimate = x_0_hat + weight * (x_0_hat - previous.x_0_hat)
+    return sigma_s / sigma_t * x_t - alpha_s * torch.expm1(-h / 2) * estimate, x_0_hat
+
+
+def heun(
+    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
+) -> tuple[Tensor, Tensor]:
+    """Heun's method in exponential form (Hochbruck & Ostermann 2010, section 2.3): predict with DDIM, then correct.
+
+    x_0_hat is taken as linear in lambda = log_snr / 2 between t and s, and the rest of the probability flow is solved
+    exactly. Heun's plain form (Karras et al. 2022, algorithm 1) multiplies errors by sigma_t alpha_s / (sigma_s alpha_t),
+    50 and more at the ends of the cosine schedule.
+    """
+    x_0_hat = denoiser(x_t, t)
+    log_snr_t, _, sigma_t = denoiser.schedule.at(t, x_t)
+    log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
+    h = (log_snr_s - log_snr_t) / 2
+    decay = -torch.expm1(-h)
+    predicted = sigma_s / sigma_t * x_t + alpha_s * decay * x_0_hat
+    change = denoiser(predicted, s) - x_0_hat
+    return predicted + alpha_s * (1 - decay / h) * change, x_0_hat
+
+
+STEPS: dict[str, Step] = {
+    "ddpm": ddpm,
+    "ddim": ddim,
+    "dpmpp-2m": dpmpp_2m,
+    "heun": heun,
+}
+
+GRIDS: dict[str, Grid] = {
+    "time": even_times,
+    "log-snr": even_log_snr,
+}

@@ -1,0 +1,82 @@
+"""Depth codecs: metres <-> `log`, `inverse` or `metric` in [0, 1], and RangeImage <-> x_0 in [-1, 1]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class DepthCodec:
+    """A pair of inverse functions of (tensor, sensor): metres -> [0, 1] and back, before masking and clamping."""
+
+    forward: Callable[[Tensor, Sensor], Tensor]
+    inverse: Callable[[Tensor, Sensor], Tensor]
+
+
+def _log_scale(sensor: Sensor) -> float:
+    return math.log2(sensor.max_range + 1)
+
+
+# R2DM table II, rows C (log), D (metric) and E (inverse).
+CODECS: dict[str, DepthCodec] = {
+    "log": DepthCodec(
+        lambda d, sensor: torch.log2(d + 1) / _log_scale(sensor),
+        lambda u, sensor: torch.exp2(u * _log_scale(sensor)) - 1,
+    ),
+    "inverse": DepthCodec(
+        lambda d, sensor: sensor.min_range / (d + 1e-8),
+        lambda u, sensor: sensor.min_range / (u + 1e-8),
+    ),
+    "metric": DepthCodec(
+        lambda d, sensor: d / sensor.max_range,
+        lambda u, sensor: u * sensor.max_range,
+    ),
+}
+
+
+def _codec(name: str) -> DepthCodec:
+    if name not in CODECS:
+        raise ValueError(f"expected a depth codec of {', '.join(CODECS)}, found {name!r}")
+    return CODECS[name]
+
+
+def valid(distance: Tensor, sensor: Sensor) -> Tensor:
+    """Bool, where metres lie strictly between the sensor's range limits."""
+    return (distance > sensor.min_range) & (distance < sensor.max_range)
+
+
+def encode(distance: Tensor, sensor: Sensor, codec: str = "log") -> Tensor:
+    """Metres -> [0, 1], any shape; 0 where the range is not strictly inside the sensor's limits."""
+    return _codec(codec).forward(distance, sensor).clamp(0, 1) * valid(distance, sensor)
+
+
+def decode(code: Tensor, sensor: Sensor, codec: str = "log") -> Tensor:
+    """[0, 1] -> metres, any shape; 0 where the result is not strictly inside the sensor's limits."""
+    distance = _codec(codec).inverse(code, sensor)
+    return torch.where(valid(distance, sensor), distance, 0.0)
+
+
+def to_x_0(image: RangeImage, codec: str = "log") -> Tensor:
+    """RangeImage -> x_0 (2, H, W) float32 in [-1, 1]: range code, reflectance; -1 in both where nothing returned."""
+    distance = torch.from_numpy(np.ascontiguousarray(image.range, np.float32))
+    reflectance = torch.from_numpy(np.ascontiguousarray(image.reflectance, np.float32))
+    return 2 * torch.stack([encode(distance, image.sensor, codec), reflectance]) - 1
+
+
+def from_x_0(x_0: Tensor, sensor: Sensor, codec: str = "log") -> RangeImage:
+    """x_0 (2, H, W), clamped to [-1, 1] -> RangeImage of the sensor; pixels outside its limits are empty."""
+    if x_0.ndim != 3 or x_0.shape[0] != 2:
+        raise ValueError(f"x_0 must be (2, H, W), got {tuple(x_0.shape)}")
+    unit = (x_0.detach().float().cpu().clamp(-1, 1) + 1) / 2
+    distance = decode(unit[0], sensor, codec)
+    mask = distance > 0
+    return RangeImage(distance.numpy(), (unit[1] * mask).numpy(), mask.numpy(), sensor)

@@ -1,0 +1,127 @@
+"""Scan -> RangeImage: `spherical` (row from the elevation) and `unfolding` (row from the point order or ring field)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+
+PROJECTIONS = ("auto", "spherical", "unfolding")
+
+
+def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int | None = None) -> RangeImage:
+    """Draw a scan into the sensor's image; the nearest point of a pixel wins (R2DM, section III-A).
+
+    method  `spherical`: row by elevation; `unfolding`: row by ring (Triess et al. 2020), from `scan.ring` or from the
+            point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, else spherical
+    width   columns of the image, if other than the sensor's
+
+    Points outside the range limits leave their pixel empty, also where they hide a farther point, as in the published
+    program. Raises ValueError for an unknown method, and for unfolding when the points do not come ring by ring.
+    """
+    sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
+    sensor = sensor if width is None else sensor.resized(width=width)
+    if method not in PROJECTIONS:
+        raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {method!r}")
+    depth = np.linalg.norm(scan.xyz, axis=1)
+    if not (depth > 0).all():
+        scan, depth = scan[depth > 0], depth[depth > 0]
+    row = _rows(scan, sensor, method)
+    pixel = row * sensor.width + _columns(scan.xyz, sensor.width)
+    inside = row >= 0
+    return _draw(scan, sensor, depth, np.where(inside, pixel, -1))
+
+
+def _rows(scan: Scan, sensor: Sensor, method: str) -> np.ndarray:
+    """(N,) int64 row of each point; -1 outside the field of view."""
+    if method == "spherical":
+        return _rows_by_elevation(scan.xyz, sensor)
+    ring, count = ring_of_points(scan)
+    if method == "auto" and count != sensor.height:
+        return _rows_by_elevation(scan.xyz, sensor)
+    if count < sensor.height // 2 or count > 2 * sensor.height:
+        raise ValueError(
+            f"unfolding expects about {sensor.height} rings, one after the other, found {count}; use --projection spherical"
+        )
+    # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
+    return np.maximum(ring + (sensor.height - count), 0)
+
+
+def ring_of_points(scan: Scan) -> tuple[np.ndarray, int]:
+    """(N,) int64 ring of each point counted from the top, and the number of rings.
+
+    From `scan.ring` if present; else from the order of the points: a ring starts where the azimuth passes from the
+    fourth quadrant (x >= 0, y < 0) to the first (x >= 0, y >= 0). Points before the first start join the first ring.
+    """
+    if scan.ring is not None:
+        ring = scan.ring.astype(np.int64)
+        return ring, int(ring.max(initial=-1)) + 1
+    x, y = scan.xyz[:, 0], scan.xyz[:, 1]
+    fourth, first = (x >= 0) & (y < 0), (x >= 0) & (y >= 0)
+    starts = np.roll(fourth, 1) & first
+    return np.maximum(np.cumsum(starts) - 1, 0), int(starts.sum())
+
+
+def _rows_by_elevation(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
+    if sensor.edges:
+        return _rows_of_even_grid(xyz, sensor)
+    flat = np.hypot(xyz[:, 0], xyz[:, 1])
+    slope = np.tan(np.radians(np.asarray(sensor.elevations)))
+    lift = np.asarray(sensor.offsets or [0.0] * sensor.height)
+    # A border lies midway between two beams; the outermost ones as far outside as the next lies inside.
+    slope, lift = _borders(slope).astype(np.float32), _borders(lift).astype(np.float32)
+    row = np.full(len(xyz), -1, np.int64)
+    for s, h in zip(slope, lift, strict=True):
+        row += xyz[:, 2] < s * flat + h
+    return np.where(row >= sensor.height, -1, row)
+
+
+def _borders(values: np.ndarray) -> np.ndarray:
+    """(H,) values at beams -> (H + 1,) values at the borders between them."""
+    if len(values) == 1:
+        return np.array([values[0] + 0.05, values[0] - 0.05])
+    middle = (values[1:] + values[:-1]) / 2
+    return np.concatenate([[2 * values[0] - middle[0]], middle, [2 * values[-1] - middle[-1]]])
+
+
+def _rows_of_even_grid(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """R2DM's grid: floor, and points out of view pile up on the border rows."""
+    height, top = sensor.height, np.radians(sensor.elevations[0])
+    view = np.radians(sensor.elevations[0] - sensor.elevations[1]) * height
+    elevation = np.arcsin(np.clip(xyz[:, 2] / np.linalg.norm(xyz, axis=1), -1, 1))
+    return np.clip(np.floor((1 - (elevation - (top - view)) / view) * height), 0, height - 1).astype(np.int64)
+
+
+def _columns(xyz: np.ndarray, width: int) -> np.ndarray:
+    azimuth = -np.arctan2(xyz[:, 1], xyz[:, 0])
+    turn = np.mod((azimuth / np.float32(np.pi) + 1) / 2, 1)
+    return np.clip(np.floor(turn * width), 0, width - 1).astype(np.int64)
+
+
+def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray) -> RangeImage:
+    """Nearest point per pixel, by the minimum of (depth bits, index) packed into one integer."""
+    shape = (sensor.height, sensor.width)
+    order = (depth.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(
+        len(depth), dtype=np.uint64
+    )
+    best = np.full(shape[0] * shape[1], np.iinfo(np.uint64).max, np.uint64)
+    np.minimum.at(best, pixel[pixel >= 0], order[pixel >= 0])
+    hit = np.flatnonzero(best != np.iinfo(np.uint64).max)
+    point = (best[hit] & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    valid = (depth[point] >= sensor.min_range) & (depth[point] <= sensor.max_range)
+    hit, point = hit[valid], point[valid]
+
+    def image(values: np.ndarray, dtype: type) -> np.ndarray:
+        canvas = np.zeros((shape[0] * shape[1], *values.shape[1:]), dtype)
+        canvas[hit] = values[point]
+        return canvas.reshape(*shape, *values.shape[1:])
+
+    return RangeImage(
+        range=image(depth, np.float32),
+        reflectance=image(scan.reflectance, np.float32),
+        mask=image(np.ones(len(depth), bool), np.bool_),
+        sensor=sensor,
+        label=None if scan.label is None else image(scan.label, np.int64),
+        xyz=image(scan.xyz, np.float32),
+    )

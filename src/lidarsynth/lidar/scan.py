@@ -1,0 +1,109 @@
+"""The two forms of one LiDAR turn: `Scan` (points in the sensor frame) and `RangeImage` (what the networks see)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from lidarsynth.lidar.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Scan:
+    """N points in the sensor frame: x forward, y left, z up.
+
+    xyz          (N, 3) float32, metres
+    reflectance  (N,)   float32 in [0, 1]
+    ring         (N,)   int, beam number counted from the top (row 0 is the highest beam), or None
+    time         (N,)   float, seconds relative to any fixed instant, or None
+    label        (N,)   int, SemanticKITTI training class 0-19, or None
+
+    Raises ValueError when a shape does not fit.
+    """
+
+    xyz: np.ndarray
+    reflectance: np.ndarray
+    ring: np.ndarray | None = None
+    time: np.ndarray | None = None
+    label: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
+            raise ValueError(f"xyz must be (N, 3), got {self.xyz.shape}")
+        for name in ("reflectance", "ring", "time", "label"):
+            value = getattr(self, name)
+            if value is not None and value.shape != (len(self.xyz),):
+                raise ValueError(f"{name} must be ({len(self.xyz)},) like xyz, got {value.shape}")
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def __getitem__(self, index: np.ndarray | slice) -> Scan:
+        """The scan of the chosen points: a boolean mask (N,), integer indices or a slice."""
+        return Scan(*[None if (v := getattr(self, f.name)) is None else v[index] for f in fields(self)])
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """One turn as an equirectangular image; row 0 is the highest beam, column 0 looks backwards (+180 degrees).
+
+    range        (H, W) float32, metres, 0 where nothing returned
+    reflectance  (H, W) float32 in [0, 1], 0 where nothing returned
+    mask         (H, W) bool, True where measured
+    sensor       gives every pixel's ray angles
+    label        (H, W) int, SemanticKITTI training class, 0 where nothing returned, or None
+    xyz          (H, W, 3) float32, metres: the measured points themselves where the image came from a scan, or None
+
+    Raises ValueError when a shape does not fit.
+    """
+
+    range: np.ndarray
+    reflectance: np.ndarray
+    mask: np.ndarray
+    sensor: Sensor
+    label: np.ndarray | None = None
+    xyz: np.ndarray | None = None
+
+    def __post_init__(self):
+        shape = (self.sensor.height, self.sensor.width)
+        for name in ("range", "reflectance", "mask", "label"):
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} must be {shape}, the sensor's beams and columns, got {value.shape}")
+        if self.xyz is not None and self.xyz.shape != (*shape, 3):
+            raise ValueError(f"xyz must be {(*shape, 3)}, got {self.xyz.shape}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.sensor.height, self.sensor.width
+
+    def points(self) -> np.ndarray:
+        """(H, W, 3) float32, metres: measured points where the image has them, else range along each pixel's ray."""
+        rays = self.sensor.points(self.range)
+        if self.xyz is None:
+            return rays
+        return np.where(np.any(self.xyz != 0, axis=-1, keepdims=True), self.xyz, rays)
+
+    def to_scan(self) -> Scan:
+        """The measured pixels as points, row by row from the top; `ring` is the row."""
+        rows = np.broadcast_to(np.arange(self.shape[0])[:, None], self.shape)
+        label = None if self.label is None else self.label[self.mask]
+        return Scan(self.points()[self.mask], self.reflectance[self.mask], ring=rows[self.mask], label=label)
+
+    def keep(self, known: np.ndarray) -> RangeImage:
+        """The same image with every pixel outside `known` (H, W) bool emptied."""
+        if known.shape != self.shape:
+            raise ValueError(f"known must be {self.shape}, got {known.shape}")
+        mask = self.mask & known
+        label = None if self.label is None else np.where(mask, self.label, 0)
+        xyz = None if self.xyz is None else np.where(mask[..., None], self.xyz, np.float32(0))
+        zero = np.float32(0)
+        return replace(
+            self,
+            range=np.where(mask, self.range, zero),
+            reflectance=np.where(mask, self.reflectance, zero),
+            mask=mask,
+            label=label,
+            xyz=xyz,
+        )

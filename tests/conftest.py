@@ -1,0 +1,36 @@
+"""What all tests share: the folder of facts, reference tensors and real scans, and one thread per process."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+REPO_ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("LIDARSYNTH_SHARED", REPO_ROOT.parent / "shared"))
+
+torch.set_num_threads(1)  # pytest-xdist runs one process per core
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The shared folder (facts/, fixtures/, scans/); skips the test where it is absent."""
+    if not (SHARED / "fixtures").is_dir():
+        pytest.skip(f"reference values are not here: {SHARED} (set LIDARSYNTH_SHARED)")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def fixture_tensors(shared: Path) -> Callable[[str], dict[str, Tensor]]:
+    """`fixture_tensors("r2dm/ops")` -> the tensors of shared/fixtures/r2dm/ops.safetensors by key; skips if absent."""
+
+    def load(name: str) -> dict[str, Tensor]:
+        path = shared / "fixtures" / f"{name}.safetensors"
+        if not path.is_file():
+            pytest.skip(f"reference values are not here: {path}")
+        return load_file(path)
+
+    return load
