@@ -26,7 +26,7 @@ def test_equals_the_reference(fixture_tensors, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize(("dtype", "atol"), [(torch.float32, 3e-6), (DOUBLE, 1e-9)])
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float32, 3e-6), (DOUBLE, 1e-10)])
 def test_t_inverts_log_snr(name, dtype, atol):
     schedule = SCHEDULES[name]()
     t = torch.linspace(0, 1, 257, dtype=dtype)
@@ -54,12 +54,13 @@ def test_cosine_is_a_quarter_circle_between_its_bounds():
     alpha, sigma = cosine(bound=60).alpha_sigma(cosine(bound=60).log_snr(t))
     assert_close(alpha, torch.cos(math.pi / 2 * t), atol=1e-12, rtol=0)  # R2DM's paper: alpha = cos(pi t / 2)
     assert_close(sigma, torch.sin(math.pi / 2 * t), atol=1e-12, rtol=0)
-    assert_close(cosine().log_snr(torch.tensor([0.0, 0.5, 1.0])), torch.tensor([15.0, 0.0, -15.0]), atol=1e-5, rtol=0)
+    assert_close(cosine().log_snr(torch.tensor([0.0, 0.5, 1.0])), torch.tensor([15.0, 0.0, -15.0]), atol=1e-4, rtol=0)
 
 
-def test_float32_cosine_is_precise_where_tan_is_steep():
-    t = 1 - torch.logspace(-7, -2, 50)
-    assert_close(cosine().log_snr(t), cosine().log_snr(t.double()).float(), atol=5e-6, rtol=0)
+def test_cosine_has_the_roundings_of_the_reference(fixture_tensors):
+    """Not required by the tolerance, but seeds of the released models name the same samples only with these digits."""
+    expected = fixture_tensors("diffusion/schedule")
+    assert_close(cosine().log_snr(expected["t"]), expected["cosine.log_snr"], atol=2e-6, rtol=2e-7)
 
 
 def test_shifts_follow_the_image_side():
@@ -84,8 +85,15 @@ def test_variance_exploding_is_geometric():
     alpha, sigma = schedule.alpha_sigma(schedule.log_snr(torch.tensor([0.0, 0.5, 1.0], dtype=DOUBLE)))
     assert_close(alpha, torch.ones(3, dtype=DOUBLE))
     assert_close(sigma, torch.tensor([0.01, math.sqrt(0.5), 50], dtype=DOUBLE))
-    with pytest.raises(ValueError, match="0 < min < max"):
-        ve(1, 0.5)
+    with pytest.raises(ValueError, match=r"0 < min < 1 <= max, got 0.01 and 0.5"):
+        ve(0.01, 0.5)
+
+
+def test_variance_is_sigma_squared():
+    for name in NAMES:
+        schedule = SCHEDULES[name]()
+        alpha, sigma = schedule.alpha_sigma(schedule.log_snr(torch.linspace(0, 1, 33, dtype=DOUBLE)))
+        assert_close(schedule.variance(alpha, sigma), sigma**2, rtol=1e-8, atol=0)
 
 
 def test_at_gives_one_value_per_sample_and_refuses_other_times():

@@ -1,6 +1,7 @@
-"""RePaint: completion with an unconditional denoiser (Lugmayr et al. 2022; R2DM section III-D, eq. 5)."""
+"""RePaint: completion with an unconditional denoiser (Lugmayr et al. 2022; R2DM eq. 5)."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -41,14 +42,13 @@ def repaint(
     times = times_for(grid(denoiser.schedule, steps), x_1)
     mask = mask.bool()
     x, index = x_1, 0
-    for start, end in zip(times[:-1], times[1:], strict=True):
-        passes = resamples if bool((end > 0).any()) else 1
+    for interval, (start, end) in enumerate(pairwise(times)):
         marks = [torch.lerp(start, end, part / jump) for part in range(jump + 1)]
-        for turn in range(passes):
+        for turn in range(resamples if interval < steps - 1 else 1):
             if turn > 0:
-                for s, t in zip(marks[:0:-1], marks[-2::-1], strict=True):
+                for s, t in pairwise(reversed(marks)):
                     x = renoise(denoiser.schedule, x, s, t, noise_like(x, rng))
-            for t, s in zip(marks[:-1], marks[1:], strict=True):
+            for t, s in pairwise(marks):
                 state = joined_step(denoiser, x, known, mask, t, s, rng, step, index)
                 yield state
                 x, index = state.x_s, index + 1

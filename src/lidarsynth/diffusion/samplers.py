@@ -5,7 +5,7 @@ A step has the signature `step(denoiser, x_t, t, s, rng, previous) -> (x_s, x_0_
 
 | name | method | network calls | order |
 |---|---|---|---|
-| ddpm | ancestral sampling (Ho et al. 2020; R2DM eq. 4) | 1 | - |
+| ddpm | ancestral sampling (Ho et al. 2020; R2DM) | 1 | - |
 | ddim | DDIM (Song et al. 2021); Euler's step when the schedule is `flow` | 1 | 1 |
 | dpmpp-2m | DPM-Solver++(2M) (Lu et al. 2022) | 1 | 2 |
 | heun | Heun's method, exponential form (Hochbruck & Ostermann 2010) | 2 | 2 |
@@ -40,7 +40,7 @@ Grid = Callable[[Schedule, int], Tensor]
 
 
 def generators(seed: int, count: int, offset: int = 0) -> list[torch.Generator]:
-    """One CPU generator per sample: sample i of the whole run draws from seed + i, here i = offset .. offset + count - 1.
+    """One CPU generator per sample: sample i of a run draws from seed + i, here for i = offset .. offset + count - 1.
 
     With seed 0 these are the generators of R2DM's evaluation (seed = sample index). Draws do not depend on the batch
     size or the device.
@@ -65,9 +65,12 @@ def noise_like(x: Tensor, rng: Rng) -> Tensor:
 
 
 def starting_noise(denoiser: Denoiser, x: Tensor, rng: Rng) -> Tensor:
-    """x_1 ~ N(0, sigma_1^2), like x (B, C, H, W): where sampling begins; sigma_1 is 1 but for the schedule `ve`."""
+    """x_1, where sampling begins, like x (B, C, H, W): unit Gaussian noise, times sigma_1 for the schedule `ve`.
+
+    Elsewhere sigma_1 is 1 to three digits or more, and is taken as 1 as in R2DM's program.
+    """
     _, _, sigma = denoiser.schedule.at(torch.ones(len(x), device=x.device), x)
-    return sigma * noise_like(x, rng)
+    return sigma.clamp(min=1) * noise_like(x, rng)
 
 
 def even_times(schedule: Schedule, steps: int) -> Tensor:
@@ -115,9 +118,29 @@ def sample(
 
 
 def times_for(times: Tensor, x: Tensor) -> Tensor:
-    """Times (T,) repeated for the samples of x: (T, B) on its device, in float32, or float64 if x is float64."""
-    dtype = torch.promote_types(x.dtype, torch.float32)
-    return times.to(dtype).to(x.device)[:, None].repeat(1, len(x))
+    """Times (T,) repeated for the samples of x: (T, B) on its device, in float32, or float64 if x is float64.
+
+    Raises ValueError unless each time is below the one before, which very many steps can break in float32.
+    """
+    times = times.to(torch.promote_types(x.dtype, torch.float32))
+    if not bool((times.diff() < 0).all()):
+        raise ValueError(f"times must fall at every step, got equal or rising ones among {len(times)} in {times.dtype}")
+    return times.to(x.device)[:, None].repeat(1, len(x))
+
+
+def ddpm(
+    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
+) -> tuple[Tensor, Tensor]:
+    """Ancestral sampling: a draw from q(x_s | x_t, x_0 = x_0_hat) (Ho et al. 2020; R2DM).
+
+    It is DDIM with eta = 1 in other words, and other roundings: these are R2DM's. Noise comes with the last step too.
+    """
+    x_0_hat = denoiser(x_t, t)
+    log_snr_t, alpha_t, _ = denoiser.schedule.at(t, x_t)
+    log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
+    c = -torch.expm1(log_snr_t - log_snr_s)  # 1 - snr_t / snr_s
+    mean = alpha_s * (x_t * (1 - c) / alpha_t + c * x_0_hat)
+    return mean + sigma_s * c.sqrt() * noise_like(x_t, rng), x_0_hat
 
 
 def ddim(
@@ -127,31 +150,19 @@ def ddim(
     s: Tensor,
     rng: Rng,
     previous: State | None = None,
-    eta: float = 0.0,
+    eta: float = 0.0,  # share of fresh noise: 0 = deterministic, 1 = ancestral sampling
 ) -> tuple[Tensor, Tensor]:
-    """DDIM (Song et al. 2021, eq. 12): eta = 0 is deterministic, eta = 1 is ancestral sampling.
+    """DDIM (Song et al. 2021, eq. 12); on the schedule `flow` with eta = 0, Euler's step of rectified flow.
 
-    On the schedule alpha = 1 - t, sigma = t with eta = 0 it is Euler's step of rectified flow. Noise is drawn whatever
-    eta is, as in R2DM's program, so that one seed names one sequence of noise.
+    Noise is drawn whatever eta is, as in R2DM's program, so that one seed names one sequence of noise.
     """
     x_0_hat = denoiser(x_t, t)
     log_snr_t, alpha_t, sigma_t = denoiser.schedule.at(t, x_t)
     log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
     eps_hat = (x_t - alpha_t * x_0_hat) / sigma_t
-    drawn = -(eta**2) * torch.expm1(log_snr_t - log_snr_s)  # shares of the variance sigma_s^2
-    kept = 1 - eta**2 + eta**2 * torch.exp(log_snr_t - log_snr_s)  # = 1 - drawn, without cancellation
-    x_s = alpha_s * x_0_hat + sigma_s * (drawn.sqrt() * noise_like(x_t, rng) + kept.sqrt() * eps_hat)
-    return x_s, x_0_hat
-
-
-def ddpm(
-    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
-) -> tuple[Tensor, Tensor]:
-    """Ancestral sampling (Ho et al. 2020; R2DM eq. 4): a draw from q(x_s | x_t, x_0 = x_0_hat), noise in the last step too.
-
-    Mean alpha_s (x_t (1 - c) / alpha_t + c x_0_hat) and variance sigma_s^2 c, where c = 1 - snr_t / snr_s: DDIM, eta = 1.
-    """
-    return ddim(denoiser, x_t, t, s, rng, eta=1.0)
+    fresh = eta * sigma_s * torch.sqrt(-torch.expm1(log_snr_t - log_snr_s))
+    kept = (denoiser.schedule.variance(alpha_s, sigma_s) - fresh**2).clamp(min=0).sqrt()  # below 0 by rounding only
+    return alpha_s * x_0_hat + fresh * noise_like(x_t, rng) + kept * eps_hat, x_0_hat
 
 
 def dpmpp_2m(
@@ -177,11 +188,11 @@ def dpmpp_2m(
 def heun(
     denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Heun's method in exponential form (Hochbruck & Ostermann 2010, section 2.3): predict with DDIM, then correct.
+    """Heun's method in exponential form (Hochbruck & Ostermann 2010): predict with DDIM, then correct.
 
     x_0_hat is taken as linear in lambda = log_snr / 2 between t and s, and the rest of the probability flow is solved
-    exactly. Heun's plain form (Karras et al. 2022, algorithm 1) multiplies errors by sigma_t alpha_s / (sigma_s alpha_t),
-    50 and more at the ends of the cosine schedule.
+    exactly. Heun's plain form (Karras et al. 2022, algorithm 1) multiplies errors by e^h, 50 and more at the ends of
+    the cosine schedule.
     """
     x_0_hat = denoiser(x_t, t)
     log_snr_t, _, sigma_t = denoiser.schedule.at(t, x_t)

@@ -35,9 +35,16 @@ class Schedule:
         log_snr = self.log_snr(t).view(-1, *[1] * (x.ndim - 1))
         return log_snr, *self.alpha_sigma(log_snr)
 
+    def variance(self, alpha: Tensor, sigma: Tensor) -> Tensor:
+        """sigma^2, for variance-preserving schedules as 1 - alpha^2.
+
+        In float32 the two differ by a fifth at t = 0, where sigma^2 = 3e-7; R2DM's program has the second in DDIM.
+        """
+        return 1 - alpha**2 if self.alpha_sigma is variance_preserving else sigma**2
+
 
 def variance_preserving(log_snr: Tensor) -> tuple[Tensor, Tensor]:
-    """alpha and sigma with alpha^2 + sigma^2 = 1 (R2DM eq. 1; Kingma et al. 2021)."""
+    """alpha and sigma with alpha^2 + sigma^2 = 1 (R2DM; Kingma et al. 2021)."""
     return log_snr.sigmoid().sqrt(), (-log_snr).sigmoid().sqrt()
 
 
@@ -57,7 +64,7 @@ def cosine(bound: float = 15.0) -> Schedule:
 
 
 def cosine_shifted(resolution: float = 256, reference: float = 64, bound: float = 15.0) -> Schedule:
-    """Cosine schedule, noisier by the ratio of image sides (simple diffusion, Hoogeboom et al. 2023, eq. 7).
+    """Cosine schedule, noisier by the ratio of image sides (simple diffusion, Hoogeboom et al. 2023).
 
     resolution: side of the image in pixels, sqrt(H W) for a range image (256 for 64 x 1024).
     reference: side of the images for which the plain cosine schedule is meant.
@@ -71,7 +78,7 @@ def cosine_shifted(resolution: float = 256, reference: float = 64, bound: float 
 
 
 def cosine_interpolated(resolution: float = 256, low: float = 32, high: float = 256, bound: float = 15.0) -> Schedule:
-    """Between two shifts: that of `low` at t = 1, that of `high` at t = 0 (Hoogeboom et al. 2023, eq. 8).
+    """Between two shifts: that of `low` at t = 1, that of `high` at t = 0 (Hoogeboom et al. 2023).
 
     resolution, low, high: image sides in pixels. Its inverse has no closed form and is found by bisection.
     """
@@ -108,8 +115,8 @@ def flow(bound: float = 30.0) -> Schedule:
 
 def ve(sigma_min: float = 0.01, sigma_max: float = 50.0) -> Schedule:
     """Variance exploding: alpha = 1, sigma geometric between the two (NCSN; the defaults are LiDARGen's)."""
-    if not 0 < sigma_min < sigma_max:
-        raise ValueError(f"sigma_min and sigma_max must satisfy 0 < min < max, got {sigma_min} and {sigma_max}")
+    if not 0 < sigma_min < 1 <= sigma_max:  # the noise has to cover data in [-1, 1]
+        raise ValueError(f"sigma_min and sigma_max must satisfy 0 < min < 1 <= max, got {sigma_min} and {sigma_max}")
     start, ratio = math.log(sigma_min), math.log(sigma_max / sigma_min)
     return Schedule(
         lambda t: -2 * (start + t * ratio),
@@ -123,7 +130,7 @@ def renoise(schedule: Schedule, x_s: Tensor, s: Tensor, t: Tensor, eps: Tensor) 
 
     x_t = alpha_ts x_s + sigma_ts eps, alpha_ts = alpha_t / alpha_s, sigma_ts^2 = sigma_t^2 - alpha_ts^2 sigma_s^2.
     R2DM's paper prints sigma_ts^2 = sigma_t - alpha_ts sigma_s; only with the squares do two jumps make one longer jump
-    (Kingma et al. 2021, section 3.1), and R2DM's program has them.
+    (Kingma et al. 2021), and R2DM's program has them.
     """
     log_snr_s, alpha_s, _ = schedule.at(s, x_s)
     log_snr_t, alpha_t, sigma_t = schedule.at(t, x_s)
@@ -132,14 +139,13 @@ def renoise(schedule: Schedule, x_s: Tensor, s: Tensor, t: Tensor, eps: Tensor) 
 
 
 def cosine_log_snr(t: Tensor, bound: float) -> Tensor:
-    """-2 log tan(a + t (b - a)) with a, b such that the ends are +-bound.
+    """-2 log tan(a + t (b - a)) with a, b such that the ends are +-bound (R2DM's program).
 
-    Written with two sines, because cos(a + t (b - a)) = sin(a + (1 - t) (b - a)): tan is steep near t = 1, where
-    float32 would lose four digits.
+    tan is steep at t = 1: float32 loses up to 1e-4 of log_snr there. It is kept so on purpose, because 1 / alpha = 1800
+    carries each digit of it into x_0_hat, and only the same arithmetic gives the samples of the released program.
     """
-    start = math.atan(math.exp(-bound / 2))
-    width = math.pi / 2 - 2 * start
-    return 2 * torch.log(torch.sin(start + (1 - t) * width) / torch.sin(start + t * width))
+    start, end = math.atan(math.exp(-bound / 2)), math.atan(math.exp(bound / 2))
+    return -2 * torch.log(torch.tan(start + t * (end - start)))
 
 
 def cosine_t(log_snr: Tensor, bound: float) -> Tensor:

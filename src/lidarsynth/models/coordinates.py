@@ -1,6 +1,7 @@
 """Encodings of the ray angles that tell the network where a pixel looks (R2DM section III-B, table II)."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -31,6 +32,15 @@ def patch_angles(coords: Tensor, stem: tuple[int, int]) -> Tensor:
     return (first + offset.mean((3, 5), keepdim=True))[:, :, :, 0, :, 0]
 
 
+class NoEncoding(nn.Module):
+    """Nothing, (1,2,H,W) -> (1,0,H,W): R2DM configuration F, which does not know where a pixel looks."""
+
+    channels = 0
+
+    def forward(self, coords: Tensor) -> Tensor:
+        return coords[:, :0]
+
+
 class PolarCoordinates(nn.Module):
     """The two angles themselves, (1,2,H,W) -> (1,2,H,W): R2DM configurations A-E."""
 
@@ -58,7 +68,9 @@ class FourierFeatures(nn.Module):
         self.channels = 2 * len(freqs)
 
     def forward(self, coords: Tensor) -> Tensor:
-        arguments = nn.functional.conv2d(coords, self.freqs, self.phase)
+        elevation, azimuth = self.freqs.unbind(1)
+        # elementwise, not as a 1x1 convolution: autocast would round angles of hundreds of turns to half precision
+        arguments = elevation * coords[:, :1] + azimuth * coords[:, 1:] + self.phase[:, None, None]
         return torch.cat([arguments.sin(), arguments.cos()], dim=1)
 
 
@@ -123,16 +135,18 @@ def _degree_4(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     ]
 
 
-ENCODINGS = {
+Encoding = NoEncoding | PolarCoordinates | FourierFeatures | SphericalHarmonics
+
+ENCODINGS: dict[str | None, Callable[[tuple[int, int]], Encoding]] = {
     "fourier_features": FourierFeatures,
     "spherical_harmonics": lambda resolution: SphericalHarmonics(),
     "polar_coordinates": lambda resolution: PolarCoordinates(),
-    None: lambda resolution: None,
+    None: lambda resolution: NoEncoding(),
 }
 
 
-def coordinate_encoding(name: str | None, resolution: tuple[int, int]) -> nn.Module | None:
-    """The encoding called `name` for an (H, W) grid, None for none; its `channels` is what it gives.
+def coordinate_encoding(name: str | None, resolution: tuple[int, int]) -> Encoding:
+    """The encoding called `name` for an (H, W) grid (None is a name too); its `channels` is what it gives.
 
     Raises ValueError for a name that is not in `ENCODINGS`.
     """

@@ -1,6 +1,7 @@
 """R2DM's network: an efficient U-Net on the equirectangular image (R2DM section III-B, figure 3)."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from einops import rearrange
@@ -10,10 +11,10 @@ from lidarsynth.models.coordinates import coordinate_encoding, default_angles, p
 from lidarsynth.models.layers import (
     Conv3x3,
     Downsample,
-    LogSNREmbedding,
     ResidualBlock,
     SelfAttentionBlock,
     Upsample,
+    time_embedding,
     zero_init,
 )
 
@@ -58,8 +59,8 @@ class Level(nn.Module):
 class EfficientUNet(nn.Module):
     """R2DM's U-Net; parameter names are those of the official checkpoints without their `model.` prefix.
 
-    `forward(x_t (B,C,H,W), log_snr (B,) or 0-d) -> (B,out,H,W)`, the raw prediction. The buffer `coords` (1,2,H,W) holds
-    the ray angles in radians, elevation first; assign to it, or load a checkpoint, to change the sensor.
+    `forward(x_t (B,C,H,W), log_snr (B,) or 0-d) -> (B,out,H,W)`, the raw prediction. The buffer `coords` (1,2,H,W)
+    holds the ray angles in radians, elevation first; assign to it, or load a checkpoint, to change the sensor.
     With `stem=(sh, sw)`, patches of sh x sw pixels become channels and the network runs at (H/sh, W/sw); (1, 1) is the
     official network, 31,099,650 parameters with the defaults. On a ring, rolling `x_t` and `coords` by a multiple of
     8*sw columns rolls the output.
@@ -87,35 +88,26 @@ class EfficientUNet(nn.Module):
         dropout: float = 0.0,
     ):
         super().__init__()
-        channels = [base_channels, *(base_channels * multiplier for multiplier in channel_multipliers)]
-        _check_structure(resolution, stem, channels, num_residual_blocks, gn_num_groups)
-        self.in_channels, self.out_channels = in_channels, out_channels
-        self.resolution, self.stem = tuple(resolution), tuple(stem)
-        embedding = temb_channels or 4 * base_channels
-        patch = stem[0] * stem[1]
-        reduced = (resolution[0] // stem[0], resolution[1] // stem[1])
+        reduced = _reduced_resolution(resolution, stem)
+        c0, c1, c2, c3, c4 = _level_widths(base_channels, channel_multipliers, gn_num_groups)
+        n1, n2, n3, n4 = _four("num_residual_blocks", num_residual_blocks)
+        embedding, patch = temb_channels or 4 * base_channels, stem[0] * stem[1]
+        level = partial(Level, embedding=embedding, groups=gn_num_groups, eps=gn_eps, dropout=dropout, ring=ring)
 
+        self.in_channels, self.out_channels = in_channels, out_channels
+        self.resolution, self.stem = (resolution[0], resolution[1]), (stem[0], stem[1])
         self.register_buffer("coords", default_angles(resolution))
         self.coords_encoding = coordinate_encoding(coords_encoding, reduced)
-        self.time_embedding = nn.Sequential(
-            LogSNREmbedding(base_channels),
-            nn.Linear(base_channels, embedding),
-            nn.SiLU(),
-            nn.Linear(embedding, embedding),
-        )
-        bias_channels = 0 if self.coords_encoding is None else self.coords_encoding.channels
-        self.in_conv = Conv3x3(in_channels * patch + bias_channels, base_channels, ring)
-        c0, c1, c2, c3, c4 = channels
-        n1, n2, n3, n4 = num_residual_blocks
-        shared = (embedding, gn_num_groups, gn_eps, dropout, ring)
-        self.d_block1 = Level(c0, c1, n1, *shared)
-        self.d_block2 = Level(c1, c2, n2, *shared, down=True)
-        self.d_block3 = Level(c2, c3, n3, *shared, down=True)
-        self.d_block4 = Level(c3, c4, n4, *shared, down=True, heads=attn_num_heads)
-        self.u_block4 = Level(c4, c3, n4, *shared, up=True, heads=attn_num_heads)
-        self.u_block3 = Level(2 * c3, c2, n3, *shared, up=True)
-        self.u_block2 = Level(2 * c2, c1, n2, *shared, up=True)
-        self.u_block1 = Level(2 * c1, c0, n1, *shared)
+        self.time_embedding = time_embedding(base_channels, embedding)
+        self.in_conv = Conv3x3(in_channels * patch + self.coords_encoding.channels, c0, ring)
+        self.d_block1 = level(c0, c1, n1)
+        self.d_block2 = level(c1, c2, n2, down=True)
+        self.d_block3 = level(c2, c3, n3, down=True)
+        self.d_block4 = level(c3, c4, n4, down=True, heads=attn_num_heads)
+        self.u_block4 = level(c4, c3, n4, up=True, heads=attn_num_heads)
+        self.u_block3 = level(2 * c3, c2, n3, up=True)
+        self.u_block2 = level(2 * c2, c1, n2, up=True)
+        self.u_block1 = level(2 * c1, c0, n1)
         self.out_conv = zero_init(Conv3x3(c0, out_channels * patch, ring))
 
     def forward(self, x_t: Tensor, log_snr: Tensor) -> Tensor:
@@ -135,8 +127,6 @@ class EfficientUNet(nn.Module):
         return rearrange(self.out_conv(h), "b (c sh sw) h w -> b c (h sh) (w sw)", sh=sh, sw=sw)
 
     def _with_coords(self, x: Tensor) -> Tensor:
-        if self.coords_encoding is None:
-            return x
         encoding = self.coords_encoding(patch_angles(self.coords, self.stem))
         return torch.cat([x, encoding.to(x.dtype).expand(len(x), -1, -1, -1)], dim=1)
 
@@ -148,21 +138,21 @@ class EfficientUNet(nn.Module):
             raise ValueError(f"log_snr must be () or ({len(x_t)},), got {tuple(log_snr.shape)}")
 
 
-def _check_structure(
-    resolution: tuple[int, int],
-    stem: tuple[int, int],
-    channels: Sequence[int],
-    num_residual_blocks: Sequence[int],
-    groups: int,
-) -> None:
+def _reduced_resolution(resolution: tuple[int, int], stem: tuple[int, int]) -> tuple[int, int]:
     for name, size, step in zip(("height", "width"), resolution, stem, strict=True):
         if step < 1 or size < 1 or size % (8 * step):
             raise ValueError(f"{name} must be divisible by {8 * step} (8 x stem {step}), got {size}")
-    if len(channels) != 5 or len(num_residual_blocks) != 4:
-        raise ValueError(
-            "channel_multipliers and num_residual_blocks must have 4 entries each, "
-            f"got {len(channels) - 1} and {len(num_residual_blocks)}"
-        )
-    for width in channels:
-        if width % groups:
-            raise ValueError(f"gn_num_groups must divide all level widths {list(channels)}, got {groups}")
+    return resolution[0] // stem[0], resolution[1] // stem[1]
+
+
+def _level_widths(base_channels: int, multipliers: Sequence[int], groups: int) -> list[int]:
+    widths = [base_channels, *(base_channels * factor for factor in _four("channel_multipliers", multipliers))]
+    if any(width % groups for width in widths):
+        raise ValueError(f"gn_num_groups must divide all level widths {widths}, got {groups}")
+    return widths
+
+
+def _four(name: str, values: Sequence[int]) -> Sequence[int]:
+    if len(values) != 4 or min(values) < 1:
+        raise ValueError(f"{name} must be 4 positive integers, got {values}")
+    return values

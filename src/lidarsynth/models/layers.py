@@ -1,17 +1,22 @@
 """Layers for equirectangular images: the width is a ring, the height has ends (R2DM section III-B)."""
 
 import math
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 
-def pad_width(x: Tensor, amount: int, ring: bool = True) -> Tensor:
-    """Adds `amount` columns on both sides of (B,C,H,W): those of the other side on a ring, else zeros."""
+def pad_width(x: Tensor, ring: bool = True) -> Tensor:
+    """Adds a column on either side of (B,C,H,W): the one of the other side on a ring, else zeros."""
     if not ring:
-        return F.pad(x, (amount, amount))
-    return torch.cat([x[..., -amount:], x, x[..., :amount]], dim=-1)
+        return F.pad(x, (1, 1))
+    if x.shape[-1] == 1:
+        return x.expand(-1, -1, -1, 3)
+    # split once, because the gradient of overlapping slices costs four passes over the image
+    first, middle, last = x.split([1, x.shape[-1] - 2, 1], dim=-1)
+    return torch.cat([last, first, middle, last, first], dim=-1)
 
 
 class Conv3x3(nn.Conv2d):
@@ -22,7 +27,7 @@ class Conv3x3(nn.Conv2d):
         self.ring = ring
 
     def forward(self, x: Tensor) -> Tensor:
-        return super().forward(pad_width(x, 1, self.ring))
+        return super().forward(pad_width(x, self.ring))
 
 
 class Downsample(nn.Module):
@@ -38,7 +43,7 @@ class Downsample(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         channels = x.shape[1]
         across, along = (self.kernel.expand(channels, 1, -1).unsqueeze(dim) for dim in (2, 3))
-        x = F.conv2d(pad_width(x, 1, self.ring), across, stride=(1, 2), groups=channels)
+        x = F.conv2d(pad_width(x, self.ring), across, stride=(1, 2), groups=channels)
         return F.conv2d(x, along, stride=(2, 1), padding=(1, 0), groups=channels)
 
 
@@ -53,17 +58,9 @@ class Upsample(nn.Module):
         self.register_buffer("kernel", torch.tensor([1.0, 3.0, 3.0, 1.0]) / 4)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = self._double(pad_width(x, 1, self.ring), dim=3)
-        return self._double(F.pad(x, (0, 0, 1, 1)), dim=2)
-
-    def _double(self, x: Tensor, dim: int) -> Tensor:
-        """Zero insertion and filter in polyphase form: n + 2 samples -> 2n, even ones see the neighbour before."""
-        first, second, third, fourth = self.kernel
-        size = x.shape[dim] - 2
-        before, here, after = (x.narrow(dim, start, size) for start in range(3))
-        even = first * before + third * here
-        odd = second * here + fourth * after
-        return torch.stack([even, odd], dim=dim + 1).flatten(dim, dim + 1)
+        channels = x.shape[1]
+        taps = torch.outer(self.kernel, self.kernel).flip(0, 1).expand(channels, 1, -1, -1)
+        return F.conv_transpose2d(pad_width(x, self.ring), taps, stride=2, padding=(1, 3), groups=channels)
 
 
 class LogSNREmbedding(nn.Module):
@@ -80,6 +77,11 @@ class LogSNREmbedding(nn.Module):
         freqs = torch.exp(torch.arange(n, device=log_snr.device) * (-math.log(10_000) / (n - 1)))
         arguments = log_snr.float()[:, None] * freqs
         return torch.cat([arguments.sin(), arguments.cos()], dim=1)
+
+
+def time_embedding(channels: int, width: int) -> nn.Sequential:
+    """Embedding (B,) -> (B, width) of the log-SNR; the activation that follows is part of `AdaGroupNorm`."""
+    return nn.Sequential(LogSNREmbedding(channels), nn.Linear(channels, width), nn.SiLU(), nn.Linear(width, width))
 
 
 class AdaGroupNorm(nn.Module):
@@ -159,7 +161,10 @@ class SelfAttentionBlock(nn.Module):
         return (x + h.transpose(1, 2).reshape(x.shape)) * self.scale
 
 
-def zero_init(layer: nn.Module) -> nn.Module:
+Layer = TypeVar("Layer", bound=nn.Module)
+
+
+def zero_init(layer: Layer) -> Layer:
     """Sets all parameters of `layer` to zero, so that its branch is silent at the start of training; returns it."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)

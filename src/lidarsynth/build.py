@@ -1,0 +1,130 @@
+"""Experiment -> objects: the only place that assembles a model; and our folder format, save and load."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from lidarsynth.diffusion.denoiser import Denoiser
+from lidarsynth.diffusion.schedule import SCHEDULES
+from lidarsynth.experiment import Experiment, Model, from_dict
+from lidarsynth.lidar import sensor as sensors
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.models.conditional import ConditionalUNet
+from lidarsynth.models.efficient_unet import EfficientUNet
+
+WEIGHTS, RECORD = "model.safetensors", "experiment.json"
+
+
+def build_sensor(experiment: Experiment) -> Sensor:
+    """The sensor of the experiment's images: its beams thinned to `data.height`, `data.width` columns."""
+    given = experiment.data.sensor
+    sensor = sensors.from_dict(given) if isinstance(given, dict) else sensors.get_sensor(given)
+    return sensor.resized(experiment.data.height, experiment.data.width)
+
+
+def build_network(experiment: Experiment) -> nn.Module:
+    """The experiment's network with fresh weights and the sensor's ray angles, in evaluation mode."""
+    sensor, model = build_sensor(experiment), experiment.model
+    if model.network not in NETWORKS:
+        raise ValueError(f"model.network: expected one of {', '.join(NETWORKS)}, found {model.network!r}")
+    network = NETWORKS[model.network](model, (sensor.height, sensor.width))
+    unet = network.unet if isinstance(network, ConditionalUNet) else network
+    assert isinstance(unet, EfficientUNet)
+    unet.coords.copy_(torch.from_numpy(sensor.ray_angles())[None])
+    return network.eval()
+
+
+def _unet(model: Model, resolution: tuple[int, int], in_channels: int = 2) -> EfficientUNet:
+    return EfficientUNet(
+        in_channels=in_channels,
+        resolution=resolution,
+        base_channels=model.base_channels,
+        temb_channels=model.temb_channels,
+        channel_multipliers=model.channel_multipliers,
+        num_residual_blocks=model.num_residual_blocks,
+        gn_num_groups=model.gn_num_groups,
+        gn_eps=model.gn_eps,
+        attn_num_heads=model.attn_num_heads,
+        coords_encoding=model.coords_encoding,
+        ring=model.ring,
+        stem=model.stem,
+        dropout=model.dropout,
+    )
+
+
+NETWORKS = {
+    "efficient-unet": _unet,
+    "conditional-unet": lambda model, resolution: ConditionalUNet(_unet(model, resolution, in_channels=8)),
+}
+
+
+def build_denoiser(experiment: Experiment, network: nn.Module) -> Denoiser:
+    """The network with the experiment's schedule and kind."""
+    diffusion = experiment.diffusion
+    if diffusion.schedule not in SCHEDULES:
+        raise ValueError(f"diffusion.schedule: expected one of {', '.join(SCHEDULES)}, found {diffusion.schedule!r}")
+    return Denoiser(network, SCHEDULES[diffusion.schedule](), diffusion.kind, diffusion.clip)
+
+
+def load_weights(network: nn.Module, weights: dict[str, Tensor], source: str) -> None:
+    """Copy weights into the network. Raises ValueError that names what is missing, unknown or of another shape."""
+    own = network.state_dict()
+    missing, unknown = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
+    if missing or unknown:
+        raise ValueError(
+            f"{source}: expected the {len(own)} tensors of the experiment's network, found {len(missing)} missing "
+            f"{missing[:2]} and {len(unknown)} unknown {unknown[:2]}"
+        )
+    for name, tensor in own.items():
+        if weights[name].shape != tensor.shape:
+            raise ValueError(f"{source}: expected {name} {tuple(tensor.shape)}, found {tuple(weights[name].shape)}")
+    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})
+
+
+def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
+    """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    dtype = torch.float16 if half else torch.float32
+    # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
+    exact = {name for name, _ in network.named_buffers()}
+    weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()}
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
+        save_file(weights, Path(scratch) / WEIGHTS)
+        (Path(scratch) / RECORD).write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
+        for name in (WEIGHTS, RECORD):
+            os.replace(Path(scratch) / name, folder / name)
+    return folder
+
+
+def read_experiment(folder: str | Path) -> Experiment:
+    """The record of a saved model. Raises ValueError when the folder is not one."""
+    path = Path(folder) / RECORD
+    try:
+        return from_dict(json.loads(path.read_text()), str(path))
+    except FileNotFoundError:
+        raise ValueError(f"{folder}: expected a model folder with {WEIGHTS} and {RECORD}, found no {RECORD}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: expected JSON, found {error}") from None
+
+
+def load(folder: str | Path) -> tuple[Experiment, nn.Module]:
+    """A saved model: its experiment and its network. Raises ValueError when either file is not as it should be."""
+    experiment, path = read_experiment(folder), Path(folder) / WEIGHTS
+    network = build_network(experiment)
+    try:
+        weights = load_file(path)
+    except FileNotFoundError:
+        raise ValueError(f"{folder}: expected {WEIGHTS} beside {RECORD}, found none") from None
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: expected safetensors weights, found {error}") from None
+    load_weights(network, weights, str(path))
+    return experiment, network

@@ -1,0 +1,200 @@
+"""From the named columns of any point file to a `Scan`: field names, intensity scales, ring order, lost points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS
+
+Fields = dict[str, np.ndarray]  # what a format's reader returns: one (N,) array per field, under the file's own names
+
+MAX_POINTS = 10_000_000  # one turn of the largest sensor is under a million points; more is a map or a lying header
+MAX_BYTES = 1 << 29  # of one file, and of one array packed in a file
+MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coordinates, or coordinates of a map
+MAX_RINGS = 1024
+
+NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found wins; case does not matter
+    "x": ("x", "points:0"),
+    "y": ("y", "points:1"),
+    "z": ("z", "points:2"),
+    "reflectance": ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i", "scalar_intensity"),
+    "ring": ("ring", "channel", "laser", "laser_number", "laser_id", "scalar_ring"),
+    "time": ("time", "timestamp", "t", "offset_ns", "time_offset", "gps_time", "timestamps", "scalar_timestamp"),
+    "label": ("label", "class", "scalar_label"),
+}
+
+SCALES: dict[str, float] = {"unit": 1.0, "byte": 255.0, "uint16": 65535.0}  # intensity -> the value of reflectance 1
+INTENSITIES = ("auto", *SCALES, "none")
+
+
+class FileError(ValueError):
+    """A file that cannot be read or written; the message is one line: `path: expected ..., found ...`."""
+
+
+def find(fields: Fields, name: str) -> str | None:
+    """The file's own name of our field `name` (a key of NAMES), or None."""
+    lower = {key.lower(): key for key in reversed(list(fields))}
+    return next((lower[usual] for usual in NAMES[name] if usual in lower), None)
+
+
+def scan_from_fields(fields: Fields, intensity: str = "auto") -> tuple[Scan, int]:
+    """The scan of N columns, and how many points it lost.
+
+    Points with a non-finite coordinate or intensity, or at exactly (0, 0, 0) (no return), are dropped and counted.
+    `intensity`: see `reflectance_from`. Raises FileError (without the path) for anything that is not one LiDAR turn.
+    """
+    xyz = _coordinates(fields)
+    name = find(fields, "reflectance")
+    if intensity == "none":
+        values = np.zeros(len(xyz), np.float32)
+    elif name is None:
+        raise FileError(f"expected an intensity field ({', '.join(NAMES['reflectance'][:4])}), "
+                        f"found {_listed(fields)}; intensity='none' reads it with reflectance 0")  # fmt: skip
+    else:
+        values = fields[name]
+    keep = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1) & np.isfinite(_numbers(values, name or "intensity"))
+    if not keep.any():
+        raise FileError(f"expected at least one finite point away from the origin, found none in {len(xyz)}")
+    xyz = xyz[keep]
+    if (far := float(np.abs(xyz).max())) > MAX_METRES:
+        raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}")
+    values = reflectance_from(values[keep], "unit" if intensity == "none" else intensity)
+    optional = {n: fields[key][keep] if (key := find(fields, n)) else None for n in ("ring", "time", "label")}
+    xyz = xyz.astype(np.float32)
+    ring = None if optional["ring"] is None else rings_from_top(optional["ring"], xyz)
+    time = None if optional["time"] is None else seconds_from(optional["time"], find(fields, "time") == "offset_ns")
+    label = None if optional["label"] is None else _training_classes(optional["label"])
+    return Scan(xyz, values, ring, time, label), int(len(keep) - keep.sum())
+
+
+def _coordinates(fields: Fields) -> np.ndarray:
+    """(N, 3) float, metres, after checking that N is at least 1 and the same for every field."""
+    names = [find(fields, axis) for axis in "xyz"]
+    if missing := [axis for axis, name in zip("xyz", names, strict=True) if name is None]:
+        raise FileError(f"expected the fields x, y, z, found no {', '.join(missing)} in {_listed(fields)}")
+    columns = [fields[name] for name in names if name is not None]
+    if len({v.shape for v in fields.values()}) > 1:
+        shapes = ", ".join(f"{key} {value.shape}" for key, value in list(fields.items())[:8])
+        raise FileError(f"expected fields of one length, found {shapes}")
+    if not 1 <= len(columns[0]) <= MAX_POINTS:
+        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {len(columns[0])}")
+    return np.stack([_numbers(column, axis) for column, axis in zip(columns, "xyz", strict=True)], axis=1)
+
+
+def _numbers(values: np.ndarray, name: str) -> np.ndarray:
+    if values.dtype.kind not in "fiu":
+        raise FileError(f"expected real numbers in the field {name}, found the type {values.dtype}")
+    return values
+
+
+def _listed(fields: Fields) -> str:
+    names = ", ".join(list(fields)[:12])
+    return f"only {names}" if names else "no field at all"
+
+
+def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
+    """(N,) float32 in [0, 1] from finite intensities of 0-1 ("unit"), 0-255 ("byte") or 0-65535 ("uint16").
+
+    "auto": an 8-bit type is 0-255, other integers are 0-255 up to 255 and 0-65535 above; floats are 0-1 up to 1, 0-255
+    up to 255, 0-65535 above. A scan of floats so dark that no point exceeds 1 of 255 is the one case to force by hand.
+    Raises FileError when the values do not fit the scale.
+    """
+    low, high = float(values.min()), float(values.max())
+    if intensity == "auto":
+        limits = {name: limit for name, limit in SCALES.items() if values.dtype.kind == "f" or name != "unit"}
+        intensity = next((name for name, limit in limits.items() if high <= limit), "uint16")
+    limit = SCALES[intensity]
+    if low < 0 or high > limit:
+        raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}")
+    return (values if limit == 1 else values / limit).astype(np.float32)
+
+
+def rings_from_top(ring: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """(N,) int32 beam numbers that count from the highest beam, whatever the file's own order.
+
+    The mean elevation of each ring decides: falling numbers stay, rising ones (nuScenes, Velodyne drivers) are turned
+    round, any other order (laser ids in firing order) becomes the rank by elevation. When turned, a count that just
+    misses that of a known sensor (30 rings of 32) is taken as that sensor's, its top beams being empty.
+    """
+    if not (np.isfinite(_numbers(ring, "ring")).all() and ring.min() >= 0 and ring.max() < MAX_RINGS):
+        raise FileError(f"expected ring numbers of 0-{MAX_RINGS - 1}, found {ring.min():.4g} to {ring.max():.4g}")
+    whole = ring.astype(np.int32)
+    if np.any(whole != ring):
+        raise FileError(f"expected whole ring numbers, found {ring[whole != ring][0]:.4g}")
+    elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+    count = np.bincount(whole)
+    used = np.flatnonzero(count)
+    mean = (np.bincount(whole, elevation) / np.maximum(count, 1))[used]
+    rising = np.mean(np.diff(mean) > 0) if len(used) > 1 else 0.0
+    if rising <= 0.1:
+        return whole
+    if rising >= 0.9:
+        return _beams(len(count)) - 1 - whole
+    rank = np.zeros(len(count), np.int32)
+    rank[used[np.argsort(-mean)]] = np.arange(len(used))
+    return rank[whole]
+
+
+def _beams(found: int) -> int:
+    known = sorted({sensor.height for sensor in SENSORS.values()})
+    return next((height for height in known if 0.9 * height <= found <= height), found)
+
+
+def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
+    """(N,) float64 seconds. Floats are seconds already; integers are the unit of 1, 1e-3, 1e-6 or 1e-9 s that
+    brings the span nearest to 0.1 s, counted from the first instant so that no digit is lost; `nanoseconds` forces 1e-9.
+    """
+    if _numbers(time, "time").dtype.kind == "f":
+        return time.astype(np.float64) * (1e-9 if nanoseconds else 1.0)
+    first = time.min()
+    span = max(int(time.max()) - int(first), 1)
+    power = 9 if nanoseconds else min((0, 3, 6, 9), key=lambda p: abs(np.log10(span) - p + 1))
+    return (time - first).astype(np.float64) / 10.0**power
+
+
+def rings_of_grid(fields: Fields, shape: tuple[int, int]) -> np.ndarray | None:
+    """(N,) int row (or column) of each point of an organised cloud (H, W), if those are the beams of a spinning LiDAR.
+
+    They are when there are 8 to 256 of them and a point's elevation varies far less along one than over the cloud.
+    """
+    names = [find(fields, axis) for axis in "xyz"]
+    if None in names or find(fields, "ring") or fields[str(names[0])].size != shape[0] * shape[1]:
+        return None
+    x, y, z = (fields[str(name)].astype(np.float32) for name in names)
+    with np.errstate(all="ignore"):  # organised clouds are full of NaN
+        elevation = np.arctan2(z, np.hypot(x, y))
+    good = np.isfinite(elevation) & (elevation != 0)
+    index = np.arange(len(x))
+    for count, ring in ((shape[0], index // shape[1]), (shape[1], index % shape[1])):
+        if not 8 <= count <= 256 or good.sum() < 2 * count:
+            continue
+        number = np.maximum(np.bincount(ring[good], minlength=count), 1)
+        mean = np.bincount(ring[good], elevation[good], count) / number
+        if np.std(elevation[good] - mean[ring[good]]) < 0.25 * np.std(elevation[good]):
+            return ring
+    return None
+
+
+def _training_classes(label: np.ndarray) -> np.ndarray | None:
+    """Labels are kept where they are SemanticKITTI training classes 0-19; other numbers would mean something else."""
+    if label.dtype.kind not in "fiu" or not np.isin(label, np.arange(20)).all():
+        return None
+    return label.astype(np.int32)
+
+
+def scan_table(scan: Scan) -> np.ndarray:
+    """Packed structured array (N,): x y z intensity float32, and ring uint16, timestamp float64, label uint16 if known."""
+    columns = {axis: scan.xyz[:, i].astype("<f4") for i, axis in enumerate("xyz")}
+    columns["intensity"] = scan.reflectance.astype("<f4")
+    for name, value, kind in (
+        ("ring", scan.ring, "<u2"),
+        ("timestamp", scan.time, "<f8"),
+        ("label", scan.label, "<u2"),
+    ):
+        if value is not None:
+            columns[name] = value.astype(kind)
+    table = np.empty(len(scan), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    return table

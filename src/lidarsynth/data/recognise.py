@@ -1,0 +1,143 @@
+"""Which sensor took a scan: the elevations of its rings, or of its points, against the tables of SENSORS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+FAR = 3.0  # metres: nearer points show the beam's origin off the sensor's centre more than its elevation
+UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by this much (HDL-64E units do)
+SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams only; chance gives 0.25
+POINTWISE = 0.6  # of points within a tenth of the spacing of some beam, for scans without rings; chance gives 0.2
+
+
+def recognise(scan: Scan, path: str | Path | None = None) -> tuple[str | None, str]:
+    """The name in SENSORS of the sensor that took the scan, or None, and the reason in words, one line.
+
+    Rings come from `scan.ring`, else from the order of the points (KITTI's files hold one ring after the other). A scan
+    of at least nine tenths of a sensor's beams matches it beam by beam within half a degree; one of fewer beams must
+    meet them ten times better than the spacing, so every fourth ring of an HDL-64E is an HDL-64E and no VLP-16. Without
+    rings each point must lie on a beam. `path` begins the reason.
+    """
+    where = "" if path is None else f"{path}: "
+    if len(scan) < 100:
+        return None, f"{where}expected at least 100 points to tell the sensor, found {len(scan)}: name it with --sensor"
+    ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
+    if ring is not None and len(np.unique(ring)) > 1:
+        name, reason = _by_rings(scan.xyz, ring)
+    else:
+        name, reason = _by_points(scan.xyz)
+    if name is None:
+        reason = f"expected the beams of {', '.join(SENSORS)}, found {reason}: name the sensor with --sensor"
+    return name, where + reason
+
+
+def elevations_of(xyz: np.ndarray) -> np.ndarray:
+    """(..., 3) metres -> (...) degrees above the horizon."""
+    return np.degrees(np.arctan2(xyz[..., 2], np.hypot(xyz[..., 0], xyz[..., 1])))
+
+
+def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
+    """(N,) int ring of each point where the file holds ring after ring, the highest first, else None.
+
+    Each ring is one turn, so the azimuth jumps by a turn once between two rings, always in the same direction. The
+    turn may begin ahead (KITTI) or behind (our own images): the seam with fewer jumps is the right one.
+    """
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    best: np.ndarray | None = None
+    for angle in (azimuth, np.mod(azimuth, 2 * np.pi)):
+        step = np.diff(angle)
+        up, down = step > np.pi, step < -np.pi
+        jumps, others = (up, down) if up.sum() > down.sum() else (down, up)
+        if 3 <= jumps.sum() < 256 and others.sum() <= 0.02 * jumps.sum() and (best is None or jumps.sum() < best.sum()):
+            best = jumps
+    return None if best is None else np.concatenate([[0], np.cumsum(best)])
+
+
+def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
+    far = np.hypot(xyz[:, 0], xyz[:, 1]) > FAR
+    beams = [xyz[far & (ring == k)] for k in np.unique(ring)]
+    beams = [points for points in beams if len(points) >= 5]
+    if len(beams) < 2:
+        return None, f"{len(beams)} rings with points beyond {FAR:g} m"
+    beams.sort(key=lambda points: -np.median(elevations_of(points)))
+    middle = np.array([np.median(elevations_of(points)) for points in beams])
+    found = f"{len(beams)} rings from {middle[0]:+.1f} to {middle[-1]:+.1f} degrees"
+    errors = {name: e for name, s in SENSORS.items() if (e := _whole_error(beams, s)) is not None and e < UNIT}
+    if errors:
+        name = min(errors, key=lambda n: errors[n])
+        return name, f"{found}, {errors[name]:.2f} from the {SENSORS[name].height} beams of {name}"
+    shares = {name: e for name, s in SENSORS.items() if (e := _subset_error(beams, s)) is not None and e < SUBSET}
+    if shares:
+        name = min(shares, key=lambda n: shares[n])
+        return name, f"{found}, on {len(beams)} of the {SENSORS[name].height} beams of {name}"
+    return None, found
+
+
+def _whole_error(beams: list[np.ndarray], sensor: Sensor) -> float | None:
+    """Median distance in degrees of the rings from the sensor's beams, taken in order; the sky may hide a few beams."""
+    spare = sensor.height - len(beams)
+    if not 0 <= spare <= 0.1 * sensor.height:
+        return None
+    offsets = sensor.offsets or (0.0,) * sensor.height
+    return min(
+        float(np.median([
+            abs(_elevation(points, offsets[row]) - sensor.elevations[row])
+            for row, points in enumerate(beams, start=first)
+        ]))
+        for first in range(spare + 1)
+    )  # fmt: skip
+
+
+def _subset_error(beams: list[np.ndarray], sensor: Sensor) -> float | None:
+    """Mean distance of the rings from the nearest beams, in units of the spacing there; None if two meet one beam."""
+    if len(beams) >= 0.9 * sensor.height or sensor.height < 32:
+        return None
+    table, spacing = np.array(sensor.elevations), _spacing(sensor)
+    offsets = sensor.offsets or (0.0,) * sensor.height
+    rows, errors = set(), []
+    for points in beams:
+        plain = _elevation(points, 0.0)
+        near = np.argsort(np.abs(table - plain))[:16]  # an offset of 0.2 m moves a near ring by a few beams
+        distance = {int(row): abs(_elevation(points, offsets[row]) - table[row]) / spacing[row] for row in near}
+        row = min(distance, key=lambda r: distance[r])
+        rows.add(row)
+        errors.append(min(distance[row], 1.0))
+    return float(np.mean(errors)) if len(rows) == len(beams) else None
+
+
+def _elevation(points: np.ndarray, offset: float) -> float:
+    """Median elevation in degrees of a ring's points, seen from a beam's origin `offset` metres above the sensor's."""
+    return float(np.median(elevations_of(points - np.array([0, 0, offset], points.dtype))))
+
+
+def _spacing(sensor: Sensor) -> np.ndarray:
+    """(H,) degrees from each beam to its nearer neighbour."""
+    gaps = -np.diff(np.array(sensor.elevations))
+    return np.minimum(np.concatenate([gaps[:1], gaps]), np.concatenate([gaps, gaps[-1:]]))
+
+
+def _by_points(xyz: np.ndarray) -> tuple[str | None, str]:
+    elevation = elevations_of(xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR])
+    if len(elevation) < 100:
+        return None, f"{len(elevation)} points beyond {FAR:g} m"
+    shares = {name: _share_on_beams(elevation, sensor) for name, sensor in SENSORS.items()}
+    name = max(shares, key=lambda n: shares[n])
+    found = f"no rings, and points from {elevation.min():+.1f} to {elevation.max():+.1f} degrees"
+    if shares[name] < POINTWISE:
+        return None, found
+    return name, f"{found}, {shares[name]:.0%} of them on the beams of {name}"
+
+
+def _share_on_beams(elevation: np.ndarray, sensor: Sensor) -> float:
+    """Share of points within a tenth of the spacing of a beam, times the share of beams that have points."""
+    table, spacing = np.array(sensor.elevations)[::-1], _spacing(sensor)[::-1]
+    above = np.clip(np.searchsorted(table, elevation), 1, len(table) - 1)
+    row = np.where(elevation - table[above - 1] < table[above] - elevation, above - 1, above)
+    on = np.abs(elevation - table[row]) < 0.1 * spacing[row]
+    used = np.bincount(row[on], minlength=len(table)) > 0
+    return float(on.mean() * used.mean())

@@ -1,0 +1,75 @@
+"""Kinds of surroundings, as KITTI drives through them: how wide, how dense, what stands where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Area:
+    """One kind of street. Ranges are uniform; `per_100` counts things per 100 m and side; shares are probabilities."""
+
+    weight: float  # how often the kind is drawn
+    half: Range  # m, half width of the driving lanes
+    walk: Range  # m, sidewalk width
+    parking: tuple[float, float]  # share of streets with a parking lane on the right, on the left
+    parked: Range  # share of its length that is taken
+    setback: Range  # m from the sidewalk to the fronts
+    house: Range  # m, length of a front
+    gap: Range  # m between houses
+    vacant: float  # share of lots without a house
+    shops: float  # share of fronts with a glazed ground floor
+    borders: tuple[float, float, float, float]  # shares of lots bordered by wall, hedge, fence, nothing
+    trees: Range  # per 100 m and side, in a row by the kerb
+    garden: Range  # bushes and small trees per 100 m and side, between sidewalk and fronts
+    thicket: Range  # big vegetation per 100 m and side, behind
+    lamps: float  # per 100 m and side
+    signs: float
+    people: Range  # per 100 m and side
+    bicycles: Range  # parked ones
+    traffic: Range  # moving vehicles per 100 m and lane
+    crossings: tuple[int, int]  # how many side roads within 300 m
+    lanes: tuple[float, float]  # share of dashed, of solid centre lines
+    bend: Range  # m, amplitude of the road's waves
+    slope: float  # standard deviation of the gradient
+    verge: tuple[str, ...]  # material words between sidewalk and fronts
+    rails: float = 0.0  # share of streets with a tram
+    bank: float = 0.0  # standard deviation of the slope beside the road
+
+
+# fmt: off
+AREAS: dict[str, Area] = {
+    "city": Area(
+        weight=0.30, half=(3.0, 5.5), walk=(1.8, 4.5), parking=(0.7, 0.6), parked=(0.4, 0.95), setback=(0.0, 1.5),
+        house=(8, 24), gap=(0, 2), vacant=0.10, shops=0.45, borders=(0.1, 0.05, 0.1, 0.75), trees=(0, 7), garden=(0, 2),
+        thicket=(0, 1), lamps=3.0, signs=5.0, people=(1, 9), bicycles=(0, 6), traffic=(0.5, 3.5), crossings=(1, 3),
+        lanes=(0.35, 0.1), bend=(0, 4), slope=0.015, verge=("sidewalk",), rails=0.15),
+    "old town": Area(
+        weight=0.12, half=(1.9, 2.8), walk=(0.7, 2.0), parking=(0.35, 0.2), parked=(0.3, 0.8), setback=(0.0, 0.6),
+        house=(6, 15), gap=(0, 0.5), vacant=0.07, shops=0.35, borders=(0.3, 0.1, 0.2, 0.4), trees=(0, 2), garden=(0, 2),
+        thicket=(0, 1), lamps=3.0, signs=4.0, people=(0, 7), bicycles=(0, 5), traffic=(0, 1), crossings=(1, 3),
+        lanes=(0.0, 0.0), bend=(0, 6), slope=0.02, verge=("sidewalk", "gravel")),
+    "residential": Area(
+        weight=0.27, half=(2.4, 3.3), walk=(1.0, 2.4), parking=(0.5, 0.4), parked=(0.2, 0.8), setback=(2.0, 8.0),
+        house=(9, 17), gap=(2, 9), vacant=0.12, shops=0.02, borders=(0.25, 0.35, 0.25, 0.15), trees=(0, 4),
+        garden=(3, 14), thicket=(1, 6), lamps=2.5, signs=2.5, people=(0, 2), bicycles=(0, 1), traffic=(0, 1),
+        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 7), slope=0.03, verge=("grass", "grass", "gravel"), bank=0.04),
+    "avenue": Area(
+        weight=0.13, half=(5.5, 9.0), walk=(1.5, 4.0), parking=(0.2, 0.2), parked=(0.2, 0.7), setback=(4.0, 18.0),
+        house=(15, 45), gap=(3, 25), vacant=0.35, shops=0.15, borders=(0.1, 0.15, 0.2, 0.55), trees=(0, 8),
+        garden=(1, 8), thicket=(1, 6), lamps=3.5, signs=5.0, people=(0, 3), bicycles=(0, 2), traffic=(1.0, 4.0),
+        crossings=(0, 2), lanes=(0.7, 0.2), bend=(0, 4), slope=0.01, verge=("grass", "sidewalk"), rails=0.2, bank=0.03),
+    "country": Area(
+        weight=0.10, half=(2.8, 4.0), walk=(0.0, 0.0), parking=(0.0, 0.0), parked=(0, 0), setback=(8.0, 30.0),
+        house=(10, 30), gap=(20, 80), vacant=0.6, shops=0.0, borders=(0.02, 0.08, 0.25, 0.65), trees=(0, 5),
+        garden=(1, 8), thicket=(3, 16), lamps=0.5, signs=3.0, people=(0, 0.3), bicycles=(0, 0), traffic=(0.2, 2),
+        crossings=(0, 1), lanes=(0.6, 0.2), bend=(0, 12), slope=0.025, verge=("grass",), bank=0.09),
+    "campus": Area(
+        weight=0.08, half=(2.4, 4.0), walk=(1.5, 4.0), parking=(0.5, 0.3), parked=(0.3, 0.8), setback=(5.0, 22.0),
+        house=(15, 50), gap=(5, 25), vacant=0.2, shops=0.3, borders=(0.08, 0.2, 0.12, 0.6), trees=(1, 6),
+        garden=(2, 10), thicket=(0, 4), lamps=3.0, signs=3.0, people=(1, 8), bicycles=(0, 12), traffic=(0, 1),
+        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 5), slope=0.012, verge=("grass", "sidewalk"), bank=0.03),
+}
+# fmt: on

@@ -1,0 +1,62 @@
+"""What the street is made of: how bright each surface looks to the laser, how much it varies, how it drops returns."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Material(NamedTuple):
+    """One kind of surface. `signal` is the sensor's raw scale, before its response curve (`sensor_model.RESPONSE`)."""
+
+    signal: float  # mean signal of the material at 10 m, head on
+    spread: float  # standard deviation between objects
+    grain: float  # standard deviation between neighbouring returns of one object
+    gloss: float  # how fast the signal falls at grazing incidence: signal += gloss * ln(cos)
+    loss: float = 0.0  # share of beams that return nothing whatever the distance
+    passes: float = 0.0  # share of beams that go through and hit what is behind
+
+
+# fmt: off
+MATERIALS: dict[str, Material] = {
+    "road":     Material(0.195, 0.020, 0.040, 0.00),
+    "marking":  Material(0.400, 0.080, 0.060, 0.00),
+    "parking":  Material(0.215, 0.030, 0.045, 0.00),
+    "sidewalk": Material(0.225, 0.030, 0.045, 0.00),
+    "kerb":     Material(0.260, 0.040, 0.050, 0.00),
+    "gravel":   Material(0.210, 0.030, 0.060, 0.00),
+    "grass":    Material(0.270, 0.030, 0.075, 0.00),
+    "rail":     Material(0.000, 0.020, 0.040, 0.00),
+    "plaster":  Material(0.330, 0.080, 0.060, 0.02),
+    "stone":    Material(0.240, 0.060, 0.070, 0.02),
+    "window":   Material(0.000, 0.040, 0.060, 0.04, loss=0.45),
+    "door":     Material(0.130, 0.120, 0.050, 0.04, loss=0.03),
+    "wall":     Material(0.270, 0.070, 0.070, 0.02),
+    "fence":    Material(0.180, 0.100, 0.080, 0.02),
+    "leaves":   Material(0.240, 0.060, 0.100, 0.01),
+    "bark":     Material(0.200, 0.060, 0.080, 0.02),
+    "pole":     Material(0.120, 0.120, 0.090, 0.02),
+    "sign":     Material(1.050, 0.150, 0.050, 0.00),
+    "sign back": Material(0.200, 0.120, 0.050, 0.02),
+    "paint":    Material(0.130, 0.150, 0.060, 0.06, loss=0.02),
+    "glass":    Material(0.020, 0.030, 0.060, 0.10, loss=0.62, passes=0.30),
+    "dark":     Material(0.030, 0.040, 0.060, 0.02, loss=0.10),
+    "lamp":     Material(0.600, 0.200, 0.150, 0.02),
+    "plate":    Material(0.850, 0.120, 0.080, 0.00),
+    "tyre":     Material(0.090, 0.060, 0.090, 0.02, loss=0.05),
+    "canvas":   Material(0.300, 0.120, 0.060, 0.02),
+    "cloth":    Material(0.200, 0.130, 0.080, 0.01),
+    "skin":     Material(0.300, 0.040, 0.060, 0.01),
+}
+# fmt: on
+
+NUMBER = {name: i for i, name in enumerate(MATERIALS)}
+TABLE = np.array(list(MATERIALS.values()), np.float32)
+
+# SemanticKITTI training classes (facts/metrics.md section 4), the words of this folder.
+LABEL = {
+    "unlabeled": 0, "car": 1, "bicycle": 2, "motorcycle": 3, "truck": 4, "other-vehicle": 5, "person": 6,
+    "bicyclist": 7, "motorcyclist": 8, "road": 9, "parking": 10, "sidewalk": 11, "other-ground": 12, "building": 13,
+    "fence": 14, "vegetation": 15, "trunk": 16, "terrain": 17, "pole": 18, "traffic-sign": 19,
+}  # fmt: skip

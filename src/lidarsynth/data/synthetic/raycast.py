@@ -1,0 +1,37 @@
+"""First hits of many rays on a triangle soup, by Embree (Wald et al., 2014)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Caster:
+    """A scene of T triangles, corners (T, 3, 3) float32 metres. Raises ImportError that names the extra to install."""
+
+    def __init__(self, corners: np.ndarray):
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise ImportError("synthetic streets need embreex: pip install 'lidarsynth[synthetic]'") from error
+        corners = np.ascontiguousarray(corners, np.float32)
+        self.scene = EmbreeScene()
+        TriangleMesh(self.scene, corners)
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        self.normal = normal.astype(np.float32)
+        self.level = np.einsum("ij,ij->i", self.normal, corners[:, 0])
+
+    def cast(self, origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where each ray first meets the scene.
+
+        origins, rays (N, 3) float32, rays of length 1. Returns the triangle's number (N,) int32, -1 where there is none;
+        the distance (N,) float32 metres, infinite there; and |cos| of the angle between ray and normal, (N,) float32.
+        """
+        face = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(rays), query="INTERSECT")
+        normal = self.normal[face]
+        towards = np.einsum("ij,ij->i", normal, rays)
+        gap = self.level[face] - np.einsum("ij,ij->i", normal, origins)
+        hit = (face >= 0) & (towards != 0)
+        distance = np.divide(gap, towards, out=np.full(len(rays), np.inf, np.float32), where=hit)
+        return face, distance, np.abs(towards)

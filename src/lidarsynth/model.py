@@ -1,0 +1,235 @@
+"""`LidarModel`, what `load()` returns: generate, complete and upsample scans."""
+
+from __future__ import annotations
+
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lidarsynth.build import build_denoiser, build_sensor
+from lidarsynth.data.recognise import recognise
+from lidarsynth.diffusion.denoiser import Denoiser
+from lidarsynth.diffusion.repaint import evaluations, repaint
+from lidarsynth.diffusion.samplers import STEPS, State, generators, sample, starting_noise
+from lidarsynth.experiment import Experiment
+from lidarsynth.lidar.depth import from_x_0, to_x_0
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+
+METHODS = ("auto", "conditional", "repaint")
+OnStep = Callable[[], object] | None  # called after every network step, for progress bars
+
+
+@dataclass(frozen=True)
+class LidarModel:
+    """A trained model with its sensor.
+
+    network     the bare torch module: raw prediction (B, 2, H, W) from x_t (B, 2, H, W) and log_snr (B,)
+    denoiser    (x_t, t) -> x_0_hat
+    sensor      the beams and columns of its images
+    experiment  what it is and how it was trained
+    """
+
+    network: nn.Module
+    denoiser: Denoiser
+    sensor: Sensor
+    experiment: Experiment
+
+    @property
+    def conditional(self) -> bool:
+        """Whether the network can be told the known pixels."""
+        return self.experiment.model.network == "conditional-unet"
+
+    def to(self, device: str | torch.device) -> LidarModel:
+        """The same model with its network on another device."""
+        self.network.to(device)
+        return self
+
+    def generate(
+        self,
+        n: int = 1,
+        steps: int = 32,
+        seed: int = 0,
+        sampler: str = "ddpm",
+        batch_size: int = 4,
+        on_step: OnStep = None,
+    ) -> list[RangeImage]:
+        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
+
+        steps    network evaluations per scan (twice as many for `heun`)
+        sampler  ddpm | ddim | dpmpp-2m | heun
+
+        Raises ValueError for an unknown sampler or counts below 1.
+        """
+        return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
+
+    def stream(
+        self,
+        n: int,
+        steps: int = 32,
+        seed: int = 0,
+        sampler: str = "ddpm",
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
+        if n < 1 or steps < 1 or batch_size < 1:
+            raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
+        for start in range(first, n, batch_size):
+            count = min(batch_size, n - start)
+            rng = generators(seed, count, offset=start)
+            x_1 = starting_noise(self.denoiser, self._blank(count), rng)
+            for x in _last(sample(self.denoiser, x_1, _step(sampler), steps, rng), on_step):
+                yield from_x_0(x, self.sensor, self.experiment.data.codec)
+
+    def complete(
+        self,
+        scan: Scan | RangeImage,
+        known: np.ndarray | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int = 10,
+        sampler: str = "ddim",
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """Fill what was not measured; measured pixels come back exactly as they were, in metres.
+
+        scan    points, or an image of this model's sensor
+        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
+        method  `conditional`: the network is told the known pixels (few steps); `repaint`: R2DM's way, for any network;
+                `auto`: conditional where the network can
+        steps   default 4, or 32 for repaint, where `resamples` passes go over each step
+
+        A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
+        """
+        image = self.image_of(scan)
+        known = image.mask if known is None else known
+        if known.shape != image.shape or known.dtype != np.bool_:
+            raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
+        method = self._method(method)
+        steps = steps or (4 if method == "conditional" else 32)
+        x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
+        mask = torch.from_numpy(known).to(self._device).expand(1, 2, *known.shape).clone()
+        mask[:, 1] &= bool(image.reflectance[known].any())
+        rng = generators(seed, 1)
+        x_1 = starting_noise(self.denoiser, x_0, rng)
+        if method == "conditional":
+            states = sample(self.denoiser.given(x_0, mask), x_1, _step(sampler), steps, rng)
+        else:
+            states = repaint(self.denoiser, x_1, x_0, mask, rng, _step("ddpm"), steps, resamples)
+        filled = from_x_0(_last(states, on_step)[0], self.sensor, self.experiment.data.codec)
+        return _with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
+
+    def upsample(
+        self,
+        scan: Scan,
+        sensor_in: Sensor | str | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor.
+
+        sensor_in  the sensor that made the scan; None = recognised from the points. Its beams tell which rows of the
+                   image were looked at; points outside this model's view are left out.
+
+        Raises ValueError when the sensor is not recognised or sees nothing that the model does.
+        """
+        if sensor_in is None:
+            sensor_in, reason = recognise(scan)
+            if sensor_in is None:
+                raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
+        sensor_in = get_sensor(sensor_in) if isinstance(sensor_in, str) else sensor_in
+        image, known = sparse_image(scan, sensor_in, self.sensor)
+        return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
+
+    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
+        """The scan in this model's image. Raises ValueError for an image of another size."""
+        if isinstance(scan, Scan):
+            return project(scan, self.sensor, self.experiment.data.projection)
+        if scan.shape != (self.sensor.height, self.sensor.width):
+            raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
+        return scan
+
+    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
+        """How many network evaluations `complete` takes."""
+        if self._method(method) == "conditional":
+            return steps or 4
+        return evaluations(steps or 32, resamples)
+
+    def _method(self, method: str) -> str:
+        if method not in METHODS:
+            raise ValueError(f"expected a method of {', '.join(METHODS)}, found {method!r}")
+        if method == "conditional" and not self.conditional:
+            raise ValueError(f"{self.experiment.name}: expected method repaint, since this network cannot be told the "
+                             f"known pixels, found conditional")  # fmt: skip
+        return method if method != "auto" else "conditional" if self.conditional else "repaint"
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def _blank(self, count: int) -> Tensor:
+        return torch.zeros(count, 2, self.sensor.height, self.sensor.width, device=self._device)
+
+
+def assemble(experiment: Experiment, network: nn.Module) -> LidarModel:
+    """The model of an experiment and its trained network."""
+    return LidarModel(network.eval(), build_denoiser(experiment, network), build_sensor(experiment), experiment)
+
+
+def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeImage, np.ndarray]:
+    """A scan of `sensor_in` in the image of `sensor`, and which pixels it looked at: (H, W) bool.
+
+    A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
+    in that direction. Raises ValueError when no point falls into the image.
+    """
+    image = project(replace(scan, ring=None), sensor, "spherical")
+    if not image.mask.any():
+        raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
+    own = project(scan, sensor_in, "auto", width=sensor.width)
+    gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
+    beams = np.flatnonzero(gap.min(axis=1) < 0.5)
+    known = image.mask.copy()
+    for beam in beams:
+        known[gap[beam].argmin()] |= ~own.mask[beam]
+    return image, known
+
+
+def _step(name: str):
+    if name not in STEPS:
+        raise ValueError(f"expected a sampler of {', '.join(STEPS)}, found {name!r}")
+    return STEPS[name]
+
+
+def _last(states: Iterator[State], on_step: OnStep) -> Tensor:
+    """Run the sampler to its end; (B, 2, H, W)."""
+    state = None
+    for state in states:
+        if on_step is not None:
+            on_step()
+    assert state is not None
+    return state.x_s
+
+
+def _with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
+    """The filled image with every known pixel replaced by its measurement, bit by bit."""
+    measured = known & image.mask
+    mask = np.where(known, image.mask, filled.mask)
+    reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
+    points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
+    return RangeImage(
+        range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
+        reflectance=np.where(mask, reflectance, 0).astype(np.float32),
+        mask=mask,
+        sensor=filled.sensor,
+        xyz=points,
+    )

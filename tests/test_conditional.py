@@ -1,0 +1,76 @@
+"""The conditional network: what it adds to the U-Net it wraps."""
+
+import pytest
+import torch
+
+from lidarsynth.models.conditional import ConditionalUNet
+from lidarsynth.models.efficient_unet import EfficientUNet
+from lidarsynth.models.interpolation import fill_in
+
+
+@pytest.fixture
+def net() -> ConditionalUNet:
+    torch.manual_seed(0)
+    unet = EfficientUNet(8, 2, (16, 64), 8, None, (1, 1, 2, 2), (1, 1, 1, 1), stem=(2, 4))
+    return ConditionalUNet(unet).eval().requires_grad_(False)
+
+
+@pytest.fixture
+def case() -> dict:
+    generator = torch.Generator().manual_seed(1)
+    x_t, known = torch.randn(2, 3, 2, 16, 64, generator=generator)
+    mask = torch.zeros(3, 2, 16, 64)
+    mask[0, :, ::4] = 1  # sample 0: every fourth beam; sample 1: range only; sample 2: nothing
+    mask[1, 0] = torch.rand(16, 64, generator=generator) < 0.1
+    return {"x_t": x_t, "log_snr": torch.tensor([1.0, -2.0, 5.0]), "known": known, "mask": mask}
+
+
+def randomised(net: ConditionalUNet) -> ConditionalUNet:
+    for parameter in net.parameters():
+        parameter.add_(torch.randn(parameter.shape) * 0.1)
+    return net
+
+
+def test_an_untrained_network_returns_the_interpolation(net, case):
+    torch.testing.assert_close(net(**case), fill_in(case["known"], case["mask"]))
+    torch.testing.assert_close(net(case["x_t"], case["log_snr"]), torch.zeros(3, 2, 16, 64))
+
+
+def test_an_empty_mask_is_no_mask(net, case):
+    case["mask"].zero_()
+    torch.testing.assert_close(randomised(net)(**case), net(case["x_t"], case["log_snr"]))
+
+
+def test_values_of_unknown_pixels_do_not_matter(net, case):
+    expected = randomised(net)(**case)
+    case["known"] = torch.where(case["mask"] == 1, case["known"], torch.nan)
+    assert torch.equal(net(**case), expected)
+
+
+def test_known_pixels_masks_and_noise_all_matter(net, case):
+    expected = randomised(net)(**case)
+    for name in ("x_t", "known"):
+        changed = net(**{**case, name: case[name] + 1})
+        assert (changed - expected).abs().amax((1, 2, 3))[:2].min() > 1e-3
+    assert (net(**{**case, "mask": case["mask"].flip(1)}) - expected)[1].abs().max() > 1e-3
+
+
+def test_samples_with_and_without_known_pixels_share_a_batch(net, case):
+    together = randomised(net)(**case)
+    for i in range(3):
+        alone = net(**{name: value[i : i + 1] for name, value in case.items()})
+        torch.testing.assert_close(together[i : i + 1], alone, atol=1e-5, rtol=1e-5)
+
+
+def test_a_boolean_mask_is_a_mask(net, case):
+    expected = randomised(net)(**case)
+    assert torch.equal(net(**{**case, "mask": case["mask"].bool()}), expected)
+
+
+def test_impossible_inputs_are_refused(net, case):
+    with pytest.raises(ValueError, match=r"mask must have the shape of x_t, .* got None"):
+        net(**{**case, "mask": None})
+    with pytest.raises(ValueError, match=r"known must have the shape of x_t, .* got \(3, 1, 16, 64\)"):
+        net(**{**case, "known": case["known"][:, :1]})
+    with pytest.raises(ValueError, match=r"in_channels = 4 \* out_channels = 8, got 2"):
+        ConditionalUNet(EfficientUNet(resolution=(16, 64), base_channels=8))

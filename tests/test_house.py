@@ -1,0 +1,227 @@
+"""The house rules of DESIGN.md as tests: who imports whom, how long, how named, how loud, how light."""
+
+import ast
+import resource
+import statistics
+import subprocess
+import sys
+from functools import lru_cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import lidarsynth
+
+PACKAGE = Path(lidarsynth.__file__).parent
+REPO_ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted(PACKAGE.rglob("*.py"))
+CODE = [path for path in FILES if path.name != "__init__.py"]
+EVERYTHING = {"lidar", "models", "diffusion", "experiment", "data", "metrics", "presets", "build", "weights", "model"}
+# DESIGN.md, "Who may import whom": part -> the other parts that it may import.
+ARROWS: dict[str, set[str]] = {
+    "lidar": set(),
+    "models": set(),
+    "diffusion": set(),
+    "experiment": set(),
+    "data": {"lidar"},
+    "metrics": {"lidar"},
+    "presets": {"experiment"},
+    "build": {"lidar", "models", "diffusion", "experiment", "data", "metrics", "presets"},
+    "weights": {"build", "experiment", "presets"},  # plain records, so that a release is built from its preset
+    "model": {"build", "weights", "lidar", "diffusion", "experiment"},
+    "training": EVERYTHING,
+    "cli": EVERYTHING | {"training", "viewer"},
+    "viewer": EVERYTHING | {"training", "cli"},
+    "__main__": {"cli"},
+}
+CORE = {"torch", "numpy", "einops", "safetensors", "tyro", "tqdm", "PIL", "tomli"}  # pyproject's dependencies
+VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
+PURE = {"experiment", "presets"}  # no torch, no numpy, no lidar: they read in milliseconds
+SPEAKERS = {"cli", "__main__"}  # the only ones that print and set the exit code
+
+
+def module_name(path: Path) -> str:
+    return ".".join(("lidarsynth", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+def part(name: str) -> str:
+    """The row of ARROWS a module belongs to: lidarsynth.lidar.scan -> lidar."""
+    return name.split(".")[1]
+
+
+def short(path: Path) -> str:
+    return str(path.relative_to(PACKAGE))
+
+
+@lru_cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(), str(path))
+
+
+MODULES = {module_name(path): path for path in FILES}
+
+
+def imported(path: Path, everywhere: bool = True) -> set[str]:
+    """Full names of what a file imports, in its functions too where `everywhere`: modules, and names in modules."""
+    names: set[str] = set()
+    for node in ast.walk(tree(path)) if everywhere else tree(path).body:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{short(path)}:{node.lineno}: imports are absolute"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def imported_modules(path: Path) -> set[str]:
+    """The lidarsynth modules a file imports; `from lidarsynth.lidar import sensor` is lidarsynth.lidar.sensor."""
+    ours = {name for name in imported(path) if name.split(".")[0] == "lidarsynth"}
+    return {name if name in MODULES else name.rpartition(".")[0] for name in ours} - {module_name(path)}
+
+
+def functions(path: Path) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
+    return [n for n in ast.walk(tree(path)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def calls(path: Path) -> list[tuple[str, ast.Call]]:
+    return [(ast.unparse(node.func), node) for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
+
+
+@pytest.mark.parametrize("path", CODE, ids=short)
+def test_imports_follow_the_arrows(path: Path):
+    own = part(module_name(path))
+    assert own in ARROWS, f"{short(path)} is in no row of DESIGN.md's table"
+    others = {part(name) for name in imported_modules(path) if name != "lidarsynth"} - {own}
+    assert others <= ARROWS[own], f"{own} may import {sorted(ARROWS[own])}, {short(path)} imports {sorted(others)}"
+
+
+@pytest.mark.parametrize("path", CODE, ids=short)
+def test_no_submodule_imports_the_root_or_private_names(path: Path):
+    assert "lidarsynth" not in imported_modules(path), "the root imports the parts, never the other way round"
+    private = {n for n in imported(path) if n.startswith("lidarsynth") and n.rpartition(".")[2].startswith("_")}
+    assert private <= {"lidarsynth.__main__"}, f"{short(path)} takes private names of another module: {private}"
+
+
+def test_there_is_no_import_cycle():
+    graph = {name: imported_modules(path) for name, path in MODULES.items() if name != "lidarsynth"}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"import cycle: {' -> '.join(error.args[1])}")
+
+
+def test_sub_package_inits_are_empty():
+    full = [short(p) for p in FILES if p.name == "__init__.py" and p.parent != PACKAGE and p.read_text().strip()]
+    assert full == []
+    bare = {p.parent for p in CODE} - {p.parent for p in FILES if p.name == "__init__.py"}
+    assert not bare, f"folders without __init__.py: {bare}"
+
+
+@pytest.mark.parametrize("path", CODE, ids=short)
+def test_optional_packages_are_imported_where_they_are_used(path: Path):
+    top = {name.split(".")[0] for name in imported(path, everywhere=False)}
+    foreign = top - CORE - {"lidarsynth"} - sys.stdlib_module_names
+    assert not foreign, (
+        f"{short(path)} imports {sorted(foreign)} at its top: only {sorted(CORE)} come with every install"
+    )
+
+
+@pytest.mark.parametrize("path", FILES, ids=short)
+def test_files_and_functions_are_short(path: Path):
+    lines = path.read_text().splitlines()
+    assert len(lines) <= 350, f"{short(path)} has {len(lines)} lines"
+    long = {f.name: n for f in functions(path) if (n := (f.end_lineno or 0) - f.lineno + 1) > 40}
+    assert not long, f"{short(path)}: functions over 40 lines: {long}"
+
+
+def test_modules_are_named_by_what_they_hold():
+    assert not [short(p) for p in FILES if VAGUE & set(p.relative_to(PACKAGE).with_suffix("").parts)]
+
+
+@pytest.mark.parametrize("path", [p for p in CODE if part(module_name(p)) not in SPEAKERS], ids=short)
+def test_the_library_never_prints_and_never_exits(path: Path):
+    loud = {"print", "exit", "quit", "sys.exit", "os._exit", "sys.stdout.write", "sys.stderr.write"}
+    found = [f"{name} in line {node.lineno}" for name, node in calls(path) if name in loud]
+    raised = [(ast.unparse(n.exc), n) for n in ast.walk(tree(path)) if isinstance(n, ast.Raise) and n.exc]
+    found += [f"{text} in line {node.lineno}" for text, node in raised if text.startswith("SystemExit")]
+    assert not found, f"{short(path)}: {found}"
+
+
+@pytest.mark.parametrize("path", CODE, ids=short)
+def test_code_of_others_is_never_loaded(path: Path):
+    for name, node in calls(path):
+        options = {k.arg: ast.unparse(k.value) for k in node.keywords}
+        where = f"{short(path)}:{node.lineno}"
+        assert name != "torch.load" or options.get("weights_only") == "True", f"{where}: weights_only=True is missing"
+        assert options.get("allow_pickle", "False") == "False", f"{where}: allow_pickle"
+        assert name not in {"eval", "exec", "compile", "__import__"}, f"{where}: {name}"
+    pickles = {"pickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
+    assert not pickles & {name.split(".")[0] for name in imported(path)}
+    assert "torch.load" not in imported(path), "write torch.load in full, so that this test sees it"
+
+
+@pytest.mark.parametrize("path", CODE, ids=short)
+def test_no_duck_typing_hidden_signatures_or_global_randomness(path: Path):
+    for name, node in calls(path):
+        assert name != "hasattr", f"{short(path)}:{node.lineno}: hasattr"
+        assert name not in {"torch.manual_seed", "np.random.seed", "random.seed"}, (
+            f"{short(path)}:{node.lineno}: {name}"
+        )
+    hidden = [f.name for f in functions(path) if f.args.kwarg and not f.name.startswith("_")]
+    assert not hidden, f"{short(path)}: **{'kwargs'} hides the signature of {hidden}"
+
+
+@pytest.mark.parametrize("path", CODE, ids=short)
+def test_public_names_have_docstrings(path: Path):
+    assert ast.get_docstring(tree(path)), f"{short(path)} says nothing about itself"
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    public = [n for n in tree(path).body if isinstance(n, kinds) and not n.name.startswith("_")]
+    assert not [n.name for n in public if not ast.get_docstring(n)], f"{short(path)}: public names without a docstring"
+
+
+def test_concrete_classes_are_never_subclassed():
+    classes = [(p, n) for p in FILES for n in ast.walk(tree(p)) if isinstance(n, ast.ClassDef)]
+    interfaces = {n.name for _, n in classes if {"Protocol", "ABC"} & {ast.unparse(b).split("[")[0] for b in n.bases}}
+    ours = {n.name for _, n in classes} - interfaces
+    bad = [f"{short(p)}: {n.name}" for p, n in classes if ours & {ast.unparse(b).split(".")[-1] for b in n.bases}]
+    assert bad == [], "give the shared part a function or an interface"
+
+
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60, cwd=REPO_ROOT)
+
+
+def test_experiments_and_presets_are_pure_python():
+    heavy = "print(sorted({'torch', 'numpy', 'PIL', 'einops', 'safetensors'} & set(sys.modules)))"
+    done = run_python("-c", f"import sys, lidarsynth, lidarsynth.experiment, lidarsynth.presets; {heavy}")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+    for name in PURE:
+        own = {n.split(".")[0] for n in imported(PACKAGE / f"{name}.py")}
+        assert own <= sys.stdlib_module_names | {"lidarsynth"}
+
+
+def test_help_does_not_import_torch():
+    done = run_python("-X", "importtime", "-m", "lidarsynth", "--help")
+    assert done.returncode == 0, done.stderr[-500:]
+    assert "lidarsynth" in done.stdout
+    read = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert "lidarsynth.cli" in read, "importtime lists what --help imported"
+    assert not read & {"torch", "numpy", "PIL", "tqdm.auto", "safetensors", "einops"}
+
+
+def cpu_seconds(*arguments: str) -> float:
+    """Processor time of one Python process: what a clock shows on an idle machine, whoever else works on this one."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = run_python(*arguments)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def test_help_answers_in_half_a_second():
+    bare = statistics.median(cpu_seconds("-c", "pass") for _ in range(5))
+    asked = statistics.median(cpu_seconds("-m", "lidarsynth", "--help") for _ in range(5))
+    slow = max(bare / 0.025, 1.0)  # a bare Python takes 15 to 25 ms; more, and the machine is slow or crowded
+    assert asked < 0.5 * slow, f"--help took {asked:.2f} s, a bare python {bare:.3f} s"

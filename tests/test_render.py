@@ -1,0 +1,288 @@
+"""Pictures: known values get known colours at known pixels; anything, even nothing, gives a picture."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lidarsynth.lidar.colours import (
+    CLASSES,
+    NEAREST,
+    TURBO,
+    VIRIDIS,
+    height_colours,
+    label_colours,
+    point_colours,
+    range_colours,
+    reflectance_colours,
+    turbo,
+)
+from lidarsynth.lidar.figure import colour_bar, compare, compare_3d, panel
+from lidarsynth.lidar.perspective import Camera, perspective
+from lidarsynth.lidar.render import (
+    BACKGROUNDS,
+    EMPTY,
+    bev,
+    label_strip,
+    mask_strip,
+    range_strip,
+    reflectance_strip,
+    save_png,
+)
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+SMALL = Sensor("small", (2.0, 0.0, -5.0, -15.0), 32, 1.0, 50.0)
+
+
+def one_point(x: float, y: float, z: float = 0.0) -> Scan:
+    return Scan(np.array([[x, y, z]], np.float32), np.array([0.5], np.float32), label=np.array([1]))
+
+
+def no_points() -> Scan:
+    return Scan(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), label=np.zeros(0, int))
+
+
+def small_image(seed: int = 0) -> RangeImage:
+    generator = np.random.default_rng(seed)
+    distance = generator.uniform(2, 50, (4, 32)).astype(np.float32)
+    mask = generator.random((4, 32)) < 0.8
+    reflectance = generator.random((4, 32), dtype=np.float32)
+    label = np.where(mask, generator.integers(0, 20, (4, 32)), 0)
+    return RangeImage(np.where(mask, distance, np.float32(0)), reflectance, mask, SMALL, label)
+
+
+def street(points: int = 100_000) -> Scan:
+    """A road of all rings and two walls."""
+    generator = np.random.default_rng(0)
+    x, y = generator.uniform(-60, 60, points), generator.uniform(-12, 12, points)
+    wall = generator.random(points) < 0.4
+    y, z = np.where(wall, np.sign(y) * 12, y), np.where(wall, generator.uniform(-1.7, 3, points), -1.7)
+    return Scan(np.stack([x, y, z], -1).astype(np.float32), generator.random(points, dtype=np.float32))
+
+
+def drawn(picture: np.ndarray, background: str) -> tuple[float, float]:
+    """Column and row of the middle of everything that is not background."""
+    rows, columns = np.nonzero(np.any(picture != BACKGROUNDS[background], axis=-1))
+    return float(columns.mean()), float(rows.mean())
+
+
+def test_ramps_pass_through_their_anchors_and_clip():
+    np.testing.assert_allclose(turbo(np.linspace(0, 1, 17)).astype(int), TURBO, atol=1)
+    np.testing.assert_array_equal(turbo([-3, 2, np.nan]), turbo([0, 1, 0]))
+    np.testing.assert_array_equal(reflectance_colours([0, 1]), VIRIDIS[[0, -1]])
+
+
+def test_near_is_warm_and_far_is_cold():
+    near, far = range_colours([NEAREST, 80.0], 80.0).astype(int)
+    assert near[0] > 150 > 60 > near[2]
+    assert far[2] > far[0]
+    blueness = range_colours(np.geomspace(3, 80, 40))[:, 2].astype(int) - range_colours(np.geomspace(3, 80, 40))[:, 0]
+    assert blueness[-8:].min() > blueness[:8].max()
+
+
+def test_classes_have_the_colours_of_semantickitti():
+    assert len(CLASSES) == 20
+    np.testing.assert_array_equal(label_colours([[9, 1]]), [[(255, 0, 255), (100, 150, 245)]])
+    with pytest.raises(ValueError, match=r"0-19, got 3 to 20"):
+        label_colours(np.array([3, 20]))
+
+
+def test_point_colours_by_each_word():
+    scan = one_point(3.0, 4.0, -1.0)
+    np.testing.assert_array_equal(point_colours(scan, "height"), height_colours([-1.0]))
+    np.testing.assert_array_equal(point_colours(scan, "range"), range_colours([np.sqrt(26.0)]))
+    np.testing.assert_array_equal(point_colours(scan, "reflectance"), reflectance_colours([0.5]))
+    np.testing.assert_array_equal(point_colours(scan, "label"), [CLASSES[1][1]])
+    with pytest.raises(ValueError, match=r"height, range, reflectance, label, found 'speed'"):
+        point_colours(scan, "speed")
+    with pytest.raises(ValueError, match="needs a scan with labels"):
+        point_colours(Scan(scan.xyz, scan.reflectance), "label")
+
+
+def test_strips_colour_measured_pixels_and_leave_the_others_dark():
+    image = small_image()
+    for strip, colours in (
+        (range_strip(image), range_colours(image.range, SMALL.max_range)),
+        (reflectance_strip(image), reflectance_colours(image.reflectance)),
+        (label_strip(image), label_colours(image.label)),
+    ):
+        assert strip.shape == (12, 32, 3) and strip.dtype == np.uint8
+        np.testing.assert_array_equal(strip[1::3][image.mask], colours[image.mask])
+        assert np.all(strip[2::3][~image.mask] == EMPTY)
+    assert range_strip(image, max_range=10.0, row_scale=1).shape == (4, 32, 3)
+
+
+def test_mask_strip_is_light_where_known():
+    known = np.zeros((4, 32), bool)
+    known[1] = True
+    strip = mask_strip(known, row_scale=2).mean(axis=-1)
+    assert strip[2:4].min() > 200 > 100 > strip[[0, 1, 4, 5, 6, 7]].max()
+
+
+def test_strips_say_what_is_wrong():
+    image = small_image()
+    bare = RangeImage(image.range, image.reflectance, image.mask, SMALL)
+    with pytest.raises(ValueError, match="image with labels"):
+        label_strip(bare)
+    with pytest.raises(ValueError, match="whole number from 1, got 0"):
+        range_strip(image, row_scale=0)
+    with pytest.raises(ValueError, match=r"\(H, W\) bool, got \(4, 32\) float32"):
+        mask_strip(image.range)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "column", "row"), [(20, 0, 100, 50), (0, 20, 50, 100), (-20, 0, 100, 150), (0, -20, 150, 100)]
+)
+def test_bev_has_forward_up_and_left_left(x: float, y: float, column: int, row: int):
+    empty = bev(no_points(), size=200, rings=0)
+    differs = np.any(bev(one_point(x, y), size=200, rings=0) != empty, axis=-1)
+    rows, columns = np.nonzero(differs)
+    assert abs(columns.mean() - column) <= 1 and abs(rows.mean() - row) <= 1
+    assert len(rows) <= 9
+
+
+def test_bev_leaves_out_what_is_outside_and_draws_rings():
+    empty = bev(no_points(), size=200)
+    np.testing.assert_array_equal(bev(one_point(41, 0), size=200), empty)
+    assert np.any(empty[50, 100] != BACKGROUNDS["dark"])  # the ring at 20 m
+    with pytest.raises(ValueError, match="must be positive, got 0 metres"):
+        bev(no_points(), extent=0)
+    with pytest.raises(ValueError, match="background of dark, white, found 'pink'"):
+        bev(no_points(), background="pink")
+
+
+def test_camera_looks_at_its_target_with_left_on_the_left():
+    camera = Camera(azimuth=180, elevation=0, distance=10, target=(5, 0, 0), field=90)
+    pixel, depth = camera.project(np.array([[5, 0, 0], [5, 5, 0], [5, 0, 5], [15, 0, 0]], np.float32), (200, 100))
+    np.testing.assert_allclose(depth, [10, 10, 10, 20], atol=1e-5)
+    np.testing.assert_allclose(pixel, [[100, 50], [50, 50], [100, 0], [100, 50]], atol=1e-4)
+    with pytest.raises(ValueError, match=r"elevation in \(-90, 90\)"):
+        Camera(elevation=90)
+
+
+def test_camera_above_sees_forward_up():
+    pixel, _ = Camera(180, 89.9, 30, (0, 0, 0)).project(np.array([[3, 0, 0], [0, 3, 0]], np.float32), (100, 100))
+    assert pixel[0, 1] < 45 and pixel[1, 0] < 45
+
+
+@pytest.mark.parametrize("background", sorted(BACKGROUNDS))
+def test_perspective_draws_a_point_at_its_pixel(background: str):
+    camera, scan = Camera(azimuth=150, elevation=20, distance=20), one_point(8, -2, 1)
+    picture = perspective(scan, camera, (320, 180), background=background, diameter=0.3)
+    expected = camera.project(scan.xyz, (320, 180))[0][0]
+    np.testing.assert_allclose(np.array(drawn(picture, background)) + 0.5, expected, atol=0.75)
+
+
+def test_perspective_shows_the_nearer_of_two_points_whatever_their_order():
+    camera = Camera(azimuth=180, elevation=0, distance=10, target=(0, 0, 0))
+    pair = Scan(np.array([[0, 0, 0], [4, 0, 0]], np.float32), np.zeros(2, np.float32), label=np.array([1, 19]))
+    pictures = [perspective(s, camera, (600, 360), "label", "dark", 1.0) for s in (pair, pair[::-1])]
+    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_array_equal(pictures[0][180, 300], CLASSES[1][1])
+
+
+def test_eye_dome_lighting_darkens_only_what_lies_behind_an_edge():
+    scan, camera = street(), Camera(azimuth=120)
+    lit, flat = (perspective(scan, camera, (320, 180), background="dark", shading=s).astype(int) for s in (1.0, 0.0))
+    assert np.all(lit <= flat)
+    assert 0.02 < np.mean(np.any(lit < flat, axis=-1)) < 0.9
+
+
+def test_points_behind_the_camera_and_nan_are_left_out():
+    away = np.array([[-100, 0, 0], [np.nan, 0, 0], [np.inf, 1, 0]], np.float32)
+    scan = Scan(away, np.zeros(3, np.float32))
+    camera = Camera(azimuth=180, elevation=5, distance=10)
+    assert np.all(perspective(scan, camera, (64, 36)) == BACKGROUNDS["white"])
+    np.testing.assert_array_equal(bev(scan, size=64), bev(no_points(), size=64))
+
+
+@pytest.mark.parametrize("by", ["height", "range", "reflectance", "label"])
+def test_nothing_gives_a_picture(by: str):
+    assert perspective(no_points(), size=(64, 36), by=by).shape == (36, 64, 3)
+    assert bev(no_points(), by=by, size=64).shape == (64, 64, 3)
+    zero = np.zeros((4, 32), np.float32)
+    blank = RangeImage(zero, zero, zero > 0, SMALL, zero.astype(int))
+    assert np.all(range_strip(blank) == EMPTY) and np.all(label_strip(blank) == EMPTY)
+    assert compare({"nothing": blank}).dtype == np.uint8
+    assert perspective(blank, size=(64, 36), by=by).shape == (36, 64, 3)
+
+
+def test_pictures_are_deterministic_and_independent_of_point_order():
+    scan = street(5_000)
+    shuffled = scan[np.random.default_rng(1).permutation(len(scan))]
+    np.testing.assert_array_equal(perspective(scan, size=(160, 90)), perspective(shuffled, size=(160, 90)))
+    np.testing.assert_array_equal(bev(scan, size=100), bev(shuffled, size=100))
+
+
+def test_a_large_scan_is_drawn_in_bounded_time():
+    scan, started = street(), time.process_time()
+    perspective(scan)
+    bev(scan)
+    assert time.process_time() - started < 4.0  # 0.6 s on an idle core
+
+
+def test_panel_gives_every_row_one_width_and_a_title_more_height():
+    red, wide = np.full((20, 30, 3), (255, 0, 0), np.uint8), np.zeros((10, 200, 3), np.uint8)
+    figure = panel([[("a", wide)], [("b", red), ("c", red)]])
+    assert figure.shape[1] == 200 + 40
+    assert panel([[("a", wide)], [("b", red), ("c", red)]], "title").shape[0] > figure.shape[0]
+    reds = np.all(np.abs(figure.astype(int) - (255, 0, 0)) < 3, axis=-1)
+    assert np.count_nonzero(reds.any(axis=0)) == 200 - 12  # both pictures fill the row but for the gap
+    assert panel([[("", red)]], width=60).shape == (40 + 40, 60 + 40, 3)
+    assert panel([[("a caption that is far too long for its picture", red)]]).shape[1] == 30 + 40
+
+
+def test_panel_says_what_is_wrong():
+    with pytest.raises(ValueError, match=r"at least one picture in every row, got rows of \[1, 0\]"):
+        panel([[("a", np.zeros((2, 2, 3), np.uint8))], []])
+    with pytest.raises(ValueError, match=r"'a' must be \(H, W, 3\) uint8, got \(2, 2\) float64"):
+        panel([[("a", np.zeros((2, 2)))]])
+    with pytest.raises(ValueError, match="at least one image, got none"):
+        compare({})
+    with pytest.raises(ValueError, match="0 images and 2 columns"):
+        compare_3d({})
+
+
+def test_compare_holds_the_strips_of_every_image():
+    before, after = small_image(0), small_image(1)
+    figure = compare({"before": before, "after": after}, "title", row_scale=3)
+    for strip in (range_strip(before), reflectance_strip(after)):
+        windows = np.lib.stride_tricks.sliding_window_view(figure[:, 20 : 20 + 32], 12, axis=0)
+        assert np.any(np.all(np.moveaxis(windows, -1, 1) == strip, axis=(1, 2, 3)))
+
+
+def test_compare_3d_fills_its_rows():
+    images = {"one": small_image(0), "two": street(500), "three": small_image(2)}
+    assert compare_3d(images, columns=3, size=(80, 45)).shape[1] == 3 * 80 + 2 * 12 + 40
+    assert compare_3d(images, columns=2, size=(80, 45), background="dark").shape[1] == 2 * 80 + 12 + 40
+
+
+@pytest.mark.parametrize("by", ["range", "reflectance"])
+def test_colour_bars(by: str):
+    bar = colour_bar(by, width=300, max_range=SENSORS["hdl-64e"].max_range)
+    assert bar.shape[1] == 300
+    ends = {"range": range_colours([NEAREST, 80.0]), "reflectance": reflectance_colours([0, 1])}[by]
+    np.testing.assert_allclose(bar[0, [0, -1]].astype(int), ends, atol=2)
+    with pytest.raises(ValueError, match="range, reflectance, found 'speed'"):
+        colour_bar("speed")
+
+
+def test_save_png_round_trips_and_is_whole_or_not_at_all(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    picture = range_strip(small_image())
+    path = save_png(tmp_path / "strip.png", picture)
+    np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
+    before = path.read_bytes()
+
+    def full_disk(*args: object, **options: object):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_png(path, bev(no_points(), size=64))
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["strip.png"]
+    with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 with pixels, got \(2, 2, 4\) uint8"):
+        save_png(path, np.zeros((2, 2, 4), np.uint8))
