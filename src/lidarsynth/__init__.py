@@ -1,0 +1,59 @@
+"""lidarsynth generates, completes and judges spinning-LiDAR scans.
+
+The public names load what they need when first used, so that `import lidarsynth` is instant.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lidarsynth.data.files import read, read_image, write
+    from lidarsynth.lidar.corruption import corrupt
+    from lidarsynth.lidar.projection import project
+    from lidarsynth.lidar.scan import RangeImage, Scan
+    from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor, read_sensor
+    from lidarsynth.model import LidarModel, load
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "read": "lidarsynth.data.files",
+    "read_image": "lidarsynth.data.files",
+    "write": "lidarsynth.data.files",
+    "corrupt": "lidarsynth.lidar.corruption",
+    "project": "lidarsynth.lidar.projection",
+    "RangeImage": "lidarsynth.lidar.scan",
+    "Scan": "lidarsynth.lidar.scan",
+    "SENSORS": "lidarsynth.lidar.sensor",
+    "Sensor": "lidarsynth.lidar.sensor",
+    "get_sensor": "lidarsynth.lidar.sensor",
+    "read_sensor": "lidarsynth.lidar.sensor",
+    "LidarModel": "lidarsynth.model",
+    "load": "lidarsynth.model",
+}
+
+__all__ = [
+    "SENSORS",
+    "LidarModel",
+    "RangeImage",
+    "Scan",
+    "Sensor",
+    "corrupt",
+    "get_sensor",
+    "load",
+    "project",
+    "read",
+    "read_image",
+    "read_sensor",
+    "write",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'lidarsynth' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.weights import load_parts
 
 METHODS = ("auto", "conditional", "repaint")
 OnStep = Callable[[], object] | None  # called after every network step, for progress bars
@@ -233,3 +235,14 @@ def _with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_r
         sensor=filled.sensor,
         xyz=points,
     )
+
+
+def load(source: str | Path = "default", ema: bool = True, device: str | torch.device = "cpu") -> LidarModel:
+    """A trained model.
+
+    source  `default`: the shipped weights; the name of an official release; one of our folders; an official `.pth`
+    ema     official files hold two sets of weights: their moving average (True), or the raw ones
+
+    Raises ValueError, or OSError, with one line that says what was expected and what was found.
+    """
+    return assemble(*load_parts(source, ema)).to(device)

@@ -60,14 +60,14 @@ def default() -> Experiment:
         data=Data(sensor="hdl-64e-kitti", projection="auto", roll=True, mirror=True),
         model=Model(
             network="conditional-unet",
-            base_channels=48,
-            channel_multipliers=(1, 2, 3, 4),
-            num_residual_blocks=(2, 2, 2, 2),
+            base_channels=32,
+            channel_multipliers=(1, 2, 4, 8),
+            num_residual_blocks=(1, 1, 2, 2),
             stem=(2, 4),
         ),
         diffusion=Diffusion(kind="x_0", mean_weight=False),
         training=Training(
-            steps=12_000, learning_rate=4e-4, warmup=200, ema_start=500, ema_decay=0.995, generation_share=0.5
+            steps=6_500, batch_size=4, learning_rate=5e-4, warmup=200, ema_start=500, generation_share=0.5
         ),
     )
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import json
+import lzma
+import struct
 import zipfile
 import zlib
 from io import BufferedIOBase, BytesIO
@@ -11,12 +13,16 @@ from typing import IO
 
 import numpy as np
 
-from lidarsynth.data.fields import MAX_BYTES, Fields, FileError, rings_of_grid
+from lidarsynth.data.fields import MAX_BYTES, MAX_METRES, Fields, FileError, rings_of_grid
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import from_dict
 
 COLUMNS = ("x", "y", "z", "intensity", "ring")
 MAX_HEADER = 1 << 16
+ZIP_ERRORS = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, RuntimeError, ValueError,
+    OSError, KeyError, IndexError,
+)  # fmt: skip
 PRINTABLE = frozenset(b"\t\n\r" + bytes(range(32, 127)))
 
 
@@ -29,7 +35,7 @@ def read_bin(data: bytes) -> Fields:
 def read_pcd_bin(data: bytes) -> Fields:
     """nuScenes: x y z intensity (0-255) ring, five float32 a point. Raises FileError as `read_bin`."""
     fields = _floats(data, 5, "")
-    if fields["intensity"].size and np.nanmax(fields["intensity"]) <= 255:
+    if np.nanmax(fields["intensity"], initial=0) <= 255:
         fields["intensity"] = fields["intensity"] / np.float32(255)  # the format fixes the scale, however dark the scan
     return fields
 
@@ -140,7 +146,7 @@ def unzip(data: bytes) -> dict[str, np.ndarray]:
                 raise FileError(f"expected 1 to 64 arrays of at most {MAX_BYTES} bytes in all, found {len(members)} "
                                 f"of {sum(m.file_size for m in members)}")  # fmt: skip
             return {m.filename[:-4]: _member(archive, m) for m in members}
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError) as error:
+    except ZIP_ERRORS as error:
         if isinstance(error, FileError):
             raise
         raise FileError(f"expected an npz (a zip of numpy arrays), found {_first_line(error)}") from None
@@ -158,14 +164,24 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
+IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least and greatest value
+    "range": ("f", 0, MAX_METRES),
+    "reflectance": ("f", 0, 1),
+    "mask": ("b", 0, 1),
+    "label": ("iu", 0, 19),
+    "xyz": ("f", -MAX_METRES, MAX_METRES),
+}
+
+
 def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
     """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and label, xyz where present."""
     if missing := {"range", "reflectance", "mask", "sensor"} - arrays.keys():
         raise FileError(f"expected a saved range image, found no {', '.join(sorted(missing))} in {', '.join(arrays)}")
-    for name in ("range", "reflectance", "mask", "label", "xyz"):
-        kinds = "b" if name == "mask" else "iu" if name == "label" else "f"
-        if name in arrays and (arrays[name].dtype.kind not in kinds or not np.isfinite(arrays[name]).all()):
-            raise FileError(f"expected finite numbers in {name} (mask: bool), found {arrays[name].dtype}")
+    for name, (kinds, low, high) in IMAGE.items():
+        if name in arrays and arrays[name].dtype.kind not in kinds:
+            raise FileError(f"expected {name} of the kind {kinds}, found {arrays[name].dtype}")
+        if name in arrays and not np.all((arrays[name] >= low) & (arrays[name] <= high)):
+            raise FileError(f"expected finite {name} of {low:g} to {high:g}, found others")
     try:
         values = json.loads(str(arrays["sensor"]))
         if not isinstance(values, dict) or "elevations" not in values:

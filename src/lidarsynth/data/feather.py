@@ -19,6 +19,7 @@ def read_feather(data: bytes) -> Fields:
         raise FileError(f"expected a feather table (version 2), found {data[:12]!r}")
     try:
         table = ipc.open_file(BytesIO(data)).read_all()
+        table.validate()
         if table.num_rows > MAX_POINTS:
             raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {table.num_rows}")
         numeric = [name for name in table.column_names if table[name].null_count == 0]

@@ -10,7 +10,7 @@ from lidarsynth.lidar.sensor import SENSORS
 Fields = dict[str, np.ndarray]  # what a format's reader returns: one (N,) array per field, under the file's own names
 
 MAX_POINTS = 10_000_000  # one turn of the largest sensor is under a million points; more is a map or a lying header
-MAX_BYTES = 1 << 29  # of one file, and of one array packed in a file
+MAX_BYTES = 1 << 28  # of one file, and of one array packed in a file
 MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coordinates, or coordinates of a map
 MAX_RINGS = 1024
 
@@ -44,42 +44,47 @@ def scan_from_fields(fields: Fields, intensity: str = "auto") -> tuple[Scan, int
     Points with a non-finite coordinate or intensity, or at exactly (0, 0, 0) (no return), are dropped and counted.
     `intensity`: see `reflectance_from`. Raises FileError (without the path) for anything that is not one LiDAR turn.
     """
-    xyz = _coordinates(fields)
+    x, y, z = _coordinates(fields)
     name = find(fields, "reflectance")
     if intensity == "none":
-        values = np.zeros(len(xyz), np.float32)
+        values = np.zeros(len(x), np.float32)
     elif name is None:
         raise FileError(f"expected an intensity field ({', '.join(NAMES['reflectance'][:4])}), "
                         f"found {_listed(fields)}; intensity='none' reads it with reflectance 0")  # fmt: skip
     else:
-        values = fields[name]
-    keep = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1) & np.isfinite(_numbers(values, name or "intensity"))
+        values = _numbers(fields[name], name)
+    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & np.isfinite(values) & ((x != 0) | (y != 0) | (z != 0))
     if not keep.any():
-        raise FileError(f"expected at least one finite point away from the origin, found none in {len(xyz)}")
-    xyz = xyz[keep]
-    if (far := float(np.abs(xyz).max())) > MAX_METRES:
+        raise FileError(f"expected at least one finite point away from the origin, found none in {len(x)}")
+    dropped = int(len(keep) - keep.sum())
+    kept = keep if dropped else slice(None)
+    xyz = np.stack([x[kept], y[kept], z[kept]], axis=1)
+    if (far := max(float(xyz.max()), -float(xyz.min()))) > MAX_METRES:
         raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}")
-    values = reflectance_from(values[keep], "unit" if intensity == "none" else intensity)
-    optional = {n: fields[key][keep] if (key := find(fields, n)) else None for n in ("ring", "time", "label")}
-    xyz = xyz.astype(np.float32)
-    ring = None if optional["ring"] is None else rings_from_top(optional["ring"], xyz)
-    time = None if optional["time"] is None else seconds_from(optional["time"], find(fields, "time") == "offset_ns")
-    label = None if optional["label"] is None else _training_classes(optional["label"])
-    return Scan(xyz, values, ring, time, label), int(len(keep) - keep.sum())
+    xyz = xyz.astype(np.float32, copy=False)
+    values = reflectance_from(values[kept], "unit" if intensity == "none" else intensity)
+    ring, time, label = (fields[key][kept] if (key := find(fields, n)) else None for n in ("ring", "time", "label"))
+    return Scan(
+        xyz,
+        values,
+        ring=None if ring is None else rings_from_top(ring, xyz),
+        time=None if time is None else seconds_from(time, find(fields, "time") == "offset_ns"),
+        label=None if label is None else _training_classes(label),
+    ), dropped
 
 
-def _coordinates(fields: Fields) -> np.ndarray:
-    """(N, 3) float, metres, after checking that N is at least 1 and the same for every field."""
+def _coordinates(fields: Fields) -> list[np.ndarray]:
+    """x, y, z, each (N,), after checking that N is at least 1 and the same for every field."""
     names = [find(fields, axis) for axis in "xyz"]
     if missing := [axis for axis, name in zip("xyz", names, strict=True) if name is None]:
         raise FileError(f"expected the fields x, y, z, found no {', '.join(missing)} in {_listed(fields)}")
-    columns = [fields[name] for name in names if name is not None]
     if len({v.shape for v in fields.values()}) > 1:
         shapes = ", ".join(f"{key} {value.shape}" for key, value in list(fields.items())[:8])
         raise FileError(f"expected fields of one length, found {shapes}")
-    if not 1 <= len(columns[0]) <= MAX_POINTS:
-        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {len(columns[0])}")
-    return np.stack([_numbers(column, axis) for column, axis in zip(columns, "xyz", strict=True)], axis=1)
+    columns = [_numbers(fields[name], name) for name in names if name is not None]
+    if columns[0].ndim != 1 or not 1 <= len(columns[0]) <= MAX_POINTS:
+        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {columns[0].shape}")
+    return columns
 
 
 def _numbers(values: np.ndarray, name: str) -> np.ndarray:
@@ -107,7 +112,7 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
     limit = SCALES[intensity]
     if low < 0 or high > limit:
         raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}")
-    return (values if limit == 1 else values / limit).astype(np.float32)
+    return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
 
 
 def rings_from_top(ring: np.ndarray, xyz: np.ndarray) -> np.ndarray:
@@ -143,7 +148,7 @@ def _beams(found: int) -> int:
 
 def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
     """(N,) float64 seconds. Floats are seconds already; integers are the unit of 1, 1e-3, 1e-6 or 1e-9 s that
-    brings the span nearest to 0.1 s, counted from the first instant so that no digit is lost; `nanoseconds` forces 1e-9.
+    brings the span nearest to 0.1 s (`nanoseconds`: 1e-9), counted from the first instant so that no digit is lost.
     """
     if _numbers(time, "time").dtype.kind == "f":
         return time.astype(np.float64) * (1e-9 if nanoseconds else 1.0)
@@ -184,7 +189,7 @@ def _training_classes(label: np.ndarray) -> np.ndarray | None:
 
 
 def scan_table(scan: Scan) -> np.ndarray:
-    """Packed structured array (N,): x y z intensity float32, and ring uint16, timestamp float64, label uint16 if known."""
+    """Packed structured array (N,): x y z intensity float32; ring uint16, timestamp float64, label uint16 if known."""
     columns = {axis: scan.xyz[:, i].astype("<f4") for i, axis in enumerate("xyz")}
     columns["intensity"] = scan.reflectance.astype("<f4")
     for name, value, kind in (

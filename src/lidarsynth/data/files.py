@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedIOBase
 from pathlib import Path
 
@@ -53,15 +54,24 @@ def read_with_report(path: str | Path, intensity: str = "auto", labels: str | Pa
         raise ValueError(f"expected an intensity of {', '.join(INTENSITIES)}, found {intensity!r}")
     reader = READERS[_suffix(path, READERS, "read")]
     data = _bytes(path)
-    try:
+    with _naming(path):
         fields = reader(data)
-        if labels is not None:
-            fields["label"] = read_labels(labels, len(next(iter(fields.values()), ())))
+    if labels is not None:
+        fields["label"] = read_labels(labels, len(next(iter(fields.values()), ())))
+    with _naming(path):
         return scan_from_fields(fields, intensity)
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Puts the path before a FileError's message and keeps it on one line, whatever a file's own names hold."""
+    try:
+        yield
     except FileError as error:
-        raise FileError(f"{path}: {error}") from None
+        text = " ".join(str(error).split())
+        raise FileError(f"{path}: {''.join(c if c.isprintable() else '?' for c in text)}") from None
     except MemoryError:
-        raise FileError(f"{path}: expected a scan that fits in memory, found {len(data)} bytes that do not") from None
+        raise FileError(f"{path}: expected a scan that fits in memory, found one that does not") from None
 
 
 def read_image(path: str | Path) -> RangeImage:
@@ -70,10 +80,9 @@ def read_image(path: str | Path) -> RangeImage:
     Raises FileError as `read`.
     """
     _suffix(path, {".npz": None}, "read a range image")
-    try:
-        return arrays.image_of(arrays.unzip(_bytes(path)))
-    except FileError as error:
-        raise FileError(f"{path}: {error}") from None
+    data = _bytes(path)
+    with _naming(path):
+        return arrays.image_of(arrays.unzip(data))
 
 
 def write(path: str | Path, scan: Scan | RangeImage) -> None:
@@ -89,7 +98,7 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
         raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found {suffix}")
     if isinstance(scan, RangeImage) and suffix != ".npz":
         scan = scan.to_scan()
-    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
         if path.is_dir():
             raise FileError(f"{path}: expected the name of a file to write, found a folder")
@@ -99,7 +108,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     except OSError as error:
         raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from None
     finally:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
 
 
 def _suffix(path: str | Path, known: dict, verb: str) -> str:

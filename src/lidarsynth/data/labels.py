@@ -8,12 +8,7 @@ import numpy as np
 
 from lidarsynth.data.fields import FileError
 
-CLASSES = (
-    "unlabeled", "car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist",
-    "road", "parking", "sidewalk", "other-ground", "building", "fence", "vegetation", "trunk", "terrain", "pole",
-    "traffic-sign",
-)  # fmt: skip
-RAW_OF_CLASS: tuple[tuple[int, ...], ...] = (  # class -> raw ids, SemanticKITTI's learning_map; 252-259 move
+RAW_OF_CLASS: tuple[tuple[int, ...], ...] = (  # index = class (lidar/colours.py names them); 252-259 move
     (0, 1, 52, 99), (10, 252), (11,), (15,), (18, 258), (13, 16, 20, 256, 257, 259), (30, 254), (31, 253), (32, 255),
     (40, 60), (44,), (48,), (49,), (50,), (51,), (70,), (71,), (72,), (80,), (81,),
 )  # fmt: skip

@@ -41,13 +41,14 @@ class Header(NamedTuple):
 def read_pcd(data: bytes) -> Fields:
     """The scalar fields (COUNT 1) of a PCD file under their own names, each (N,) in the file's type.
 
-    Organised clouds are flattened row by row; rows that are beams become the field `ring`. Raises FileError when header and data do not fit.
+    Organised clouds are flattened row by row; rows that are beams become the field `ring`. Raises FileError when header
+    and data do not fit.
     """
     header = read_header(data)
     columns = DECODERS[header.encoding](data[header.start :], header)
     named = zip(header.names, header.counts, columns, strict=True)
     fields = {name: column for name, count, column in reversed(list(named)) if count == 1 and name != "_"}
-    if header.rows > 1 and header.points and (ring := rings_of_grid(fields, header.shape)) is not None:
+    if header.rows > 1 and (ring := rings_of_grid(fields, header.shape)) is not None:
         fields["ring"] = ring
     return fields
 
@@ -67,7 +68,7 @@ def read_header(data: bytes) -> Header:
         raise FileError(f"expected PCD types of F4, F8, I1-I8 or U1-U8, found {unknown[0][:20]}")
     if not all(1 <= count <= 4096 for count in counts):
         raise FileError(f"expected PCD counts of 1-4096, found {min(counts) if min(counts) < 1 else max(counts)}")
-    encoding = " ".join(entries["DATA"])
+    encoding = " ".join(entries["DATA"]).lower()
     if encoding not in DECODERS:
         raise FileError(f"expected DATA of {', '.join(DECODERS)}, found {encoding[:40]!r}")
     dtypes = [np.dtype(TYPES[t + s]) for t, s in zip(types, sizes, strict=True)]
@@ -116,8 +117,8 @@ def _points(entries: dict[str, list[str]]) -> tuple[int, int]:
     if "WIDTH" in sizes and sizes["WIDTH"] * sizes.get("HEIGHT", 1) != points:
         raise FileError(f"expected WIDTH x HEIGHT = POINTS, found {sizes['WIDTH']} x {sizes.get('HEIGHT', 1)} "
                         f"and {points}")  # fmt: skip
-    if points > MAX_POINTS:
-        raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {points} in the PCD header")
+    if not 1 <= points <= MAX_POINTS:
+        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {points} in the PCD header")
     return points, max(sizes.get("HEIGHT", 1), 1)
 
 

@@ -21,8 +21,7 @@ WRITTEN = {"f4": "float", "f8": "double", "u2": "ushort"}
 
 
 class Element(NamedTuple):
-    """One element of the header; `order` has the types of its properties in file order, two of them (length, item) for a
-    list."""
+    """One element of the header; `order` has the types of its properties, two of them (length, item) for a list."""
 
     name: str
     count: int
@@ -46,6 +45,8 @@ def read_ply(data: bytes) -> Fields:
     vertex, before = elements[place], elements[:place]
     if vertex.has_list:
         raise FileError("expected one number per vertex property, found a list property in the element vertex")
+    if vertex.count == 0:
+        raise FileError("expected at least one vertex, found none")
     if len(set(vertex.names)) < len(vertex.names) or not vertex.names:
         raise FileError(f"expected distinct vertex properties, found {vertex.names[:8]}")
     if encoding == "ascii":

@@ -27,14 +27,14 @@ def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int |
     depth = np.linalg.norm(scan.xyz, axis=1)
     if not (depth > 0).all():
         scan, depth = scan[depth > 0], depth[depth > 0]
-    row = _rows(scan, sensor, method)
+    row = row_of_points(scan, sensor, method)
     pixel = row * sensor.width + _columns(scan.xyz, sensor.width)
     inside = row >= 0
     return _draw(scan, sensor, depth, np.where(inside, pixel, -1))
 
 
-def _rows(scan: Scan, sensor: Sensor, method: str) -> np.ndarray:
-    """(N,) int64 row of each point; -1 outside the field of view."""
+def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarray:
+    """(N,) int64 row of each point in the sensor's image, methods as in `project`; -1 outside the field of view."""
     if method == "spherical":
         return _rows_by_elevation(scan.xyz, sensor)
     ring, count = ring_of_points(scan)

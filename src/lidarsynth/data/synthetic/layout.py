@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.data.synthetic.areas import AREAS
 from lidarsynth.data.synthetic.ground import KERB, Road
-from lidarsynth.data.synthetic.streets import Lot
+from lidarsynth.data.synthetic.world import Lot, World, assemble, draw_ground, draw_poses
 
 Array = np.ndarray
+
+
+def build(rng: np.random.Generator) -> World:
+    """One world. The same generator state gives the same world."""
+    weights = np.array([a.weight for a in AREAS.values()])
+    area = list(AREAS.values())[rng.choice(len(AREAS), p=weights / weights.sum())]
+    ground = draw_ground(rng, area)
+    poses, places = draw_poses(rng, ground)
+    lot = Lot(rng, ground, area)
+    fill(lot, places)
+    return assemble(lot, poses)
 
 
 def fill(lot: Lot, places: Array) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidarsynth.data.synthetic.areas import AREAS, Area
+from lidarsynth.data.synthetic.areas import Area
 from lidarsynth.data.synthetic.ground import Ground, Road, ground_mesh, slab_mesh
 from lidarsynth.data.synthetic.materials import LABEL, NUMBER
 from lidarsynth.data.synthetic.objects import library
@@ -130,19 +130,6 @@ def draw_poses(rng: np.random.Generator, ground: Ground) -> tuple[np.ndarray, np
     roll = np.arctan((ground.height(x - left * sn, y + left * c) - ground.height(x + left * sn, y - left * c)) / (2 * left))
     pitch, roll = pitch + rng.normal(0, 0.008, POSES), roll + rng.normal(0, 0.008, POSES)
     return np.column_stack([x, y, z, yaw, pitch, roll]), np.column_stack([s, d])
-
-
-def build(rng: np.random.Generator) -> World:
-    """One world. The same generator state gives the same world."""
-    from lidarsynth.data.synthetic import layout  # layout fills a Lot
-
-    weights = np.array([a.weight for a in AREAS.values()])
-    area = list(AREAS.values())[rng.choice(len(AREAS), p=weights / weights.sum())]
-    ground = draw_ground(rng, area)
-    poses, places = draw_poses(rng, ground)
-    lot = Lot(rng, ground, area)
-    layout.fill(lot, places)
-    return assemble(lot, poses)
 
 
 def assemble(lot: Lot, poses: np.ndarray) -> World:

@@ -1,0 +1,5 @@
+"""`python -m lidarsynth`."""
+
+from lidarsynth.cli import main
+
+main()

@@ -1,0 +1,60 @@
+"""What is particular to KITTI's Velodyne HDL-64E on its car: how bright each laser reads, and what its own car hides.
+
+Fitted to real KITTI scans of 2011_09_26 and the object benchmark, as the elevations in `lidar/sensor.py` are; numbers
+of the instrument, not of any scene.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsynth.lidar.sensor import Sensor
+
+NAME = "hdl-64e-kitti"
+
+# fmt: off
+# How much less signal each laser reports than the brightest ones, top beam first.
+RING_LOSS = (
+    -0.005, 0.028, 0.045, 0.058, 0.012, 0.045, -0.022, 0.028, -0.005, 0.058, 0.012, -0.005, -0.022,
+    0.012, 0.045, 0.028, 0.028, 0.045, 0.012, 0.058, 0.028, 0.112, 0.028, 0.020, 0.092, 0.068,
+    0.052, 0.038, 0.038, 0.117, 0.046, 0.038, 0.095, 0.104, 0.081, 0.157, 0.182, 0.076, 0.004,
+    0.025, 0.111, 0.090, 0.186, 0.076, 0.086, 0.081, 0.073, 0.111, 0.130, 0.046, 0.010, 0.209,
+    0.092, 0.136, 0.138, 0.078, 0.065, 0.000, 0.131, 0.133, 0.154, 0.038, -0.013, 0.017)
+
+# Outlines of what stands on the car's roof and hides the ground: for each part, (row, first column, last column) at
+# 1024 columns, row by row; and by how many columns every second laser of the lower block sees it shifted.
+_EGO = (
+    (0, ((52, -36, 28), (53, -57, 62), (54, -70, 57), (56, -72, 61), (58, -78, 70), (60, -86, 73), (62, -90, 79),
+         (63, -90, 100))),
+    (7, ((42, 41, 63), (44, 40, 67), (46, 43, 63), (48, 41, 58), (50, 42, 55), (52, 44, 56))),
+    (8, ((42, 947, 969), (44, 947, 973), (46, 951, 969), (48, 954, 969), (50, 959, 972), (52, 961, 972))),
+    (14, ((46, 685, 690), (47, 681, 706), (48, 677, 722), (50, 673, 730), (52, 674, 735), (54, 668, 732),
+          (56, 671, 732), (58, 674, 732), (60, 689, 729), (61, 694, 724), (63, 713, 730))),
+    (11, ((55, 132, 139), (56, 126, 142), (58, 123, 147), (60, 118, 146), (61, 116, 145), (62, 99, 141), (63, 97, 145))),
+    (10, ((55, 867, 871), (56, 864, 878), (58, 862, 885), (60, 858, 884), (61, 860, 886), (62, 861, 906), (63, 861, 912))),
+    (5, ((57, 481, 537), (58, 470, 549), (60, 461, 557), (61, 456, 560), (62, 454, 563), (63, 452, 564))),
+    (10, ((60, 423, 425), (61, 398, 428), (62, 398, 430), (63, 396, 430))),
+    (10, ((60, 583, 614), (61, 584, 614), (62, 584, 616), (63, 583, 615))),
+)
+# fmt: on
+
+
+def own_car(sensor: Sensor, width: int) -> np.ndarray:
+    """(H, width) bool: which rays end on the vehicle itself. All False for other sensors than `hdl-64e-kitti`."""
+    hidden = np.zeros((sensor.height, width), bool)
+    if sensor.name != NAME:
+        return hidden
+    columns = np.arange(width)
+    scale = width / 1024
+    for shift, outline in _EGO:
+        rows, first, last = np.array(outline, float).T
+        for row in range(int(rows[0]), int(rows[-1]) + 1):
+            move = shift * (row % 2)
+            a, b = (np.interp(row, rows, edge) + move for edge in (first, last))
+            hidden[row] |= np.mod(columns - a * scale, width) <= (b - a + 1) * scale
+    return hidden
+
+
+def ring_loss(sensor: Sensor) -> np.ndarray:
+    """(H,) float32: signal each beam loses, 0 for sensors not measured."""
+    return np.array(RING_LOSS if sensor.name == NAME else [0.0] * sensor.height, np.float32)

@@ -1,0 +1,122 @@
+"""Synthetic streets as a reader: scan i of seed s, the same on every machine, for any sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsynth.data.synthetic import hdl64e
+from lidarsynth.data.synthetic.layout import build
+from lidarsynth.data.synthetic.raycast import Caster
+from lidarsynth.data.synthetic.sensor_model import Returns, sense
+from lidarsynth.data.synthetic.world import POSES, World
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+FULL_TURN = 2083  # azimuth steps per turn of KITTI's sensor at 10 Hz
+
+
+class SyntheticStreets:
+    """A reader over procedural streets: `len`, `[i] -> Scan`, and `image(i) -> RangeImage` of the same place.
+
+    seed    any integer >= 0; streets of different seeds are unrelated
+    length  number of scans; scan i does not depend on it
+    sensor  beams, offsets, range limits, columns and mounting height
+
+    Eight consecutive scans are eight places in one world; reading in order builds each world once.
+    Raises IndexError beyond the length, ImportError naming the extra when embreex is missing.
+    """
+
+    def __init__(self, seed: int = 0, length: int = 1000, sensor: Sensor = SENSORS["hdl-64e-kitti"]):
+        if seed < 0 or length < 1:
+            raise ValueError(f"expected seed >= 0 and length >= 1, got seed {seed} and length {length}")
+        self.seed = seed
+        self.length = length
+        self.sensor = sensor
+        self._worlds: dict[int, tuple[World, Caster]] = {}
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> Scan:
+        """The full turn of 2083 azimuth steps (or the sensor's own columns if more), ring by ring from the top.
+
+        Points of one ring run counter-clockwise from straight ahead, as in KITTI's files; `ring`, `label` filled.
+        """
+        width = max(FULL_TURN, self.sensor.width)
+        sensor = self.sensor.resized(width=width)
+        returns, rays = self._shoot(index, sensor)
+        rows = np.broadcast_to(np.arange(sensor.height)[:, None], (sensor.height, width))
+        order = np.roll(np.arange(width)[::-1], width // 2)
+        hit = (returns.distance > 0).reshape(rows.shape)[:, order]
+        points = self._local(rays, returns, sensor)[:, order][hit]
+        reflectance = returns.reflectance.reshape(rows.shape)[:, order][hit]
+        label = returns.label.reshape(rows.shape)[:, order][hit].astype(np.int64)
+        return Scan(points, reflectance, ring=rows[hit].astype(np.int64), label=label)
+
+    def image(self, index: int) -> RangeImage:
+        """(H, W) image of scan `index` with one ray per pixel, row = beam; no `xyz`, pixels hold the rays' ranges."""
+        returns, rays = self._shoot(index, self.sensor)
+        shape = (self.sensor.height, self.sensor.width)
+        points = self._local(rays, returns, self.sensor)
+        distance = np.linalg.norm(points, axis=-1).astype(np.float32)
+        mask = returns.distance.reshape(shape) > 0
+        label = returns.label.reshape(shape).astype(np.int64)
+        return RangeImage(distance, returns.reflectance.reshape(shape), mask, self.sensor, label)
+
+    def _local(self, rays: np.ndarray, returns: Returns, sensor: Sensor) -> np.ndarray:
+        """(H, W, 3) float32 points in the sensor frame, zero where nothing returned."""
+        distance = returns.distance.reshape(rays.shape[:2])
+        points = rays * distance[..., None]
+        if sensor.offsets:
+            points[..., 2] += np.where(distance > 0, np.asarray(sensor.offsets, np.float32)[:, None], 0)
+        return points
+
+    def _world(self, number: int) -> tuple[World, Caster]:
+        if number not in self._worlds:
+            world = build(np.random.default_rng((self.seed, number)))
+            if len(self._worlds) >= 2:
+                self._worlds.pop(next(iter(self._worlds)))
+            self._worlds[number] = (world, Caster(world.corners))
+        return self._worlds[number]
+
+    def _shoot(self, index: int, sensor: Sensor) -> tuple[Returns, np.ndarray]:
+        """Returns of all H * W rays, and the rays (H, W, 3) in the sensor frame."""
+        if not 0 <= index < self.length:
+            raise IndexError(f"expected a scan number in 0..{self.length - 1}, got {index}")
+        world, caster = self._world(index // POSES)
+        rng = np.random.default_rng((self.seed, index, 1))
+        rays = _jittered(sensor, rng)
+        turn, place = _pose(world.poses[index % POSES])
+        start = np.zeros((sensor.height, 3), np.float32)
+        start[:, 2] = sensor.mount
+        if sensor.offsets:
+            start[:, 2] += np.asarray(sensor.offsets, np.float32)
+        origins = np.repeat(start @ turn.T + place, sensor.width, axis=0)
+        loss = np.repeat(hdl64e.ring_loss(sensor), sensor.width)
+        returns = sense(world, caster, origins, rays.reshape(-1, 3) @ turn.T, loss, rng, sensor.max_range)
+        hidden = hdl64e.own_car(sensor, sensor.width).reshape(-1) | (returns.distance < sensor.min_range)
+        zero = np.float32(0)
+        kept = Returns(np.where(hidden, zero, returns.distance), np.where(hidden, zero, returns.reflectance),
+                       np.where(hidden, 0, returns.label))  # fmt: skip
+        return kept, rays
+
+
+def _jittered(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """(H, W, 3) float32 rays: the sensor's, turned by a third of a column at most, each ring with its own phase."""
+    phase = rng.uniform(-0.25, 0.25, (sensor.height, 1)) + rng.uniform(-0.08, 0.08, (sensor.height, sensor.width))
+    angle = (phase * 2 * np.pi / sensor.width).astype(np.float32)
+    rays = sensor.directions()
+    x = rays[..., 0] - angle * rays[..., 1]
+    y = rays[..., 1] + angle * rays[..., 0]
+    return np.stack([x, y, rays[..., 2]], axis=-1)  # small angles: the length stays 1 within 1e-6
+
+
+def _pose(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and place (3,) float32 of a vehicle pose x, y, z, yaw, pitch, roll (nose up, left side up)."""
+    x, y, z, yaw, pitch, roll = pose
+    c, s = np.cos(yaw), np.sin(yaw)
+    cp, sp, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    about_y = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return (about_z @ about_y @ about_x).astype(np.float32), np.array([x, y, z], np.float32)
