@@ -3,295 +3,277 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-if TYPE_CHECKING:
-    from lidarsynth.lidar.scan import RangeImage, Scan
-    from lidarsynth.metrics.reconstruction import Errors
-    from lidarsynth.model import LidarModel
+from lidarsynth.terminal import answer, at_least, counted, load_with_bar, progress_line, say, step_bar
+from lidarsynth.training.options import Options
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lidarsynth.completion import Filled
+    from lidarsynth.lidar.scan import RangeImage, Scan
+
+arg = tyro.conf.arg
 Positional = tyro.conf.Positional
 Format = Literal["ply", "pcd", "bin", "npy", "npz"]
 Sampler = Literal["ddpm", "ddim", "dpmpp-2m", "heun"]
-Method = Literal["auto", "conditional", "repaint"]
-Intensity = Literal["auto", "unit", "byte", "uint16", "none"]
-Count = Annotated[int, tyro.conf.arg(aliases=["-n"])]
-From = Annotated[str | None, tyro.conf.arg(name="from")]
+Count = Annotated[int, arg(aliases=["-n"], help="how many scans.")]
+From = Annotated[str | None, arg(name="from")]
+Source = Annotated[
+    str, arg(metavar="MODEL", help="default, an official release, a model folder, or an official .pth file.")
+]
+Seed = Annotated[int, arg(help="of all randomness.")]
+NoSeed = Annotated[int, arg(help="not used; every verb takes it.")]
+Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
+Method = Annotated[
+    Literal["auto", "conditional", "repaint"],
+    arg(help="conditional tells the network what is known; repaint works with any network, and takes minutes."),
+]
+Steps = Annotated[int | None, arg(metavar="INT", help="network steps; default 4 where conditional, 32 where repaint.")]
+Resamples = Annotated[int, arg(help="passes over each step of repaint.")]
+Intensity = Annotated[
+    Literal["auto", "unit", "byte", "uint16", "none"],
+    arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),
+]
+Picture = Annotated[bool, arg(help="write a .png beside each file.")]
+Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the range image.")]
+SensorWord = Annotated[
+    str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")
+]
 
 
 def generate(
     count: Count = 4,
-    out: Path = Path("out"),
-    model: str = "default",
-    format: Format = "ply",
-    steps: int = 32,
-    sampler: Sampler = "ddpm",
-    seed: int = 0,
-    batch_size: int = 4,
-    pictures: bool = True,
+    out: Annotated[Path, arg(help="folder to write to.")] = Path("out"),
+    model: Source = "default",
+    format: Annotated[Format, arg(help="of the files.")] = "ply",
+    steps: Annotated[int, arg(help="of the sampler, per scan.")] = 32,
+    sampler: Annotated[Sampler, arg(help="of the reverse process.")] = "ddpm",
+    seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
+    batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one, as fast.")] = 4,
+    device: Device = "cpu",
+    picture: Picture = True,
 ) -> None:
-    """New scans: a file and a picture per scan. Stopped, the same command goes on where it was.
+    """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
+    from lidarsynth.generation import batches, claim, fingerprint, generate_into
 
-    Args:
-        count: how many scans.
-        out: folder to write to.
-        model: default, a preset, a folder, or an official .pth.
-        format: of the files.
-        steps: network evaluations per scan.
-        sampler: of the reverse process.
-        seed: scan i depends on seed + i only.
-        batch_size: scans at once; changes speed and memory, not the scans.
-        pictures: write a .png beside each scan.
-    """
-    from tqdm import tqdm
-
-    from lidarsynth.lidar.render import save_png
-    from lidarsynth.model import load
-
-    settings = {"model": model, "format": format, "steps": steps, "sampler": sampler, "seed": seed}
-    _same_settings(out, settings)
-    names = [out / f"{i:06d}.{format}" for i in range(count)]
-    endings = [lambda path: path, lambda path: path.with_suffix(".png")][: 1 + pictures]
-    missing = [i for i, path in enumerate(names) if not all(ending(path).exists() for ending in endings)]
-    if missing:
-        loaded = load(model)
-        first = missing[0]
-        total = (count - first) * steps
-        with tqdm(total=total, unit="step", delay=2, desc="generate") as bar:
-            done = 0
-            for i, image in enumerate(loaded.stream(count, steps, seed, sampler, batch_size, first), first):
-                _write(names[i], image)
-                if pictures:
-                    save_png(names[i].with_suffix(".png"), _portrait(image))
-                done += steps
-                bar.update(done - bar.n)
-    print(f"wrote {count} scans to {out}/ ({len(missing)} new): {names[0].name} ... {names[-1].name}")
+    at_least(1, count=count, steps=steps, batch_size=batch_size)
+    at_least(0, seed=seed)
+    loaded = load_with_bar(model, device)
+    settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
+    claim(out, settings)
+    endings = (f".{format}", ".png") if picture else (f".{format}",)
+    # Batches of other sizes round differently on a CPU, and are no faster.
+    runs = batches(out, count, endings, 1 if device == "cpu" else batch_size)
+    with step_bar("generate", len(runs) * steps) as on_step:
+        new = sum(1 for _ in generate_into(out, loaded, runs, endings, steps, sampler, seed, on_step))
+    say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")
 
 
 def complete(
-    scans: Positional[list[Path]],
-    out: Path,
-    corrupt: str | None = None,
-    model: str = "default",
+    scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, or one folder of scans.")],
+    out: Annotated[Path, arg(help="file to write, as in upsample, or a folder where there are several scans.")],
+    corrupt: Annotated[
+        str | None,
+        arg(
+            metavar="RECIPE",
+            help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +.",
+        ),
+    ] = None,
+    model: Source = "default",
     method: Method = "auto",
-    steps: int | None = None,
-    resamples: int = 10,
-    seed: int = 0,
+    steps: Steps = None,
+    resamples: Resamples = 10,
+    seed: Seed = 0,
+    device: Device = "cpu",
     intensity: Intensity = "auto",
-    picture: bool = True,
+    picture: Picture = True,
 ) -> None:
-    """Fill what a scan lacks; measured points stay as they are. Prints the errors where --corrupt hid the truth.
+    """Fill what a scan lacks: every measured point stays, bit by bit, and new ones are added.
 
-    Args:
-        scans: files, or one folder of scans.
-        out: file to write, or a folder when there are several scans.
-        corrupt: hide part of the scan first and compare: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several
-            joined by +.
-        model: default, a preset, a folder, or an official .pth.
-        method: conditional tells the network what is known; repaint works with any network.
-        steps: network steps, default 4 (conditional) or 32 (repaint).
-        resamples: passes over each step of repaint.
-        seed: of the noise and of random corruptions.
-        intensity: scale of the file's intensity, if it is not recognised rightly.
-        picture: write before / after / truth as a .png beside each file.
+    With --corrupt a part of the scan is hidden first. The file then holds what the rest was filled to, and the errors
+    of the hidden pixels are printed beside those of interpolation.
     """
-    from lidarsynth.completion import complete_file
-    from lidarsynth.metrics.reconstruction import mean_errors
-    from lidarsynth.model import load
+    from lidarsynth.completion import complete_scan
+    from lidarsynth.report import errors_table, mean_table
+    from lidarsynth.targets import targets
 
-    pairs = _outputs(_files(scans), out)
-    loaded = load(model)
-    if method == "conditional":
-        loaded.evaluations(method)  # refuses before any scan is read
-    tables = []
-    for path, target in pairs:
-        result = complete_file(loaded, _read(path, intensity), corrupt, method, steps, resamples, seed)
-        _write(target, result.image)
-        _say_written(target, result.figure() if picture else None)
-        tables.append(result.errors)
-        if result.errors:
-            _print_errors(path.name, result.errors)
-    if len(tables) > 1 and tables[0]:
-        _print_errors(f"mean of {len(tables)} scans", {k: mean_errors([t[k] for t in tables]) for k in tables[0]})
+    at_least(1, steps=steps, resamples=resamples)
+    at_least(0, seed=seed)
+    loaded, tables = None, []
+    for path, target in targets(scans, out):
+        scan = _read(path, intensity)
+        loaded = loaded or load_with_bar(model, device)
+        with step_bar(path.name, loaded.evaluations(method, steps, resamples)) as on_step:
+            filled = complete_scan(loaded, scan, corrupt, method, steps, resamples, seed, on_step)
+        _write_filled(target, filled, picture)
+        if filled.errors:
+            say(errors_table(path.name, filled.errors))
+            tables.append(filled.errors)
+    if len(tables) > 1:
+        say(mean_table(tables))
 
 
 def upsample(
-    scan: Positional[Path],
-    out: Path,
-    sensor_in: From = None,
-    model: str = "default",
+    scan: Annotated[Positional[Path], arg(help="file of the sparse scan.")],
+    out: Output,
+    sensor_in: Annotated[SensorWord, arg(name="from")] = None,
+    model: Source = "default",
     method: Method = "auto",
-    steps: int | None = None,
-    seed: int = 0,
+    steps: Steps = None,
+    resamples: Resamples = 10,
+    seed: Seed = 0,
+    device: Device = "cpu",
     intensity: Intensity = "auto",
-    picture: bool = True,
+    picture: Picture = True,
 ) -> None:
-    """Make a scan of a sensor with few beams dense. Points outside the model's view are kept as measured.
+    """Make a scan of a sensor with few beams dense: every measured point stays, bit by bit, and new ones are added."""
+    from lidarsynth.completion import named_sensor, upsample_scan
+    from lidarsynth.targets import target
 
-    Args:
-        scan: file of the sparse scan.
-        out: file to write.
-        sensor_in: sensor that made it: vlp-16, hdl-32e, ..., or a .toml/.json file; recognised if not given.
-        model: default, a preset, a folder, or an official .pth.
-        method: conditional tells the network what is known; repaint works with any network.
-        steps: network steps, default 4 (conditional) or 32 (repaint).
-        seed: of the noise.
-        intensity: scale of the file's intensity, if it is not recognised rightly.
-        picture: write before and after as a .png beside the file.
-    """
-    from lidarsynth.completion import upsample_file
-    from lidarsynth.model import load
-
+    at_least(1, steps=steps, resamples=resamples)
+    at_least(0, seed=seed)
+    target(out, scan)
     sparse = _read(scan, intensity)
-    result = upsample_file(load(model), sparse, sensor_in, method, steps, seed)
-    _write(out, result.image if out.suffix == ".npz" else result.points)
-    print(f"{scan}: {len(sparse)} points of {result.sensor} became {len(result.points)}")
-    _say_written(out, result.figure() if picture else None)
+    sensor = named_sensor(sparse, scan, "--from", sensor_in)
+    loaded = load_with_bar(model, device)
+    with step_bar(scan.name, loaded.evaluations(method, steps, resamples)) as on_step:
+        filled = upsample_scan(loaded, sparse, sensor, method, steps, resamples, seed, on_step)
+    say(f"{scan}: {len(sparse)} points of {sensor.name} became {len(filled.points)}")
+    _write_filled(out, filled, picture)
 
 
 def project(
-    scan: Positional[Path],
-    out: Path,
-    sensor: str | None = None,
-    method: Literal["auto", "spherical", "unfolding"] = "auto",
-    width: int | None = None,
-    seed: int = 0,
+    scan: Annotated[Positional[Path], arg(help="file of the scan.")],
+    out: Annotated[Path, arg(help=".npz to write; another kind of file gets the points that won a pixel.")],
+    sensor: SensorWord = None,
+    method: Annotated[
+        Literal["auto", "spherical", "unfolding"],
+        arg(help="spherical puts points into rows by elevation, unfolding by ring."),
+    ] = "auto",
+    width: Annotated[int | None, arg(metavar="INT", help="columns, if other than the sensor's.")] = None,
+    seed: NoSeed = 0,
     intensity: Intensity = "auto",
-    picture: bool = True,
+    picture: Picture = True,
 ) -> None:
-    """Draw a scan as a range image: .npz with range, reflectance, mask and sensor, and a picture.
-
-    Args:
-        scan: file of the scan.
-        out: .npz to write.
-        sensor: a word such as hdl-64e, or a .toml/.json file; recognised if not given.
-        method: spherical puts points into rows by elevation, unfolding by ring.
-        width: columns, if other than the sensor's.
-        seed: not used; every verb takes it.
-        intensity: scale of the file's intensity, if it is not recognised rightly.
-        picture: write a .png beside the file.
-    """
-    from lidarsynth.data.recognise import recognise
+    """Draw a scan as a range image: .npz with range, reflectance, mask and sensor, and a picture."""
+    from lidarsynth.completion import named_sensor
     from lidarsynth.lidar import projection
+    from lidarsynth.pictures import portrait
+    from lidarsynth.targets import target
 
+    at_least(4, width=width)
+    target(out, scan)
     points = _read(scan, intensity)
-    if sensor is None:
-        sensor, reason = recognise(points, scan)
-        if sensor is None:
-            raise ValueError(reason)
-    image = projection.project(points, sensor, method, width)
-    _write(out, image)
-    print(f"{scan}: {len(points)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled")
-    _say_written(out, _portrait(image) if picture else None)
+    image = projection.project(points, named_sensor(points, scan, "--sensor", sensor), method, width)
+    if not image.mask.any():
+        raise ValueError(f"{scan}: expected points within {image.sensor.name}'s view, found none of {len(points)}")
+    say(f"{scan}: {len(points)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled")
+    _write(out, image, portrait(image) if picture else None)
 
 
-def info(what: Positional[str] = "default", seed: int = 0) -> None:
-    """What a model, a scan file or a preset is.
-
-    Args:
-        what: default, a preset, a model folder, an official .pth, or a scan file.
-        seed: not used; every verb takes it.
-    """
+def info(
+    what: Annotated[
+        Positional[str],
+        arg(help="default, a preset, a release, a model folder, an official .pth, a sensor, or a scan file."),
+    ] = "default",
+    seed: NoSeed = 0,
+) -> None:
+    """What a model, a preset, a sensor or a scan file is."""
     from lidarsynth.report import describe
 
-    print(describe(what))
+    say(describe(what))
 
 
-def demo(out: Path = Path("demo"), seed: int = 0) -> None:
-    """Everything once, offline, on a shipped synthetic scan; ends with the list of what it made.
-
-    Args:
-        out: folder to write to.
-        seed: of all randomness.
-    """
-    street = Path(__file__).parent / "data" / "synthetic" / "street.bin"
-    scan = out / "street.bin"
-    out.mkdir(parents=True, exist_ok=True)
-    scan.write_bytes(street.read_bytes())
-    project(scan, out / "street.npz")
-    generate(4, out / "generated", seed=seed)
-    complete([scan], out / "beams.ply", corrupt="beams:4", seed=seed)
-    complete([scan], out / "sector.ply", corrupt="sector:90", seed=seed)
-    info("default")
+def demo(
+    out: Annotated[Path, arg(help="folder to write to.")] = Path("demo"), model: Source = "default", seed: Seed = 0
+) -> None:
+    """Everything once, offline, on a shipped synthetic scan; ends with the list of what it made."""
+    street = Path(__file__).parent / "shipped" / "street.npz"
+    project(street, out / "street.npz")
+    generate(4, out / "generated", model, seed=seed)
+    complete([street], out / "beams.ply", "beams:4", model, seed=seed)
+    complete([street], out / "sector.ply", "sector:90", model, seed=seed)
+    info(model)
     made = sorted(path for path in out.rglob("*") if path.is_file())
-    print(f"\n{len(made)} files in {out}/, look at the pictures:")
-    for path in made:
-        print(f"  {path}")
+    say("\n".join([f"\n{len(made)} files in {out}/, look at the pictures:", *(f"  {path}" for path in made)]))
 
 
 def data(
-    source: Positional[Literal["synthetic", "files"]],
+    source: Positional[Literal["synthetic", "files", "kitti", "kitti360", "nuscenes", "nuscenes-sweeps"]],
     root: Positional[Path],
     cache: Positional[Path | None] = None,
-    sensor: str = "hdl-64e-kitti",
-    projection: Literal["auto", "spherical", "unfolding"] = "auto",
-    width: int = 1024,
+    split: str | None = None,
+    sensor: str | None = None,
+    projection: Literal["auto", "spherical", "unfolding"] | None = None,
+    width: int | None = None,
+    workers: int | None = None,
     count: Count = 1000,
+    check: bool = False,
     seed: int = 0,
 ) -> None:
     """Prepare a cache of range images for training; killed at any moment, the same command goes on.
 
     Args:
-        source: synthetic streets, or a folder of scan files.
-        root: folder of the files; the cache itself for synthetic streets.
+        source: synthetic streets, a folder of scan files, or a data set.
+        root: where the files are; the cache itself for synthetic streets.
         cache: folder to write.
-        sensor: whose images.
+        split: train, val, test or all; of nuscenes mini, trainval or test.
+        sensor: whose images: hdl-64e, ... or a .toml/.json file. This, projection and width have defaults by source.
         projection: how points become rows.
-        width: columns.
+        width: columns; below 1024 they are chosen from 1024, or 2048 when unfolding, as in R2DM.
+        workers: processes, one per processor core if not given.
         count: synthetic scans.
+        check: also compare the checksums of what is there already, and make anew what is damaged.
         seed: of the synthetic streets.
     """
-    from lidarsynth.data.sources import cache_files, cache_synthetic
+    from lidarsynth.data.sources import cache_source, cache_synthetic, summary
 
-    if source == "files" and cache is None:
-        raise ValueError("expected data files ROOT CACHE, found no CACHE")
+    if source != "synthetic" and cache is None:
+        raise ValueError(f"expected data {source} ROOT CACHE, found no CACHE")
     folder = cache or root
     if source == "synthetic":
-        stored = cache_synthetic(folder, count, sensor, width, seed)
+        stored = cache_synthetic(folder, count, sensor or "hdl-64e-kitti", width or 1024, seed, workers, check)
     else:
-        stored = cache_files(root, folder, sensor, projection, width)
-    for done, total in _bar(stored):
-        count = total if done else count
-    print(f"wrote {count} images to {folder}/")
+        stored = cache_source(source, root, folder, split, sensor, projection, width, workers, check)
+    for _ in counted(stored):
+        pass
+    say(f"wrote {summary(folder)}")
 
 
 def train(
-    preset: Positional[str],
-    data: Path,
-    out: Path,
-    weights: From = None,
-    set: tuple[str, ...] = (),
-    threads: int = 0,
-    seed: int = 0,
-    dry_run: bool = False,
+    preset: Annotated[Positional[str], arg(help="such as default, r2dm-h, tiny.")],
+    data: Annotated[Path | None, arg(metavar="CACHE|synthetic", help="cache of `lidarsynth data`, or streets.")] = None,
+    out: Annotated[Path | None, arg(help="folder for weights and checkpoints; default runs/PRESET.")] = None,
+    weights: Annotated[str | None, arg(name="from", metavar="MODEL", help="start from these weights.")] = None,
+    set: Annotated[tuple[str, ...], arg(help="fields to change, such as training.steps=1000.")] = (),
+    validation: Annotated[Path | None, arg(metavar="CACHE", help="images that are not trained on.")] = None,
+    resume: Annotated[bool, arg(help="insist that there is a run to continue.")] = False,
+    dry_run: Annotated[bool, arg(help="print the resolved experiment and stop.")] = False,
+    seed: Annotated[int, arg(help="of weights, order and noise.")] = 0,
+    options: Annotated[Options, arg(name="")] = Options(),  # noqa: B008, frozen
 ) -> None:
-    """Train a preset on a cache; killed at any moment, the same command goes on where the last checkpoint was.
-
-    Args:
-        preset: such as default, r2dm-h, tiny.
-        data: cache folder of `lidarsynth data`.
-        out: folder for weights and state.
-        weights: start from these weights.
-        set: fields of the experiment to change, such as training.steps=1000.
-        threads: of the processor, 0 = all.
-        seed: of weights, order and noise.
-        dry_run: print the resolved experiment and stop.
-    """
+    """Train a preset; killed at any moment, the same command goes on exactly, from the newest checkpoint."""
     from lidarsynth.training.run import resolve, run
 
-    experiment = resolve(preset, set, seed)
+    experiment = resolve(preset, set, seed, data)
     if dry_run:
-        print(json.dumps(asdict(experiment), indent=1))
+        say(json.dumps(asdict(experiment), indent=1))
         return
-    for line in run(experiment, data, out, weights, threads):
-        print(line, flush=True)
-    print(f"wrote {out}/")
+    if data is None:
+        raise ValueError("expected --data CACHE or --data synthetic, found neither")
+    out = out or Path("runs") / preset
+    steps = experiment.training.steps
+    done = list(progress_line(run(experiment, data, out, weights, validation, options, resume), steps))
+    if done:  # other processes than the first say nothing
+        say(
+            f"wrote {out}/" + (f", stopped after step {done[-1]}; the same command goes on" if done[-1] < steps else "")
+        )
 
 
 def _read(path: Path, intensity: str) -> Scan:
@@ -299,80 +281,23 @@ def _read(path: Path, intensity: str) -> Scan:
 
     scan, dropped = read_with_report(path, intensity)
     if dropped:
-        print(f"{path}: {dropped} points without a return or not finite were dropped, {len(scan)} stay")
+        say(f"{path}: {dropped} points without a return or not finite were dropped, {len(scan)} stay")
     return scan
 
 
-def _write(path: Path, scan: Scan | RangeImage) -> None:
+def _write(path: Path, scan: Scan | RangeImage, figure: np.ndarray | None = None) -> None:
+    """Write a file, and its picture beside it, and say so."""
     from lidarsynth.data.files import write
+    from lidarsynth.lidar.render import save_png
 
     path.parent.mkdir(parents=True, exist_ok=True)
     write(path, scan)
+    say(f"wrote {path}" if figure is None else f"wrote {path} and {save_png(path.with_suffix('.png'), figure)}")
 
 
-def _say_written(path: Path, figure) -> None:
-    from lidarsynth.lidar.render import save_png
-
-    print(f"wrote {path}" if figure is None else f"wrote {path} and {save_png(path.with_suffix('.png'), figure)}")
-
-
-def _portrait(image: RangeImage):
-    from lidarsynth.lidar.figure import panel
-    from lidarsynth.lidar.perspective import perspective
-    from lidarsynth.lidar.render import range_strip, reflectance_strip
-
-    return panel([[("range", range_strip(image))], [("reflectance", reflectance_strip(image))],
-                  [("points", perspective(image, size=(1024, 576)))]])  # fmt: skip
-
-
-def _print_errors(title: str, errors: dict[str, Errors]) -> None:
-    print(f"{title}: error of the hidden pixels ({next(iter(errors.values())).pixels})")
-    print(f"  {'method':<12}{'range MAE':>11}{'reflectance MAE':>18}")
-    for name, error in errors.items():
-        print(f"  {name:<12}{error.range_mae:>9.3f} m{error.reflectance_mae:>18.4f}")
-
-
-def _files(scans: list[Path]) -> list[Path]:
-    if len(scans) == 1 and scans[0].is_dir():
-        from lidarsynth.data.sources import scan_files
-
-        return scan_files(scans[0])
-    return scans
-
-
-def _outputs(scans: list[Path], out: Path) -> list[tuple[Path, Path]]:
-    """Each scan with the file to write: `out` itself, or out/NAME.ply when there are several."""
-    if len(scans) == 1 and out.suffix:
-        return [(scans[0], out)]
-    names = [path.name.split(".")[0] for path in scans]
-    if len(set(names)) < len(names):
-        raise ValueError(f"expected scans of different names to write into {out}/, found two of one name")
-    return [(path, out / f"{name}.ply") for path, name in zip(scans, names, strict=True)]
-
-
-def _same_settings(out: Path, settings: dict) -> None:
-    """Begin or go on with a folder of generated scans; refuse one that was made otherwise."""
-    record = out / "generate.json"
-    if record.exists():
-        found = json.loads(record.read_text())
-        if found != settings:
-            raise ValueError(f"{out}: expected a folder made with {settings}, found one made with {found}")
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    scratch = record.with_suffix(".tmp")
-    scratch.write_text(json.dumps(settings))
-    os.replace(scratch, record)
-
-
-def _bar(stored):
-    """Pass (done, total) pairs on, under a progress bar."""
-    from tqdm import tqdm
-
-    with tqdm(unit="image", delay=2) as bar:
-        for done, total in stored:
-            bar.total = total
-            bar.update(done - bar.n)
-            yield done, total
+def _write_filled(path: Path, filled: Filled, picture: bool) -> None:
+    content = filled.image if path.suffix.lower() == ".npz" else filled.points
+    _write(path, content, filled.figure() if picture else None)
 
 
 VERBS = {
@@ -389,14 +314,4 @@ VERBS = {
 
 def main(argv: list[str] | None = None) -> None:
     """Run one verb: exits 0, or 2 with one line that says what was expected and what was found."""
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            VERBS, prog="lidarsynth", description=__doc__ and "Generate, complete and judge LiDAR scans.", args=argv
-        )
-    except (ValueError, OSError, ImportError, FloatingPointError) as error:
-        line = " ".join(str(error).split())
-        print(f"lidarsynth: {line or type(error).__name__}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("lidarsynth: stopped; the same command goes on", file=sys.stderr)
-        sys.exit(130)
+    answer(VERBS, argv)

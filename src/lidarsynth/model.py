@@ -199,7 +199,8 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
         raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
     own = project(scan, sensor_in, "auto", width=sensor.width)
     gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
-    beams = np.flatnonzero(gap.min(axis=1) < 0.5)
+    # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.
+    beams = np.flatnonzero((gap.min(axis=1) < 0.5) & (own.mask.mean(axis=1) > 0.02))
     known = image.mask.copy()
     for beam in beams:
         known[gap[beam].argmin()] |= ~own.mask[beam]

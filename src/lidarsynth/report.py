@@ -1,25 +1,30 @@
-"""The text of `lidarsynth info`: what a model, a preset or a scan file is."""
+"""The texts that verbs print: what a model, a preset, a sensor or a scan file is, and tables of errors."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.build import build_network
+from lidarsynth.build import RECORD, build_network
 from lidarsynth.data.files import READERS, read_with_report
 from lidarsynth.data.recognise import recognise
 from lidarsynth.experiment import Experiment
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.presets import PRESETS
-from lidarsynth.weights import load_parts
+from lidarsynth.weights import load_parts, shipped
 
 
 def describe(what: str) -> str:
-    """Lines about a scan file, a preset, or weights in any form that `load` takes. Raises ValueError for others."""
+    """Lines about a scan file, a sensor, a preset, or weights as `load` takes them. Raises ValueError for others."""
     path = Path(what)
-    if any(path.name.lower().endswith(suffix) for suffix in READERS):
+    if path.name.lower().endswith(tuple(READERS)) and not (path.is_dir() and (path / RECORD).exists()):
         return describe_scan(path)
-    if what in PRESETS and what != "default":
+    if what in SENSORS or (path.suffix in (".toml", ".json") and path.name != RECORD):
+        return describe_sensor(get_sensor(what))
+    if what in PRESETS and what not in shipped() and not path.is_dir():
         experiment = PRESETS[what]()
         return describe_model(experiment, build_network(experiment), "preset, no weights")
     return describe_model(*load_parts(what), source=what)
@@ -29,15 +34,29 @@ def describe_scan(path: Path) -> str:
     """Points, range, reflectance, rings and sensor of a scan file."""
     scan, dropped = read_with_report(path)
     name, reason = recognise(scan)
-    depth = np.linalg.norm(scan.xyz, axis=1)
+    depth, light = np.linalg.norm(scan.xyz, axis=1), scan.reflectance
     lines = {
         "points": f"{len(scan)}" + (f" ({dropped} without a return dropped)" if dropped else ""),
         "range": f"{depth.min():.2f} to {depth.max():.2f} m, median {np.median(depth):.2f} m",
-        "reflectance": f"{scan.reflectance.min():.2f} to {scan.reflectance.max():.2f}, mean {scan.reflectance.mean():.3f}",
-        "fields": "x y z reflectance" + "".join(f" {f}" for f in ("ring", "time", "label") if getattr(scan, f) is not None),
+        "reflectance": f"{light.min():.2f} to {light.max():.2f}, mean {light.mean():.3f}",
+        "fields": "x y z reflectance"
+        + "".join(f" {f}" for f in ("ring", "time", "label") if getattr(scan, f) is not None),
         "sensor": f"{name} ({reason})" if name else reason,
     }
     return _table(str(path), lines)
+
+
+def describe_sensor(sensor: Sensor) -> str:
+    """Beams, columns and limits of a sensor."""
+    steps = -np.diff(sensor.elevations)
+    spacing = f", {steps.min():.2f} to {steps.max():.2f} degrees apart" if len(steps) else ""
+    lines = {
+        "beams": f"{sensor.height} from {sensor.elevations[0]:+.2f} to {sensor.elevations[-1]:+.2f} degrees{spacing}",
+        "columns": f"{sensor.width}, {360 / sensor.width:.3f} degrees apart",
+        "range": f"{sensor.min_range:g} to {sensor.max_range:g} m",
+        "mount": f"{sensor.mount:g} m above the road",
+    }
+    return _table(sensor.name, lines)
 
 
 def describe_model(experiment: Experiment, network, source: str) -> str:
@@ -59,6 +78,21 @@ def describe_model(experiment: Experiment, network, source: str) -> str:
     lines |= {f"history {i}": line for i, line in enumerate(card.history, 1)}
     lines |= {f"result {i}": line for i, line in enumerate(card.results, 1)}
     return _table(experiment.name, lines)
+
+
+def errors_table(title: str, errors: Mapping[str, Errors]) -> str:
+    """Range and reflectance MAE by method, over the hidden pixels, empty ones as 0 m and reflectance 0."""
+    pixels = next(iter(errors.values())).pixels
+    lines = [f"{title}: errors of the {pixels:,} hidden pixels, an empty pixel counts as 0 m"]
+    lines.append(f"  {'method':<12}{'range MAE':>11}{'reflectance MAE':>18}")
+    lines += [f"  {name:<12}{e.range_mae:>9.3f} m{e.reflectance_mae:>18.4f}" for name, e in errors.items()]
+    return "\n".join(lines)
+
+
+def mean_table(tables: Sequence[Mapping[str, Errors]]) -> str:
+    """`errors_table` of the mean over scans."""
+    means = {name: mean_errors([table[name] for table in tables]) for name in tables[0]}
+    return errors_table(f"mean of {len(tables)} scans", means)
 
 
 def _table(title: str, lines: dict[str, str]) -> str:

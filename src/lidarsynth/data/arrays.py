@@ -17,11 +17,11 @@ from lidarsynth.data.fields import MAX_BYTES, MAX_METRES, Fields, FileError, rin
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import from_dict
 
-COLUMNS = ("x", "y", "z", "intensity", "ring")
+COLUMNS: tuple[str, ...] = ("x", "y", "z", "intensity", "ring")
 MAX_HEADER = 1 << 16
 ZIP_ERRORS = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, RuntimeError, ValueError,
-    OSError, KeyError, IndexError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, RuntimeError,
+    ValueError, OSError, KeyError, IndexError,
 )  # fmt: skip
 PRINTABLE = frozenset(b"\t\n\r" + bytes(range(32, 127)))
 
@@ -157,7 +157,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         try:
             return read_array(file, member.file_size)
         except FileError as error:
-            raise FileError(f"{member.filename[:40]}: {error}") from None
+            raise FileError(f"{error} (in {member.filename[:40]})") from None
 
 
 def _first_line(error: Exception) -> str:

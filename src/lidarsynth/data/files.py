@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedIOBase
 from pathlib import Path
+from typing import Any
 
 from lidarsynth.data import arrays, feather, las, pcd, ply
 from lidarsynth.data.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
@@ -27,7 +28,7 @@ READERS: dict[str, Callable[[bytes], Fields]] = {
     ".feather": feather.read_feather,
 }
 
-WRITERS: dict[str, Callable[[BufferedIOBase, Scan], None]] = {
+WRITERS: dict[str, Callable[[BufferedIOBase, Any], None]] = {  # a Scan; .npz also takes a RangeImage
     ".bin": arrays.write_bin,
     ".npy": arrays.write_npy,
     ".npz": arrays.write_npz,
@@ -93,17 +94,16 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     or not at all: it is written beside its place under another name, then renamed. Raises FileError.
     """
     path = Path(path)
-    suffix = _suffix(path, WRITERS | {".pcd.bin": None}, "write")
-    if suffix not in WRITERS:
-        raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found {suffix}")
-    if isinstance(scan, RangeImage) and suffix != ".npz":
-        scan = scan.to_scan()
+    if path.name.lower().endswith(".pcd.bin"):
+        raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found .pcd.bin")
+    suffix = _suffix(path, WRITERS, "write")
+    content = scan.to_scan() if isinstance(scan, RangeImage) and suffix != ".npz" else scan
     unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
         if path.is_dir():
             raise FileError(f"{path}: expected the name of a file to write, found a folder")
         with open(unfinished, "xb") as file:
-            WRITERS[suffix](file, scan)
+            WRITERS[suffix](file, content)
         os.replace(unfinished, path)
     except OSError as error:
         raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from None

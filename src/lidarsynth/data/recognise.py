@@ -59,11 +59,10 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
 
 
 def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
-    far = np.hypot(xyz[:, 0], xyz[:, 1]) > FAR
-    beams = [xyz[far & (ring == k)] for k in np.unique(ring)]
+    beams = [_far(xyz[ring == k]) for k in np.unique(ring)]
     beams = [points for points in beams if len(points) >= 5]
     if len(beams) < 2:
-        return None, f"{len(beams)} rings with points beyond {FAR:g} m"
+        return None, f"{len(beams)} rings of at least 5 points"
     beams.sort(key=lambda points: -np.median(elevations_of(points)))
     middle = np.array([np.median(elevations_of(points)) for points in beams])
     found = f"{len(beams)} rings from {middle[0]:+.1f} to {middle[-1]:+.1f} degrees"
@@ -76,6 +75,12 @@ def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
         name = min(shares, key=lambda n: shares[n])
         return name, f"{found}, on {len(beams)} of the {SENSORS[name].height} beams of {name}"
     return None, found
+
+
+def _far(points: np.ndarray) -> np.ndarray:
+    """The points beyond FAR, or all where those are too few: the lowest beams of a small robot's sensor."""
+    far = points[np.hypot(points[:, 0], points[:, 1]) > FAR]
+    return far if len(far) >= 5 else points
 
 
 def _whole_error(beams: list[np.ndarray], sensor: Sensor) -> float | None:
@@ -122,9 +127,7 @@ def _spacing(sensor: Sensor) -> np.ndarray:
 
 
 def _by_points(xyz: np.ndarray) -> tuple[str | None, str]:
-    elevation = elevations_of(xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR])
-    if len(elevation) < 100:
-        return None, f"{len(elevation)} points beyond {FAR:g} m"
+    elevation = elevations_of(_far(xyz))
     shares = {name: _share_on_beams(elevation, sensor) for name, sensor in SENSORS.items()}
     name = max(shares, key=lambda n: shares[n])
     found = f"no rings, and points from {elevation.min():+.1f} to {elevation.max():+.1f} degrees"

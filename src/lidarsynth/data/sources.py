@@ -1,48 +1,130 @@
-"""Where the images of a cache come from: synthetic streets, or a folder of scan files."""
+"""Where the images of a cache come from: the word of each data set, its reader, and how its scans become images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-from lidarsynth.data.dataset import write_cache
-from lidarsynth.data.files import READERS, read
-from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.data.cache import write_cache
+from lidarsynth.data.folder import folder as scan_folder
+from lidarsynth.data.folder import scan_files
+from lidarsynth.data.frames import Reader
+from lidarsynth.data.index import REPORT, read_index, report
+from lidarsynth.data.kitti import kitti
+from lidarsynth.data.kitti360 import kitti360
+from lidarsynth.data.nuscenes import nuscenes
+from lidarsynth.lidar.projection import PROJECTIONS, project, thin
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+
+__all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "scan_files", "summary"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A data set: its reader (root, split) -> Reader, and what its images are unless said otherwise."""
+
+    reader: Callable[[Path, str], Reader]
+    split: str
+    sensor: str
+    projection: str
+    width: int
+
+
+SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses the data set
+    "kitti360": Source(kitti360, "train", "hdl-64e", "spherical", 1024),
+    "kitti": Source(kitti, "train", "hdl-64e-kitti", "unfolding", 512),
+    "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
+    "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
+    "files": Source(lambda root, split: scan_folder(root), "all", "hdl-64e-kitti", "auto", 1024),
+}
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Image number -> RangeImage of a reader's scan, drawn at `columns` and thinned to the sensor's own columns."""
+
+    reader: Reader
+    sensor: Sensor
+    projection: str
+    columns: int
+
+    def __call__(self, i: int) -> RangeImage:
+        return thin(project(self.reader[i], self.sensor, self.projection, self.columns), width=self.sensor.width)
+
+
+def columns_of(projection: str, width: int) -> int:
+    """Columns to draw at before thinning to `width`: R2DM's 2048 for unfolding and 1024 else, where `width` is below
+    1024; so a narrow image keeps the ray-drop of a turn instead of the nearest point of many."""
+    return width if width >= 1024 else 2048 if projection == "unfolding" else 1024
+
+
+def cache_source(
+    name: str,
+    root: str | Path,
+    folder: str | Path,
+    split: str | None = None,
+    sensor: str | None = None,
+    projection: str | None = None,
+    width: int | None = None,
+    workers: int | None = 0,
+    check: bool = False,
+) -> Iterator[tuple[int, int]]:
+    """Project a data set into a cache; yields (scans done, scans in all). What is None is the source's own.
+
+    name     a word of SOURCES; `root` is where the data set lies, `folder` the cache; `split` a word of its reader
+    workers, check  as in `write_cache`; None = as many as there are processors
+    Raises ValueError for unknown words, a root without scans, or a cache of something else; OSError for a full disk.
+    """
+    if name not in SOURCES:
+        raise ValueError(f"expected a source of {', '.join(SOURCES)} or synthetic, found {name!r}")
+    own = SOURCES[name]
+    split, projection, width = split or own.split, projection or own.projection, width or own.width
+    if projection not in PROJECTIONS:
+        raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
+    spec = get_sensor(sensor or own.sensor).resized(width=width)
+    reader, columns = own.reader(Path(root), split), columns_of(projection, width)
+    image = Projected(reader, spec, projection, columns)
+    source = {"name": name, "split": split, "projection": projection, "columns": columns}
+    source |= {"root": str(Path(root).resolve()), "missing": list(reader.missing)}
+    for done in write_cache(folder, image, len(reader), spec, source, reader.name, _processes(workers), check):
+        yield done, len(reader)
 
 
 def cache_synthetic(
-    folder: str | Path, count: int, sensor: str = "hdl-64e-kitti", width: int = 1024, seed: int = 0
+    folder: str | Path,
+    count: int,
+    sensor: str = "hdl-64e-kitti",
+    width: int = 1024,
+    seed: int = 0,
+    workers: int | None = 0,
+    check: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Cast `count` synthetic streets into a cache; yields (images stored, images in all)."""
+    """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`."""
     from lidarsynth.data.synthetic.reader import SyntheticStreets
 
     spec = get_sensor(sensor).resized(width=width)
     streets = SyntheticStreets(seed=seed, length=count, sensor=spec)
-    for done in write_cache(folder, streets.image, count, spec, {"name": "synthetic", "seed": seed}):
+    source = {"name": "synthetic", "seed": seed}
+    for done in write_cache(folder, streets.image, count, spec, source, workers=_processes(workers), check=check):
         yield done, count
 
 
-def cache_files(
-    root: str | Path, folder: str | Path, sensor: str, projection: str = "auto", width: int = 1024
-) -> Iterator[tuple[int, int]]:
-    """Project every readable scan under `root` into a cache; yields (images stored, images in all).
-
-    Raises ValueError when there is none, or when one cannot be read.
-    """
-    spec = get_sensor(sensor).resized(width=width)
-    paths = scan_files(root)
-    source = {"name": "files", "root": str(Path(root).resolve()), "projection": projection}
-    for done in write_cache(folder, lambda i: project(read(paths[i]), spec, projection), len(paths), spec, source):
-        yield done, len(paths)
+def _processes(workers: int | None) -> int:
+    return (os.cpu_count() or 1) if workers is None else workers
 
 
-def scan_files(root: str | Path) -> list[Path]:
-    """The scan files under a folder, sorted. Raises ValueError when there is none."""
-    root = Path(root)
-    if not root.is_dir():
-        raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
-    paths = sorted(p for p in root.rglob("*") if p.is_file() and p.name.lower().endswith(tuple(READERS)))
-    if not paths:
-        raise ValueError(f"{root}: expected scans ({', '.join(READERS)}), found none")
-    return paths
+def summary(folder: str | Path) -> str:
+    """What a cache holds, in one line: images, sequences, and what was skipped or is missing."""
+    told = report(read_index(folder))
+    text = f"{told['stored']} images"
+    if told["sequences"]:
+        text += f" of {len(told['sequences'])} sequence{'s' if len(told['sequences']) > 1 else ''}"
+    text += f" in {folder}/"
+    if told["skipped"]:
+        text += f", {len(told['skipped'])} broken scan{'s' if len(told['skipped']) > 1 else ''} skipped (named in {Path(folder) / REPORT})"
+    if told["missing"]:
+        text += f"; not found: {', '.join(told['missing'][:5])}{', ...' if len(told['missing']) > 5 else ''}"
+    return text

@@ -24,13 +24,42 @@ def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int |
     sensor = sensor if width is None else sensor.resized(width=width)
     if method not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {method!r}")
-    depth = np.linalg.norm(scan.xyz, axis=1)
+    depth = _length(*scan.xyz.T)
     if not (depth > 0).all():
         scan, depth = scan[depth > 0], depth[depth > 0]
     row = row_of_points(scan, sensor, method)
     pixel = row * sensor.width + _columns(scan.xyz, sensor.width)
-    inside = row >= 0
-    return _draw(scan, sensor, depth, np.where(inside, pixel, -1))
+    return _draw(scan, sensor, depth, pixel, row >= 0)
+
+
+def thin(image: RangeImage, height: int | None = None, width: int | None = None) -> RangeImage:
+    """The image at fewer columns and rows, every pixel one of the old ones: ray-drop stays ray-drop, nothing is mixed.
+
+    Columns are those of nearest-exact resizing, 4k + 2 from 2048 to 512 (R2DM's KITTI-Raw). So are the rows of a grid
+    of pixel edges (`sensor.edges`); of real beams they are the ones that `Sensor.resized` keeps, each with its angle.
+    """
+    height, width = height or image.shape[0], width or image.shape[1]
+    sensor = image.sensor.resized(height, width)
+    rows = _nearest_exact(image.shape[0], height)
+    if not image.sensor.edges:
+        rows = np.arange(0, image.shape[0], image.shape[0] // height)
+    grid = np.ix_(rows, _nearest_exact(image.shape[1], width))
+    label = None if image.label is None else image.label[grid]
+    xyz = None if image.xyz is None else image.xyz[grid]
+    return RangeImage(image.range[grid], image.reflectance[grid], image.mask[grid], sensor, label, xyz)
+
+
+def _nearest_exact(size: int, smaller: int) -> np.ndarray:
+    """(smaller,) which of `size` pixels lies under the centre of each new pixel: floor((i + 1/2) size / smaller)."""
+    return (2 * np.arange(smaller) + 1) * size // (2 * smaller)
+
+
+def _length(*axes: np.ndarray) -> np.ndarray:
+    """(N,) Euclidean length from its coordinates, added in order; several times faster than a norm over rows of 3."""
+    total = np.square(axes[0])
+    for values in axes[1:]:
+        total += np.square(values)
+    return np.sqrt(total, out=total)
 
 
 def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarray:
@@ -42,7 +71,8 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
         return _rows_by_elevation(scan.xyz, sensor)
     if count < sensor.height // 2 or count > 2 * sensor.height:
         raise ValueError(
-            f"unfolding expects about {sensor.height} rings, one after the other, found {count}; use --projection spherical"
+            f"unfolding expects about {sensor.height} rings, one after the other, found {count}; "
+            "use --projection spherical"
         )
     # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
     return np.maximum(ring + (sensor.height - count), 0)
@@ -66,15 +96,29 @@ def ring_of_points(scan: Scan) -> tuple[np.ndarray, int]:
 def _rows_by_elevation(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
     if sensor.edges:
         return _rows_of_even_grid(xyz, sensor)
-    flat = np.hypot(xyz[:, 0], xyz[:, 1])
+    x, y, z = np.ascontiguousarray(xyz.T)
+    flat = _length(x, y)
     slope = np.tan(np.radians(np.asarray(sensor.elevations)))
     lift = np.asarray(sensor.offsets or [0.0] * sensor.height)
     # A border lies midway between two beams; the outermost ones as far outside as the next lies inside.
     slope, lift = _borders(slope).astype(np.float32), _borders(lift).astype(np.float32)
-    row = np.full(len(xyz), -1, np.int64)
-    for s, h in zip(slope, lift, strict=True):
-        row += xyz[:, 2] < s * flat + h
-    return np.where(row >= sensor.height, -1, row)
+    below = _count_above(z, flat, slope, lift)
+    return np.where(below > sensor.height, 0, below) - 1
+
+
+def _count_above(z: np.ndarray, flat: np.ndarray, slope: np.ndarray, lift: np.ndarray) -> np.ndarray:
+    """(N,) how many of the falling lines slope * flat + lift run above each point (flat, z): a binary search."""
+    size = 1 << len(slope).bit_length()  # the count is below it: padded with lines that are above no point
+    slope = np.concatenate([slope, np.zeros(size - len(slope), slope.dtype)])
+    lift = np.concatenate([lift, np.full(size - len(lift), -np.inf, lift.dtype)])
+    count = np.zeros(len(z), np.intp)
+    while size > 1:
+        size //= 2
+        line = count + (size - 1)
+        height = slope.take(line) * flat
+        height += lift.take(line)
+        count += (z < height) * size
+    return count
 
 
 def _borders(values: np.ndarray) -> np.ndarray:
@@ -86,27 +130,32 @@ def _borders(values: np.ndarray) -> np.ndarray:
 
 
 def _rows_of_even_grid(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """R2DM's grid: floor, and points out of view pile up on the border rows."""
+    """R2DM's grid: floor, and points out of view pile up on the border rows. All in float32, as published."""
     height, top = sensor.height, np.radians(sensor.elevations[0])
     view = np.radians(sensor.elevations[0] - sensor.elevations[1]) * height
-    elevation = np.arcsin(np.clip(xyz[:, 2] / np.linalg.norm(xyz, axis=1), -1, 1))
-    return np.clip(np.floor((1 - (elevation - (top - view)) / view) * height), 0, height - 1).astype(np.int64)
+    x, y, z = np.ascontiguousarray(xyz.T)
+    elevation = np.arcsin(np.clip(z / _length(x, y, z), -1, 1))
+    row = (1 - (elevation - np.float32(top - view)) / np.float32(view)) * height
+    return np.clip(np.floor(row), 0, height - 1).astype(np.intp)
 
 
 def _columns(xyz: np.ndarray, width: int) -> np.ndarray:
     azimuth = -np.arctan2(xyz[:, 1], xyz[:, 0])
-    turn = np.mod((azimuth / np.float32(np.pi) + 1) / 2, 1)
-    return np.clip(np.floor(turn * width), 0, width - 1).astype(np.int64)
+    turn = (azimuth / np.float32(np.pi) + 1) / 2
+    turn[turn >= 1] = 0  # straight behind, from the left or from the right, is column 0
+    return np.minimum((turn * width).astype(np.intp), width - 1)
 
 
-def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray) -> RangeImage:
+def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray, inside: np.ndarray) -> RangeImage:
     """Nearest point per pixel, by the minimum of (depth bits, index) packed into one integer."""
     shape = (sensor.height, sensor.width)
-    order = (depth.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(
-        len(depth), dtype=np.uint64
-    )
+    order = depth.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+    order |= np.arange(len(depth), dtype=np.uint64)
     best = np.full(shape[0] * shape[1], np.iinfo(np.uint64).max, np.uint64)
-    np.minimum.at(best, pixel[pixel >= 0], order[pixel >= 0])
+    if inside.all():
+        np.minimum.at(best, pixel, order)
+    else:
+        np.minimum.at(best, pixel[inside], order[inside])
     hit = np.flatnonzero(best != np.iinfo(np.uint64).max)
     point = (best[hit] & np.uint64(0xFFFFFFFF)).astype(np.int64)
     valid = (depth[point] >= sensor.min_range) & (depth[point] <= sensor.max_range)

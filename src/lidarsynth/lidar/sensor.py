@@ -43,7 +43,7 @@ class Sensor:
 
     def __post_init__(self):
         steps = np.diff(self.elevations)
-        if len(self.elevations) < 1 or np.any(steps >= 0) or np.any(np.abs(self.elevations) > 90):
+        if len(self.elevations) < 1 or not np.all(steps < 0) or not np.all(np.abs(self.elevations) <= 90):
             raise ValueError(f"sensor {self.name}: elevations must fall from top to bottom within +-90 degrees, "
                              f"got {list(self.elevations)[:4]}...")  # fmt: skip
         if self.width < 4:
@@ -114,7 +114,9 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
     """
     values = dict(values)
     if {"beams", "top", "bottom"} <= values.keys():
-        spaced = np.linspace(values.pop("top"), values.pop("bottom"), int(values.pop("beams")))
+        if not (isinstance(values["beams"], int) and 1 <= values["beams"] <= 1024):
+            raise ValueError(f"{source}: expected beams of 1 to 1024, found {values['beams']!r}")
+        spaced = np.linspace(values.pop("top"), values.pop("bottom"), values.pop("beams"))
         values.setdefault("elevations", spaced.tolist())
     known = set(Sensor.__dataclass_fields__)
     if unknown := values.keys() - known:

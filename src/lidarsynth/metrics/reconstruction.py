@@ -1,10 +1,12 @@
-"""How far a completed range image is from the measured one: MAE and RMSE of range and reflectance."""
+"""How far a completed scan is from the measured one: pixel by pixel, point by point, voxel by voxel, class by class."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
 
@@ -45,3 +47,123 @@ def mean_errors(errors: list[Errors]) -> Errors:
     names = ("range_mae", "reflectance_mae", "range_rmse", "reflectance_rmse")
     means = [float(np.mean([getattr(e, name) for e in errors])) for name in names]
     return Errors(*means, pixels=sum(e.pixels for e in errors))
+
+
+def nearest_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(N,) float64, metres: from each of `points` (N, 3) to the nearest of `others` (M, 3).
+
+    Raises ValueError for other shapes, no points or NaN; ImportError without scipy, naming the extra that brings it.
+    """
+    try:
+        from scipy.spatial import cKDTree
+    except ImportError as error:
+        raise ImportError("distances of points need scipy: pip install 'lidarsynth[metrics]'") from error
+    sets = [_points(values) for values in (points, others)]
+    return cKDTree(sets[1]).query(sets[0])[0]
+
+
+def _points(values: np.ndarray) -> np.ndarray:
+    points = np.asarray(values, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
+        raise ValueError(f"expected finite points (N, 3), at least one, found {points.shape}")
+    return points
+
+
+@dataclass(frozen=True)
+class PointErrors:
+    """Distances between a result's points and the true ones; each is the same, or swaps, when the sets are swapped."""
+
+    chamfer: float  # metres: mean distance to the truth plus mean distance from the truth
+    chamfer_squared: float  # metres^2: the same of squared distances, as most learned completion papers say it
+    hausdorff: float  # metres: the farthest any point of either set is from the other set
+    precision: float  # share of the result's points within the threshold of a true one
+    recall: float  # share of the true points within the threshold of one of the result
+    f_score: float  # harmonic mean of the two, 0 where both are 0
+
+
+def point_errors(result: np.ndarray, truth: np.ndarray, threshold: float = 0.2) -> PointErrors:
+    """Chamfer and Hausdorff distance, and F-score at `threshold` metres, of points (N, 3) and (M, 3).
+
+    F-score: Knapitsch et al. 2017. Raises ValueError for other shapes, no points or NaN.
+    """
+    there, back = nearest_distances(result, truth), nearest_distances(truth, result)
+    precision, recall = float((there <= threshold).mean()), float((back <= threshold).mean())
+    return PointErrors(
+        float(there.mean() + back.mean()),
+        float((there**2).mean() + (back**2).mean()),
+        float(max(there.max(), back.max())),
+        precision,
+        recall,
+        _harmonic(precision, recall),
+    )
+
+
+def chamfer_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean distance from `a` (N, 3) to `b` (M, 3) plus that from `b` to `a`, metres."""
+    return float(nearest_distances(a, b).mean() + nearest_distances(b, a).mean())
+
+
+def _harmonic(precision: float, recall: float) -> float:
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+@dataclass(frozen=True)
+class VoxelErrors:
+    """Overlap of the occupied voxels of a result and of the truth, each in [0, 1]."""
+
+    iou: float
+    precision: float
+    recall: float
+    f1: float
+
+
+def voxel_errors(result: np.ndarray, truth: np.ndarray, size: float = 0.1) -> VoxelErrors:
+    """Overlap of the voxels floor(x / size) that points (N, 3) and (M, 3) in metres occupy; one scan (ILN, TULIP).
+
+    Means over scans are taken of these. Raises ValueError for other shapes, no points or NaN.
+    """
+    first, second = ({*map(tuple, np.floor(_points(p) / size).astype(np.int64).tolist())} for p in (result, truth))
+    both = len(first & second)
+    precision, recall = both / len(first), both / len(second)
+    return VoxelErrors(both / len(first | second), precision, recall, _harmonic(precision, recall))
+
+
+def confusion_matrix(truth: np.ndarray | Tensor, predicted: np.ndarray | Tensor, classes: int = 20) -> np.ndarray:
+    """(classes, classes) int64 pixels, truth by row, predicted by column; those of several scans simply add up.
+
+    Labels of one shape, 0 to classes - 1. Raises ValueError for other shapes or labels.
+    """
+    rows, columns = (torch.as_tensor(np.asarray(v).astype(np.int64)).flatten() for v in (truth, predicted))
+    both = torch.cat([rows, columns])
+    if len(rows) != len(columns) or not len(rows) or both.min() < 0 or both.max() >= classes:
+        raise ValueError(f"expected two images of one shape with labels 0-{classes - 1}, "
+                         f"found {tuple(truth.shape)} and {tuple(predicted.shape)}")  # fmt: skip
+    return torch.bincount(rows * classes + columns, minlength=classes**2).view(classes, classes).numpy()
+
+
+def class_iou(confusion: np.ndarray, without: tuple[int, ...] = ()) -> np.ndarray:
+    """(C,) float64 intersection over union of each class, 0 for classes that do not occur.
+
+    without  classes whose pixels do not count, in the truth or as predicted, as in the RangeNet repository's (0,)
+    """
+    counts = confusion.astype(np.float64)
+    counts[list(without)] = 0
+    counts[:, list(without)] = 0
+    hit = counts.diagonal()
+    return hit / np.maximum(counts.sum(0) + counts.sum(1) - hit, 1)
+
+
+def mean_iou(confusion: np.ndarray, without: tuple[int, ...] = (0,)) -> float:
+    """Mean of `class_iou` over the classes not in `without`, absent ones as 0 (RangeNet repository)."""
+    return float(np.delete(class_iou(confusion, without), list(without)).mean())
+
+
+def weighted_iou(confusion: np.ndarray) -> float:
+    """Mean of `class_iou` of all classes, weighted by their true pixels (LiDARGen: jaccard_score, `weighted`)."""
+    return float(np.average(class_iou(confusion), weights=confusion.sum(1)))
+
+
+def accuracy(confusion: np.ndarray, without: tuple[int, ...] = (0,)) -> float:
+    """Share of the pixels predicted right, pixels of the classes `without` left out on both sides."""
+    left = np.delete(np.delete(confusion, list(without), 0), list(without), 1)
+    return float(left.trace() / max(left.sum(), 1))

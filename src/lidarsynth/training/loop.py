@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import copy
 import math
-import os
+import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.build import build_denoiser
-from lidarsynth.data.dataset import CachedImages
 from lidarsynth.experiment import Experiment, Training
-from lidarsynth.training.steps import training_loss
+from lidarsynth.training.examples import Examples, Images, Streets, load_batches
+from lidarsynth.training.machine import accelerator_of, fixed_randomness, workers_of
+from lidarsynth.training.options import Options
+from lidarsynth.training.steps import Batch, Objective, generation_count
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
 
 
 @dataclass
@@ -26,14 +31,16 @@ class Run:
     ema: nn.Module
     optimizer: torch.optim.Optimizer
     step: int = 0
+    scaler: torch.amp.GradScaler | None = None  # of fp16
 
     def state_dict(self) -> dict:
-        """Weights, their average, optimiser state and the step; randomness follows from the step."""
+        """Weights, their average, optimiser, loss scale and the step, from which randomness and data order follow."""
         return {
             "network": self.network.state_dict(),
             "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "step": self.step,
+            "scaler": self.scaler.state_dict() if self.scaler else {},
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -42,23 +49,27 @@ class Run:
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step = state["step"]
+        if self.scaler and state.get("scaler"):
+            self.scaler.load_state_dict(state["scaler"])
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What one step of training yields: the step's number, from 1, its losses and the gradient's norm."""
+    """What one step of training yields: how many steps are done, and what the last one was like."""
 
     step: int
-    losses: dict[str, float]
+    losses: dict[str, float]  # `loss` and its parts, means over the global batch
     grad_norm: float
     learning_rate: float
+    seconds: float = 0.0  # that the step took
+    waited: float = 0.0  # seconds of these spent waiting for data
 
 
-def start(experiment: Experiment, network: nn.Module) -> Run:
-    """A fresh run from the network's present weights."""
+def start(experiment: Experiment, network: nn.Module, scaler: torch.amp.GradScaler | None = None) -> Run:
+    """A fresh run from the network's present weights; `scaler` is accelerate's, for fp16."""
     training = experiment.training
     optimizer = torch.optim.AdamW(network.parameters(), training.learning_rate, training.betas, weight_decay=0.0)
-    return Run(network, copy.deepcopy(network).requires_grad_(False), optimizer)
+    return Run(network, copy.deepcopy(network).requires_grad_(False), optimizer, scaler=scaler)
 
 
 def learning_rate(training: Training, step: int) -> float:
@@ -69,10 +80,18 @@ def learning_rate(training: Training, step: int) -> float:
     return training.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
+def ema_due(training: Training, step: int) -> bool:
+    """Whether the average is updated after step `step`, counted from 1: the first, then every `ema_every`-th."""
+    return (step - 1) % training.ema_every == 0
+
+
 def ema_decay(training: Training, step: int) -> float:
-    """0 (copy) until `ema_start`, then min(ema_decay, 1 - (1 + k)^(-2/3)) with k steps since (R2DM)."""
+    """Share of the old average that stays after step `step`, counted from 1 (R2DM, i.e. ema-pytorch).
+
+    0 (copy) up to the first update behind `ema_start`, then min(ema_decay, 1 - (1 + k)^(-2/3)) with k steps since.
+    """
     k = step - training.ema_start - 1
-    return 0.0 if k <= 0 else min(training.ema_decay, 1 - (1 + k) ** (-2 / 3))
+    return 0.0 if k <= training.ema_every else min(training.ema_decay, 1 - (1 + k) ** (-2 / 3))
 
 
 @torch.no_grad()
@@ -83,63 +102,91 @@ def update_ema(ema: nn.Module, network: nn.Module, decay: float) -> None:
         average.lerp_(source[name], 1 - decay) if average.is_floating_point() else average.copy_(source[name])
 
 
-def epoch_order(seed: int, epoch: int, length: int) -> Tensor:
-    """(length,) permutation of the data of one epoch, a function of the seed and the epoch only."""
-    return torch.randperm(length, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
+def train(
+    experiment: Experiment,
+    run: Run,
+    images: Images,
+    options: Options | None = None,
+    accelerator: Accelerator | None = None,
+) -> Iterator[Progress]:
+    """Train from `run.step` to the last step, yielding after each; randomness is a function of (seed, step, sample).
 
-
-def batch_indices(training: Training, step: int, length: int) -> list[int]:
-    """Which images step `step` sees: each epoch visits every image once."""
-    positions = range(step * training.batch_size, (step + 1) * training.batch_size)
-    epochs = {p // length: None for p in positions}
-    orders = {epoch: epoch_order(training.seed, epoch, length) for epoch in epochs}
-    return [int(orders[p // length][p % length]) for p in positions]
-
-
-def train(experiment: Experiment, run: Run, images: CachedImages) -> Iterator[Progress]:
-    """Train from `run.step` to the last step, yielding after each; all randomness is a function of (seed, step).
-
-    Raises FloatingPointError, naming the step and the images, when the loss is not finite.
+    The batch size is the global one: every process takes an equal share of it, in `options.accumulate` passes.
+    Raises ValueError when the shares are not equal; FloatingPointError, naming the step and the images, when the
+    loss or the gradient is not finite.
     """
-    training = experiment.training
-    denoiser = build_denoiser(experiment, run.network)
+    options = options or Options(workers=0)
+    accelerator = accelerator or accelerator_of(options)
+    training, passes = experiment.training, accelerator.gradient_accumulation_steps
+    examples = Examples(experiment, images, accelerator.num_processes * passes)
+    parts = range(accelerator.process_index, examples.parts, accelerator.num_processes)
+    pinned = accelerator.device.type == "cuda"
+    workers = workers_of(options, pinned or isinstance(images, Streets))
+    batches = load_batches(examples, run.step, parts, workers, pinned)
+    run.ema.to(accelerator.device)
     run.network.train()
+    objective, optimizer = accelerator.prepare(Objective(experiment, run.network, options.compile), run.optimizer)
     while run.step < training.steps:
-        rng = torch.Generator().manual_seed(training.seed * 1_000_003 + run.step)
-        indices = batch_indices(training, run.step, len(images))
-        losses = training_loss(experiment, denoiser, images.x_0(indices, experiment.data.codec), rng)
-        if not torch.isfinite(losses["loss"]):
-            raise FloatingPointError(f"step {run.step}: expected a finite loss, found {losses['loss']}; images {indices}")
-        rate, norm = _update(run, training, losses["loss"])
-        yield Progress(run.step, {name: float(v.detach()) for name, v in losses.items()}, norm, rate)
+        began = time.perf_counter()
+        with _dropout(experiment, run.step, accelerator.process_index):
+            losses, waited = _gradients(accelerator, objective, optimizer, batches, training)
+        norm = float(accelerator.clip_grad_norm_(run.network.parameters(), training.clip_norm))  # type: ignore[arg-type]
+        finite = math.isfinite(losses["loss"]) and (math.isfinite(norm) or accelerator.scaler is not None)
+        if not finite:
+            raise FloatingPointError(f"step {run.step + 1}: expected a finite loss and gradient, "
+                                     f"found {losses['loss']} and {norm}; "
+                                     f"scans {examples.names(run.step)}")  # fmt: skip
+        rate = _update(run, optimizer, training)
+        yield Progress(run.step, losses, norm, rate, time.perf_counter() - began, waited)
 
 
-def _update(run: Run, training: Training, loss: Tensor) -> tuple[float, float]:
-    """One optimiser step and, when due, the moving average; returns learning rate and gradient norm."""
-    rate = learning_rate(training, run.step + 1)
-    for group in run.optimizer.param_groups:
+def _dropout(experiment: Experiment, step: int, process: int) -> AbstractContextManager:
+    """Dropout draws from torch's global generator: fixed for the step, and put back."""
+    if experiment.model.dropout == 0:
+        return nullcontext()
+    return fixed_randomness(experiment.training.seed, step, process)
+
+
+def _gradients(
+    accelerator: Accelerator,
+    objective: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    batches: Iterator[Batch],
+    training: Training,
+) -> tuple[dict[str, float], float]:
+    """Gradients of one step's global batch; its losses, and the seconds spent waiting for data."""
+    from accelerate.utils import send_to_device
+
+    waited, sums = 0.0, torch.zeros(2, device=accelerator.device)
+    optimizer.zero_grad()
+    for _ in range(accelerator.gradient_accumulation_steps):
+        began = time.perf_counter()
+        batch = next(batches)
+        waited += time.perf_counter() - began
+        batch: Batch = send_to_device(batch, accelerator.device, non_blocking=True)  # type: ignore[assignment]
+        with accelerator.accumulate(objective):
+            losses = objective(batch)
+            accelerator.backward(losses.mean())
+        n = batch.generation
+        sums += torch.stack([losses[:n].sum(), losses[n:].sum()]).detach()
+    total = accelerator.reduce(sums, reduction="sum")
+    assert isinstance(total, Tensor)
+    return _means(total.tolist(), training), waited
+
+
+def _means(sums: list[float], training: Training) -> dict[str, float]:
+    count, size = generation_count(training), training.batch_size
+    parts = {"generation": (sums[0], count), "completion": (sums[1], size - count)}
+    return {"loss": sum(sums) / size, **{name: total / n for name, (total, n) in parts.items() if n}}
+
+
+def _update(run: Run, optimizer: torch.optim.Optimizer, training: Training) -> float:
+    """One optimiser step and, when due, the moving average; returns the learning rate."""
+    rate = learning_rate(training, run.step)
+    for group in optimizer.param_groups:
         group["lr"] = rate
-    run.optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    norm = float(nn.utils.clip_grad_norm_(run.network.parameters(), training.clip_norm))
-    run.optimizer.step()
+    optimizer.step()
     run.step += 1
-    if run.step % training.ema_every == 0:
+    if ema_due(training, run.step):
         update_ema(run.ema, run.network, ema_decay(training, run.step))
-    return rate, norm
-
-
-def save_run(path: str | Path, run: Run) -> None:
-    """Write the run's state; the file is moved into place when complete."""
-    path = Path(path)
-    scratch = path.with_suffix(".tmp")
-    torch.save(run.state_dict(), scratch)
-    os.replace(scratch, path)
-
-
-def load_run(path: str | Path, run: Run) -> None:
-    """Continue from a file of `save_run`. Raises ValueError when it is none, or of another network."""
-    try:
-        run.load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
-    except Exception as error:
-        raise ValueError(f"{path}: expected a training state of this experiment, found {error!s:.120}") from None
+    return rate

@@ -3,35 +3,61 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from lidarsynth.build import build_network, build_sensor, load_weights, read_experiment, save
-from lidarsynth.data.dataset import CachedImages
-from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.build import build_network, build_sensor, read_experiment
+from lidarsynth.experiment import Card, Experiment, with_fields
+from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.presets import preset
-from lidarsynth.training.loop import Progress, load_run, save_run, start, train
+from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
+from lidarsynth.training.examples import Images, open_images
+from lidarsynth.training.finetune import transfer
+from lidarsynth.training.journal import Journal
+from lidarsynth.training.loop import Progress, Run, start, train
+from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
+from lidarsynth.training.options import Options
+from lidarsynth.training.validation import Watch
 from lidarsynth.weights import load_parts
 
-STATE = "state.pt"
+if TYPE_CHECKING:
+    from accelerate import Accelerator
 
 
-def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0) -> Experiment:
-    """A preset with `group.field=value` changes, values in JSON or bare words. Raises ValueError by the field's name."""
-    fields = {"training.seed": seed}
+def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str | Path | None = None) -> Experiment:
+    """A preset with `group.field=value` changes, values in JSON or bare words, for the images of cache `data`.
+
+    The sensor and the resolution are the cache's, unless `changes` name them. Raises ValueError by the field's name.
+    """
+    chosen: dict[str, Any] = {"training.seed": seed}
     for change in changes:
         path, equals, text = change.partition("=")
         if not equals:
             raise ValueError(f"expected group.field=value, such as training.steps=1000, found {change!r}")
         try:
-            fields[path] = json.loads(text)
+            chosen[path] = json.loads(text)
         except json.JSONDecodeError:
-            fields[path] = text
-    return with_fields(preset(name), fields)
+            chosen[path] = text
+    experiment = with_fields(preset(name), chosen)
+    return experiment if data is None else _for_images(experiment, data, any(key.startswith("data.") for key in chosen))
+
+
+def _for_images(experiment: Experiment, data: str | Path, chosen: bool) -> Experiment:
+    """The experiment with the sensor of the images, unless the user chose fields of `data`."""
+    found, expected = open_images(data, experiment).sensor, build_sensor(experiment)
+    shape, (height, width) = (found.height, found.width), (expected.height, expected.width)
+    if chosen and shape != (height, width):
+        raise ValueError(f"{data}: expected images of {height} x {width}, found {shape[0]} x {shape[1]}")
+    if chosen or found == expected:
+        return experiment
+    words = [w for w, s in SENSORS.items() if s.height % found.height == 0 and s.resized(*shape) == found]
+    sensor = words[0] if words else found.to_dict()
+    return with_fields(experiment, {"data.sensor": sensor, "data.height": shape[0], "data.width": shape[1]})
 
 
 def run(
@@ -39,48 +65,111 @@ def run(
     data: str | Path,
     out: str | Path,
     weights: str | None = None,
-    threads: int = 0,
-    every: int = 50,
-    save_every: int = 500,
-) -> Iterator[str]:
-    """Train on a cache and yield a line of progress `every` steps; state and weights go to `out` `save_every` steps.
+    validation: str | Path | None = None,
+    options: Options | None = None,
+    resume: bool = False,
+) -> Iterator[Progress]:
+    """Train on a cache, or on `synthetic` streets, into folder `out`; in the main process, yield after every step.
 
-    A folder that holds a state of the same experiment is continued exactly. Raises ValueError when the cache has other
-    images than the experiment, or the folder another experiment.
+    The first yield says where the run stands: at 0, or at the step of the newest checkpoint; that is continued exactly.
+    weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet
+    validation  cache of images that are not trained on
+    resume      insist that there is a checkpoint
+
+    SIGTERM or Ctrl-C saves after the present step and ends the iteration. Raises ValueError when experiment, images,
+    weights or folder do not fit; FloatingPointError, naming step, scans and last checkpoint, when it is not finite.
     """
-    if threads:
-        torch.set_num_threads(threads)
-    out, images = Path(out), CachedImages(data)
-    expected, found = build_sensor(experiment), images.sensor
-    if (expected.height, expected.width) != (found.height, found.width):
-        raise ValueError(f"{data}: expected images of {expected.height} x {expected.width}, "
+    options = options or Options()
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    out, accelerator = Path(out), accelerator_of(options)
+    images = open_images(data, experiment)
+    experiment, state = _begin(experiment, images, out, weights, resume, accelerator)
+    if accelerator.is_main_process:
+        yield Progress(state.step, {}, 0.0, 0.0)
+    watch = Watch(experiment, data, validation)
+    with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
+        try:
+            for progress in train(experiment, state, images, options, accelerator):
+                stop = any_process(accelerator, bool(received))
+                if journal:
+                    journal.step(progress)
+                    if stop or _due(progress.step, options.save_every, experiment):
+                        save_checkpoint(out, _with_history(experiment, state.step, accelerator), state, options.keep)
+                    if not stop and _due(progress.step, options.sample_every, experiment):
+                        watch.look(state.ema, state.step, journal)
+                    yield progress
+                if stop:
+                    break
+        except FloatingPointError as error:
+            raise FloatingPointError(f"{error}; last good checkpoint: {(checkpoints(out) or ['none'])[-1]}") from None
+    accelerator.end_training()
+
+
+def _begin(
+    experiment: Experiment, images: Images, out: Path, weights: str | None, resume: bool, accelerator: Accelerator
+) -> tuple[Experiment, Run]:
+    """The experiment with its card, and the run: fresh, from weights, or as the newest checkpoint has it."""
+    found, expected = images.sensor, build_sensor(experiment)
+    if (found.height, found.width) != (expected.height, expected.width):
+        raise ValueError(f"{images.source}: expected images of {expected.height} x {expected.width}, "
                          f"found {found.height} x {found.width}")  # fmt: skip
-    torch.manual_seed(experiment.training.seed)
-    network = build_network(experiment)
-    if weights:
-        load_weights(network, load_parts(weights)[1].state_dict(), weights)
-    state = start(experiment, network)
-    if (out / STATE).exists():
-        _same_experiment(out, experiment)
-        load_run(out / STATE, state)
-    out.mkdir(parents=True, exist_ok=True)
-    began, first = time.monotonic(), state.step
-    for progress in train(experiment, state, images):
-        if progress.step % every == 0 or progress.step == experiment.training.steps:
-            yield line(progress, (time.monotonic() - began) / (progress.step - first))
-        if progress.step % save_every == 0 or progress.step == experiment.training.steps:
-            save_run(out / STATE, state)
-            save(out, experiment, state.ema)
+    with fixed_randomness(experiment.training.seed):
+        network = build_network(experiment)
+    card = Card(data=json.dumps(images.source))
+    saved = checkpoints(out)
+    if resume and not saved:
+        raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
+    if weights and not saved:
+        source, trained = load_parts(weights)
+        transfer(network, experiment, trained, source, weights)
+        learned = "; ".join(filter(None, (source.card.data, card.data)))
+        card = Card(source.card.licence, learned, (*source.card.history, f"from {source.name}"))
+    state = start(experiment, network, accelerator.scaler)
+    if saved:
+        card = _same_experiment(saved[-1], experiment).card
+        card = replace(card, history=card.history[:-1])  # the last line is this run's, written anew at each checkpoint
+        load_run(saved[-1] / STATE, state)
+    elif accelerator.is_main_process:
+        out.mkdir(parents=True, exist_ok=True)
+        sweep(out)
+    accelerator.wait_for_everyone()
+    return replace(experiment, card=card), state
 
 
-def line(progress: Progress, seconds: float) -> str:
-    """Step, losses, gradient norm, learning rate and seconds per step, in one line."""
-    losses = " ".join(f"{name} {value:.4f}" for name, value in progress.losses.items())
-    return (f"step {progress.step} {losses} norm {progress.grad_norm:.2f} "
-            f"rate {progress.learning_rate:.1e} {seconds:.2f} s/step")  # fmt: skip
-
-
-def _same_experiment(out: Path, experiment: Experiment) -> None:
-    found = read_experiment(out)
+def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
+    """The checkpoint's record. Raises ValueError that names the first field that differs."""
+    found = read_experiment(checkpoint)
     if replace(found, card=experiment.card) != experiment:
-        raise ValueError(f"{out}: expected a run of this experiment, found another one in experiment.json")
+        theirs, ours = (_flat(e.to_dict()) for e in (found, experiment))
+        key = next(key for key in ours if key.partition(".")[0] != "card" and ours[key] != theirs.get(key))
+        raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {theirs.get(key)!r:.60}, "
+                         f"found {ours[key]!r:.60}; another folder begins a new run")  # fmt: skip
+    return found
+
+
+def _flat(record: dict) -> dict:
+    groups = {key: value if isinstance(value, dict) else {"": value} for key, value in record.items()}
+    return {f"{group}.{key}".rstrip("."): value for group, part in groups.items() for key, value in part.items()}
+
+
+def _with_history(experiment: Experiment, step: int, accelerator: Accelerator) -> Experiment:
+    device = torch.cuda.get_device_name() if accelerator.device.type == "cuda" else accelerator.device.type
+    line = f"{step:,} steps of {experiment.training.batch_size} on {accelerator.num_processes} x {device}"
+    return replace(experiment, card=replace(experiment.card, history=(*experiment.card.history, line)))
+
+
+def _due(step: int, every: int, experiment: Experiment) -> bool:
+    return every > 0 and (step % every == 0 or step == experiment.training.steps)
+
+
+@contextmanager
+def _journal(
+    experiment: Experiment, out: Path, step: int, options: Options, accelerator: Accelerator
+) -> Iterator[Journal | None]:
+    """The main process's journal; None in the others."""
+    if not accelerator.is_main_process:
+        yield None
+        return
+    with closing(Journal(out, step, experiment.training.batch_size, options.log_every, options.wandb)) as journal:
+        yield journal

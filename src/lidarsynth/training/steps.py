@@ -1,96 +1,151 @@
-"""One training step's loss: generation (R2DM eq. 2-3) and completion of randomly hidden pixels."""
+"""One training step's loss: generation (R2DM eq. 2-3) and completion of randomly hidden pixels.
+
+All randomness of a sample is a function of (seed, step, its position in the global batch), so that the loss does not
+depend on how many processes, workers or passes share a batch, and a resumed run draws what it would have drawn.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.experiment import Experiment
-
-
-def augment(x_0: Tensor, rng: torch.Generator, roll: bool, mirror: bool) -> Tensor:
-    """x_0 (B, C, H, W), each sample turned by any number of columns and mirrored left-right half of the time."""
-    batch, width = len(x_0), x_0.shape[-1]
-    shifts = torch.randint(width, (batch,), generator=rng).tolist()
-    flips = torch.rand(batch, generator=rng) < 0.5
-    if roll:
-        x_0 = torch.stack([torch.roll(x, shift, dims=-1) for x, shift in zip(x_0, shifts, strict=True)])
-    if mirror:
-        x_0 = torch.where(flips[:, None, None, None], x_0.flip(-1), x_0)
-    return x_0
+from lidarsynth.build import build_denoiser
+from lidarsynth.diffusion.denoiser import Denoiser, min_snr_weight
+from lidarsynth.experiment import Data, Experiment, Training
 
 
-def training_loss(experiment: Experiment, denoiser: Denoiser, x_0: Tensor, rng: torch.Generator) -> dict[str, Tensor]:
-    """Losses of a batch x_0 (B, 2, H, W), scalars: `loss` to minimise, and its parts `generation`, `completion`.
+class Batch(NamedTuple):
+    """One process's share of one pass: b samples, the first `generation` of which learn p(x_0), the rest completion."""
 
-    The first `generation_share` of the batch learns p(x_0), the rest p(x_0 | known pixels): for a network that is told
-    the known pixels, cf. conditional diffusion for LiDAR upsampling (Helgesen et al. 2024, arXiv 2405.04889).
+    x_0: Tensor  # (b, 2, H, W) in [-1, 1], augmented
+    t: Tensor  # (b,) times in [0, 1]
+    eps: Tensor  # (b, 2, H, W) unit Gaussian noise
+    known: Tensor  # (b, 2, H, W) bool, False everywhere for the first `generation`
+    times: Tensor  # (generation_count,) times of all samples of the global batch that learn p(x_0), for `mean_weight`
+    generation: int
+
+
+class Objective(nn.Module):
+    """`objective(batch) -> (b,)`, the loss per sample; its mean over the global batch is minimised.
+
+    The first samples learn p(x_0), the others p(x_0 | known pixels): for a network that is told the known pixels, cf.
+    conditional diffusion for LiDAR upsampling (Helgesen et al. 2024, arXiv 2405.04889). A module, so that one wrapper
+    (distributed, autocast) holds both calls of the network; noising stays in float32.
     """
-    x_0 = augment(x_0, rng, experiment.data.roll, experiment.data.mirror)
-    count = round(experiment.training.generation_share * len(x_0))
-    parts = {}
-    if count:
-        parts["generation"] = generation_loss(experiment, denoiser, x_0[:count], rng)
-    if count < len(x_0):
-        parts["completion"] = completion_loss(denoiser, x_0[count:], rng)
-    share = count / len(x_0)
-    total = share * parts.get("generation", 0) + (1 - share) * parts.get("completion", 0)
-    return {"loss": torch.as_tensor(total), **parts}
+
+    def __init__(self, experiment: Experiment, network: nn.Module, compiled: bool = False):
+        super().__init__()
+        self.experiment = experiment
+        self.network = network
+        called = torch.compile(network) if compiled else network
+        self.denoiser = build_denoiser(experiment, called)  # type: ignore[arg-type]
+
+    def forward(self, batch: Batch) -> Tensor:
+        losses, n = [], batch.generation
+        if n:
+            x_0, t, eps = (part[:n] for part in (batch.x_0, batch.t, batch.eps))
+            losses.append(generation_loss(self.experiment, self.denoiser, x_0, t, eps, batch.times))
+        if n < len(batch.x_0):
+            x_0, t, eps, known = (part[n:] for part in (batch.x_0, batch.t, batch.eps, batch.known))
+            losses.append(completion_loss(self.denoiser, x_0, t, eps, known))
+        return torch.cat(losses)
 
 
-def noise(x_0: Tensor, rng: torch.Generator) -> Tensor:
-    """Unit Gaussian noise like x_0, drawn on the generator's device."""
-    return torch.randn(x_0.shape, generator=rng, device=rng.device).to(x_0)
+def generation_loss(
+    experiment: Experiment, denoiser: Denoiser, x_0: Tensor, t: Tensor, eps: Tensor, times: Tensor
+) -> Tensor:
+    """Weighted loss (b,) of samples that learn p(x_0); `times` are those of all such samples of the global batch.
 
-
-def generation_loss(experiment: Experiment, denoiser: Denoiser, x_0: Tensor, rng: torch.Generator) -> Tensor:
-    """Mean loss at uniformly drawn times, scalar."""
+    With `mean_weight`, R2DM's mean(loss) * mean(weight), the mean weight is that of `times`. R2DM's program takes it
+    over each device's samples, so its loss depends on the number of devices; ours is its loss on one, always.
+    """
     diffusion = experiment.diffusion
-    t = torch.rand(len(x_0), generator=rng, device=rng.device).to(x_0)
-    return denoiser.loss(
-        x_0,
-        t,
-        noise(x_0, rng),
-        loss=diffusion.loss,
-        gamma=diffusion.gamma,
-        mean_weight=diffusion.mean_weight,
-    ).mean()
+    gamma = None if diffusion.mean_weight else diffusion.gamma
+    losses = denoiser.loss(x_0, t, eps, loss=diffusion.loss, gamma=gamma)
+    if diffusion.gamma is None or not diffusion.mean_weight:
+        return losses
+    log_snr, alpha, sigma = denoiser.schedule.at(times, times)
+    return losses * min_snr_weight(denoiser.kind, log_snr, alpha, sigma, diffusion.gamma).mean()
 
 
-def completion_loss(denoiser: Denoiser, x_0: Tensor, rng: torch.Generator) -> Tensor:
-    """Mean absolute error of the hidden pixels, scalar; half of the times are 1, where completion begins.
+def completion_loss(denoiser: Denoiser, x_0: Tensor, t: Tensor, eps: Tensor, known: Tensor) -> Tensor:
+    """Mean absolute error (b,) of the pixels that are not `known` (b, 2, H, W).
 
     The absolute error has the median as its optimum, which is the same in metres and in any depth code.
     """
-    known = random_known(x_0, rng).to(x_0)
-    t = torch.rand(2, len(x_0), generator=rng).to(x_0)
-    t = torch.where(t[1] < 0.5, t[0], torch.ones_like(t[0]))
-    return denoiser.given(x_0, known).loss(x_0, t, noise(x_0, rng), mask=1 - known, loss="l1", gamma=None).mean()
+    mask = known.to(x_0)
+    return denoiser.given(x_0, mask).loss(x_0, t, eps, mask=1 - mask, loss="l1", gamma=None)
+
+
+def generation_count(training: Training) -> int:
+    """How many samples of the global batch, the first ones, learn p(x_0)."""
+    return round(training.generation_share * training.batch_size)
+
+
+def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> Batch:
+    """The batch of clean images x_0 (b, 2, H, W) that stand at rising `positions` of step `step`'s global batch."""
+    count = generation_count(experiment.training)
+    seed = experiment.training.seed
+    drawn = [
+        _draw(experiment.data, x, p >= count, sample_rng(seed, step, p)) for x, p in zip(x_0, positions, strict=True)
+    ]
+    times = [
+        draw_time(sample_rng(seed, step, p), False) for p in range(count if experiment.diffusion.mean_weight else 0)
+    ]
+    x_0, t, eps, known = map(torch.stack, zip(*drawn, strict=True))
+    return Batch(x_0, t, eps, known, torch.tensor(times), sum(p < count for p in positions))
+
+
+def sample_rng(seed: int, step: int, position: int) -> torch.Generator:
+    """The generator of one sample; neighbouring keys give unrelated streams."""
+    # torch's CPU generator uses 32 bits of its seed, so the key is hashed, not added up
+    return torch.Generator().manual_seed(int(np.random.SeedSequence((seed, step, position)).generate_state(1)[0]))
+
+
+def _draw(data: Data, x_0: Tensor, completes: bool, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """x_0, t, eps and known of one sample (2, H, W)."""
+    t = draw_time(rng, completes)  # first, because `draw` repeats it for the other processes' samples
+    x_0 = augment(x_0, rng, data.roll, data.mirror)
+    known = random_known(x_0, rng) if completes else torch.zeros(x_0.shape, dtype=torch.bool)
+    return x_0, t, torch.randn(x_0.shape, generator=rng), known
+
+
+def draw_time(rng: torch.Generator, completes: bool) -> Tensor:
+    """t () ~ U(0, 1); for completion, half of the times are 1, where it begins."""
+    t, begins = torch.rand(2, generator=rng)
+    return torch.ones(()) if completes and begins < 0.5 else t
+
+
+def augment(x_0: Tensor, rng: torch.Generator, roll: bool, mirror: bool) -> Tensor:
+    """x_0 (2, H, W) turned by any number of columns and mirrored left-right half of the time."""
+    shift = int(torch.randint(x_0.shape[-1], (), generator=rng))
+    flip = bool(torch.rand((), generator=rng) < 0.5)
+    if roll:
+        x_0 = torch.roll(x_0, shift, dims=-1)
+    return x_0.flip(-1) if mirror and flip else x_0
 
 
 def random_known(x_0: Tensor, rng: torch.Generator) -> Tensor:
-    """Bool (B, C, H, W): per sample a random pattern of known pixels, of one of six kinds.
+    """Bool (2, H, W): a random pattern of known pixels, of one of six kinds.
 
     Half of the samples also hide where the sensor measured nothing (-1 in x_0), as in a scan whose drop-outs are to be
     filled; a tenth hide all reflectance.
     """
-    known = []
-    for x in x_0:
-        draw = torch.rand(10, generator=rng).tolist()
-        mask = _pattern(x.shape[1], x.shape[2], draw, rng).expand(x.shape).clone()
-        if draw[8] < 0.5:
-            mask &= x[:1] > -1
-        if draw[9] < 0.1:
-            mask[1] = False
-        known.append(mask)
-    return torch.stack(known)
+    dice = torch.rand(10, generator=rng).tolist()
+    known = _pattern(x_0.shape[1], x_0.shape[2], dice, rng).expand(x_0.shape).clone()
+    if dice[8] < 0.5:
+        known &= x_0[:1] > -1
+    if dice[9] < 0.1:
+        known[1] = False
+    return known
 
 
 def _pattern(height: int, width: int, draw: list[float], rng: torch.Generator) -> Tensor:
-    """Bool (H, W): even beams (half of all), uneven beams, points, a lost sector, a lost rectangle, or beams + points."""
+    """Bool (H, W): even beams (most), uneven beams, points, a lost sector, a lost rectangle, or beams + points."""
     mask = torch.ones(height, width, dtype=torch.bool)
     if draw[0] < 0.6:  # every k-th beam, k = 2, 3, 4, 4, 4, 6, 8
         step = (2, 3, 4, 4, 4, 6, 8)[int(draw[1] * 7)]
@@ -99,7 +154,7 @@ def _pattern(height: int, width: int, draw: list[float], rng: torch.Generator) -
         mask[first::step] = True
     elif draw[0] < 0.7:  # any beams, one in eight to one in two
         mask = mask & (torch.rand(height, 1, generator=rng) < 1 / 8 + 3 / 8 * draw[1])
-    if draw[0] > 0.7 and draw[0] < 0.82 or draw[4] < 0.1:  # a share of the points, 2 % to 80 %
+    if 0.7 < draw[0] < 0.82 or draw[4] < 0.1:  # a share of the points, 2 % to 80 %
         share = math.exp(math.log(0.02) + draw[5] * math.log(40))
         mask = mask & (torch.rand(height, width, generator=rng) < share)
     if 0.82 <= draw[0] < 0.91:  # a sector of 20 to 180 degrees is lost

@@ -35,6 +35,7 @@ class Area:
     bend: Range  # m, amplitude of the road's waves
     slope: float  # standard deviation of the gradient
     verge: tuple[str, ...]  # material words between sidewalk and fronts
+    closed: float = 0.5  # how far houses close the view: share of road ends, and density of those behind
     rails: float = 0.0  # share of streets with a tram
     bank: float = 0.0  # standard deviation of the slope beside the road
 
@@ -42,34 +43,35 @@ class Area:
 # fmt: off
 AREAS: dict[str, Area] = {
     "city": Area(
-        weight=0.30, half=(3.0, 5.5), walk=(1.8, 4.5), parking=(0.7, 0.6), parked=(0.4, 0.95), setback=(0.0, 1.5),
-        house=(8, 24), gap=(0, 2), vacant=0.10, shops=0.45, borders=(0.1, 0.05, 0.1, 0.75), trees=(0, 7), garden=(0, 2),
-        thicket=(0, 1), lamps=3.0, signs=5.0, people=(1, 9), bicycles=(0, 6), traffic=(0.5, 3.5), crossings=(1, 3),
-        lanes=(0.35, 0.1), bend=(0, 4), slope=0.015, verge=("sidewalk",), rails=0.15),
+        weight=0.21, half=(3.0, 6.5), walk=(2.0, 5.5), parking=(0.7, 0.6), parked=(0.3, 0.85), setback=(0.0, 3.0),
+        house=(8, 24), gap=(0, 2), vacant=0.10, shops=0.45, borders=(0.1, 0.15, 0.1, 0.65), trees=(0, 8), garden=(0, 4),
+        thicket=(0, 2), lamps=3.0, signs=9.0, people=(1, 9), bicycles=(0, 6), traffic=(0.5, 3.5), crossings=(1, 3),
+        lanes=(0.35, 0.1), bend=(0, 9), slope=0.015, verge=("sidewalk",), closed=0.6, rails=0.15),
     "old town": Area(
-        weight=0.12, half=(1.9, 2.8), walk=(0.7, 2.0), parking=(0.35, 0.2), parked=(0.3, 0.8), setback=(0.0, 0.6),
-        house=(6, 15), gap=(0, 0.5), vacant=0.07, shops=0.35, borders=(0.3, 0.1, 0.2, 0.4), trees=(0, 2), garden=(0, 2),
-        thicket=(0, 1), lamps=3.0, signs=4.0, people=(0, 7), bicycles=(0, 5), traffic=(0, 1), crossings=(1, 3),
-        lanes=(0.0, 0.0), bend=(0, 6), slope=0.02, verge=("sidewalk", "gravel")),
+        weight=0.08, half=(1.9, 2.8), walk=(1.0, 2.5), parking=(0.35, 0.2), parked=(0.3, 0.8), setback=(0.0, 0.6),
+        house=(6, 15), gap=(0, 0.5), vacant=0.07, shops=0.35, borders=(0.3, 0.2, 0.2, 0.3), trees=(0, 3), garden=(0, 4),
+        thicket=(0, 2), lamps=3.0, signs=6.0, people=(0, 7), bicycles=(0, 5), traffic=(0, 1), crossings=(1, 3),
+        lanes=(0.0, 0.0), bend=(0, 10), slope=0.02, verge=("sidewalk", "gravel"), closed=0.8),
     "residential": Area(
-        weight=0.27, half=(2.4, 3.3), walk=(1.0, 2.4), parking=(0.5, 0.4), parked=(0.2, 0.8), setback=(2.0, 8.0),
-        house=(9, 17), gap=(2, 9), vacant=0.12, shops=0.02, borders=(0.25, 0.35, 0.25, 0.15), trees=(0, 4),
-        garden=(3, 14), thicket=(1, 6), lamps=2.5, signs=2.5, people=(0, 2), bicycles=(0, 1), traffic=(0, 1),
-        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 7), slope=0.03, verge=("grass", "grass", "gravel"), bank=0.04),
+        weight=0.38, half=(2.4, 3.3), walk=(1.3, 3.5), parking=(0.5, 0.4), parked=(0.2, 0.8), setback=(2.0, 11.0),
+        house=(9, 17), gap=(2, 12), vacant=0.15, shops=0.02, borders=(0.17, 0.55, 0.18, 0.1), trees=(0, 6),
+        garden=(6, 24), thicket=(2, 12), lamps=2.5, signs=4.0, people=(0, 2), bicycles=(0, 1), traffic=(0, 1),
+        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 10), slope=0.03, verge=("grass", "grass", "gravel"), closed=0.5, bank=0.07),
     "avenue": Area(
         weight=0.13, half=(5.5, 9.0), walk=(1.5, 4.0), parking=(0.2, 0.2), parked=(0.2, 0.7), setback=(4.0, 18.0),
-        house=(15, 45), gap=(3, 25), vacant=0.35, shops=0.15, borders=(0.1, 0.15, 0.2, 0.55), trees=(0, 8),
-        garden=(1, 8), thicket=(1, 6), lamps=3.5, signs=5.0, people=(0, 3), bicycles=(0, 2), traffic=(1.0, 4.0),
-        crossings=(0, 2), lanes=(0.7, 0.2), bend=(0, 4), slope=0.01, verge=("grass", "sidewalk"), rails=0.2, bank=0.03),
+        house=(15, 45), gap=(3, 25), vacant=0.35, shops=0.15, borders=(0.1, 0.35, 0.15, 0.4), trees=(0, 10),
+        garden=(3, 16), thicket=(2, 14), lamps=3.5, signs=9.0, people=(0, 3), bicycles=(0, 2), traffic=(1.0, 4.0),
+        crossings=(0, 2), lanes=(0.7, 0.2), bend=(0, 4), slope=0.01, verge=("grass", "sidewalk"), closed=0.5,
+        rails=0.2, bank=0.04),
     "country": Area(
-        weight=0.10, half=(2.8, 4.0), walk=(0.0, 0.0), parking=(0.0, 0.0), parked=(0, 0), setback=(8.0, 30.0),
-        house=(10, 30), gap=(20, 80), vacant=0.6, shops=0.0, borders=(0.02, 0.08, 0.25, 0.65), trees=(0, 5),
-        garden=(1, 8), thicket=(3, 16), lamps=0.5, signs=3.0, people=(0, 0.3), bicycles=(0, 0), traffic=(0.2, 2),
-        crossings=(0, 1), lanes=(0.6, 0.2), bend=(0, 12), slope=0.025, verge=("grass",), bank=0.09),
+        weight=0.11, half=(2.8, 4.0), walk=(0.0, 0.0), parking=(0.0, 0.0), parked=(0, 0), setback=(8.0, 30.0),
+        house=(10, 30), gap=(20, 80), vacant=0.6, shops=0.0, borders=(0.02, 0.3, 0.2, 0.48), trees=(0, 6),
+        garden=(4, 20), thicket=(6, 30), lamps=0.5, signs=3.0, people=(0, 0.3), bicycles=(0, 0), traffic=(0.2, 2),
+        crossings=(0, 1), lanes=(0.6, 0.2), bend=(0, 12), slope=0.025, verge=("grass",), closed=0.25, bank=0.11),
     "campus": Area(
-        weight=0.08, half=(2.4, 4.0), walk=(1.5, 4.0), parking=(0.5, 0.3), parked=(0.3, 0.8), setback=(5.0, 22.0),
-        house=(15, 50), gap=(5, 25), vacant=0.2, shops=0.3, borders=(0.08, 0.2, 0.12, 0.6), trees=(1, 6),
-        garden=(2, 10), thicket=(0, 4), lamps=3.0, signs=3.0, people=(1, 8), bicycles=(0, 12), traffic=(0, 1),
-        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 5), slope=0.012, verge=("grass", "sidewalk"), bank=0.03),
+        weight=0.09, half=(2.4, 4.0), walk=(1.5, 4.0), parking=(0.5, 0.3), parked=(0.3, 0.8), setback=(5.0, 22.0),
+        house=(15, 50), gap=(5, 25), vacant=0.2, shops=0.3, borders=(0.08, 0.4, 0.1, 0.42), trees=(1, 9),
+        garden=(4, 18), thicket=(1, 8), lamps=3.0, signs=3.0, people=(1, 8), bicycles=(0, 12), traffic=(0, 1),
+        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 5), slope=0.012, verge=("grass", "sidewalk"), closed=0.7, bank=0.03),
 }
 # fmt: on

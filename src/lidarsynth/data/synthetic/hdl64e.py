@@ -6,6 +6,9 @@ of the instrument, not of any scene.
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 
 from lidarsynth.lidar.sensor import Sensor
@@ -20,6 +23,22 @@ RING_LOSS = (
     0.052, 0.038, 0.038, 0.117, 0.046, 0.038, 0.095, 0.104, 0.081, 0.157, 0.182, 0.076, 0.004,
     0.025, 0.111, 0.090, 0.186, 0.076, 0.086, 0.081, 0.073, 0.111, 0.130, 0.046, 0.010, 0.209,
     0.092, 0.136, 0.138, 0.078, 0.065, 0.000, 0.131, 0.133, 0.154, 0.038, -0.013, 0.017)
+
+# How much less signal it reports from 4 to 6 m, where its optics are too close: dark patches on near walls.
+RING_DIP = (
+    0.157, 0.160, 0.050, 0.233, 0.123, 0.223, 0.117, 0.209, 0.237, 0.250, 0.317, 0.167, 0.330,
+    0.313, 0.233, 0.320, 0.330, 0.229, 0.284, 0.240, 0.157, 0.173, 0.287, 0.153, 0.233, 0.180,
+    0.033, 0.244, 0.214, 0.095, 0.150, 0.083, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+    0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+    0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+# Metres that each laser reads too far; the upper block measured on walls, the lower one within what the ground allows.
+RING_SHIFT = (
+    0.005, -0.013, 0.031, -0.010, 0.006, -0.056, 0.048, -0.016, -0.022, 0.007, 0.027, -0.012, 0.019,
+    0.005, -0.019, -0.020, 0.033, 0.004, 0.071, 0.014, 0.012, -0.009, -0.033, -0.058, -0.041, -0.068,
+    -0.018, -0.012, 0.038, 0.012, 0.063, 0.011, 0.003, 0.007, 0.003, -0.010, 0.007, 0.004, -0.004,
+    0.005, 0.003, 0.002, 0.0, 0.004, -0.006, -0.001, -0.004, 0.005, 0.0, -0.002, -0.006, -0.002,
+    0.0, -0.002, 0.010, 0.008, -0.022, -0.015, -0.001, -0.003, 0.002, 0.002, 0.017, -0.009)
 
 # Outlines of what stands on the car's roof and hides the ground: for each part, (row, first column, last column) at
 # 1024 columns, row by row; and by how many columns every second laser of the lower block sees it shifted.
@@ -39,8 +58,10 @@ _EGO = (
 # fmt: on
 
 
-def own_car(sensor: Sensor, width: int) -> np.ndarray:
-    """(H, width) bool: which rays end on the vehicle itself. All False for other sensors than `hdl-64e-kitti`."""
+@lru_cache(maxsize=4)
+def own_car(sensor: Sensor) -> np.ndarray:
+    """(H, W) bool: which rays end on the vehicle itself. All False for other sensors than `hdl-64e-kitti`."""
+    width = sensor.width
     hidden = np.zeros((sensor.height, width), bool)
     if sensor.name != NAME:
         return hidden
@@ -55,6 +76,19 @@ def own_car(sensor: Sensor, width: int) -> np.ndarray:
     return hidden
 
 
-def ring_loss(sensor: Sensor) -> np.ndarray:
-    """(H,) float32: signal each beam loses, 0 for sensors not measured."""
-    return np.array(RING_LOSS if sensor.name == NAME else [0.0] * sensor.height, np.float32)
+class Lasers(NamedTuple):
+    """Per ray: signal lost (N,), signal lost at 4 to 6 m (N,), metres read too far (N,), laser number (N,)."""
+
+    loss: np.ndarray
+    dip: np.ndarray
+    shift: np.ndarray
+    number: np.ndarray
+
+
+@lru_cache(maxsize=4)
+def lasers(sensor: Sensor) -> Lasers:
+    """For each ray of the sensor's image that its own car does not hide, row by row; zeros for sensors not measured."""
+    seen = ~own_car(sensor).reshape(-1)
+    tables = [RING_LOSS, RING_DIP, RING_SHIFT] if sensor.name == NAME else [np.zeros(sensor.height)] * 3
+    spread = [np.repeat(np.asarray(table, np.float32), sensor.width)[seen] for table in tables]
+    return Lasers(*spread, number=np.repeat(np.arange(sensor.height, dtype=np.uint32), sensor.width)[seen])

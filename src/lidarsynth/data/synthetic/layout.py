@@ -23,13 +23,15 @@ def build(rng: np.random.Generator) -> World:
 
 
 def fill(lot: Lot, places: Array) -> None:
-    """Everything of one world. places (8, 2): (s, d) of the poses on the main road, kept free."""
+    """Everything of one world. places (16, 2): (s, d) of the poses on the main road, kept free."""
+    closings(lot)
     for number, road in enumerate(lot.ground.roads):
         for side in (-1, 1):
             fronts(lot, road, side)
             gardens(lot, road, side)
             kerbside(lot, road, side, main=number == 0)
             backdrop(lot, road, side)
+            car_park(lot, road, side)
             if number == 0:
                 parked(lot, road, side, places)
                 moving(lot, road, side, places)
@@ -69,7 +71,7 @@ def fronts(lot: Lot, road: Road, side: int) -> None:
         _houses(lot, road, side, s, rng.uniform(1.2, 3.5, bays.sum()), near[bays] - out, out + 0.5)
 
 
-def _houses(lot: Lot, road: Road, side: int, s: Array, length: Array, near: Array, depth: Array) -> None:
+def _houses(lot: Lot, road: Road, side: int, s: Array, length: Array, near: Array, depth: Array, across: bool = False) -> None:
     """Boxes from (s, near) to (s + length, near + depth) beside a road; those on a carriageway are left out."""
     rng, count = lot.rng, len(s)
     if not count:
@@ -85,7 +87,7 @@ def _houses(lot: Lot, road: Road, side: int, s: Array, length: Array, near: Arra
     fine = (0, 1, 2, 3, 4)
     edge_x = np.concatenate([x + (np.roll(x, -1, 1) - x) * k / 5 for k in fine], axis=1)
     edge_y = np.concatenate([y + (np.roll(y, -1, 1) - y) * k / 5 for k in fine], axis=1)
-    keep = (lot.ground.carriageway(edge_x, edge_y) > 0.7).all(axis=1)
+    keep = across | (lot.ground.carriageway(edge_x, edge_y) > 0.7).all(axis=1)
     tall = rng.uniform(5, 14, count)
     rows = facade_rows(rng, lot.area.shops, count)
     x, y, tall, rows = x[keep], y[keep], tall[keep], rows[keep]
@@ -113,12 +115,12 @@ def facade_rows(rng: np.random.Generator, shops: float, count: int) -> Array:
     rows = np.zeros((count, 12))
     shop = rng.random(count) < shops
     rows[:, 5] = np.where(shop, rng.uniform(2.5, 5.0, count), rng.uniform(1.8, 4.5, count))  # period
-    rows[:, 6] = np.where(shop, rng.uniform(0.7, 0.92, count), rng.uniform(0.25, 0.55, count))  # window share
+    rows[:, 6] = np.where(shop, rng.uniform(0.55, 0.88, count), rng.uniform(0.2, 0.45, count))  # window share
     rows[:, 7] = np.where(shop, rng.uniform(0.1, 0.7, count), rng.uniform(0.8, 1.9, count))  # sill
     rows[:, 8] = rows[:, 7] + np.where(shop, rng.uniform(1.8, 2.6, count), rng.uniform(0.7, 1.7, count))  # head
     rows[:, 9] = rng.uniform(0.04, 0.3, count)  # recess
     rows[:, 10] = rng.integers(0, 1000, count)  # seed of its doors
-    rows[:, 11] = rng.normal(size=count)  # tint
+    rows[:, 11] = np.clip(rng.normal(size=count), -1.6, 2.2)  # tint
     return rows
 
 
@@ -131,10 +133,11 @@ def _borders(lot: Lot, road: Road, side: int, start: Array, length: Array) -> No
             s = np.arange(s0, s0 + far - 1, 2.0)
             gate = rng.integers(0, max(len(s), 1), 2)
             s = np.delete(s, gate[gate < len(s)]) + 1.0
-            d = np.full(s.shape, side * (_edge(road) + 0.35 + (0.4 if code == 1 else 0)))
+            d = np.full(s.shape, side * (_edge(road) + 0.35 + (0.6 if code == 1 else 0)))
             x, y, yaw = road.at(s, d)
             first = (rng.integers(0, 64), rng.uniform(0.9, 1.1), rng.normal())
-            lot.put_row(name, x, y, yaw, first)
+            wild = code == 1 and rng.random() < 0.45
+            lot.put_row("wild hedge" if wild else name, x, y, yaw, first)
 
 
 def gardens(lot: Lot, road: Road, side: int) -> None:
@@ -156,10 +159,47 @@ def backdrop(lot: Lot, road: Road, side: int) -> None:
         count = _count(lot, share * rng.uniform(*area.thicket), road)
         x, y, _ = road.at(_along(lot, road, count), side * (_edge(road) + area.setback[0] + 3 + rng.gamma(1.5, 12, count)))
         lot.put(kind, x, y, rng.uniform(0, 6.28, count), clear=3.5, size=(0.7, 1.5))
-    count = _count(lot, 3.0, road)
+    count = _count(lot, 18.0 * area.closed, road)
     s = _along(lot, road, count)
-    _houses(lot, road, side, s, rng.uniform(8, 30, count), _edge(road) + rng.uniform(20, 60, count),
-            rng.uniform(8, 15, count))  # fmt: skip
+    near = _edge(road) + area.setback[1] + 8 + rng.uniform(0, 45, count)
+    _houses(lot, road, side, s, rng.uniform(10, 35, count), near, rng.uniform(8, 15, count))
+
+
+def closings(lot: Lot) -> None:
+    """What stands at the far ends of roads: a house where the road ends at another, a wood behind a bend."""
+    rng = lot.rng
+    for number, road in enumerate(lot.ground.roads):
+        for end in (road.start, road.stop):
+            if end == 0:
+                continue
+            place = np.sign(end) * rng.uniform(*((82, 125) if number == 0 else (30, 80)))
+            if rng.random() < lot.area.closed:
+                length = rng.uniform(18, 40)
+                s = np.array([place if end > 0 else place - 12.0])
+                _houses(lot, road, 1, s, np.array([12.0]), np.array([-length / 2]), np.array([length]), across=True)
+            elif rng.random() < 0.7:
+                count = rng.integers(4, 12)
+                x, y, _ = road.at(place + rng.normal(0, 6, count), rng.normal(0, 14, count))
+                lot.put("thicket", x, y, rng.uniform(0, 6.28, count), clear=None, size=(0.8, 1.5))
+
+
+def car_park(lot: Lot, road: Road, side: int) -> None:
+    """Cars side by side off the street, and a crash barrier along wide roads."""
+    rng, area = lot.rng, lot.area
+    if rng.random() < 0.5 * (area.setback[1] > 6) + 0.08:
+        first, count = rng.uniform(road.start, road.stop), rng.integers(4, 18)
+        s = first + 2.6 * np.arange(count) + rng.normal(0, 0.1, count)
+        s = s[(rng.random(count) < 0.75) & (s < road.stop)]
+        if len(s):
+            d = side * (_edge(road) + rng.choice([3.2, 9.5])) + rng.normal(0, 0.2, len(s))
+            turn = np.where(rng.random(len(s)) < 0.7, np.pi / 2, -np.pi / 2)
+            clear = lot.ground.carriageway(*road.at(s, d)[:2]) > 2.6
+            _vehicles(lot, road, s[clear], d[clear], turn[clear], 0.0)
+    if area.bank > 0.02 and road.half > 3 and rng.random() < 0.3:
+        start = rng.uniform(road.start, 0)
+        s = np.arange(start, rng.uniform(start + 20, max(road.stop, start + 20)), 2.0)
+        x, y, yaw = road.at(s, np.full(s.shape, side * (road.half + 0.5)))
+        lot.put_row("guard rail", x, y, yaw if side > 0 else yaw + np.pi, (0, 1.0, rng.normal()))
 
 
 def kerbside(lot: Lot, road: Road, side: int, main: bool) -> None:
@@ -208,6 +248,7 @@ def parked(lot: Lot, road: Road, side: int, places: Array) -> None:
     free = np.ones(len(s), bool)
     for place in places:
         free &= (np.abs(s - place[0]) > 4.5) | (np.abs(d - place[1]) > 2.1)
+    free &= lot.ground.carriageway(*road.at(s, d)[:2], skip=0) > 2.5
     _vehicles(lot, road, s[free], d[free], np.where(rng.random(len(s[free])) < 0.85, 0, np.pi) + (np.pi if side > 0 else 0),
               up)  # fmt: skip
 
@@ -234,7 +275,7 @@ def _vehicles(lot: Lot, road: Road, s: Array, d: Array, turn: Array, up: float, 
     x, y, yaw = road.at(s, d)
     yaw = yaw + turn + rng.normal(0, 0.02, len(s))
     limits = {"bicyclist": two_wheels * 0.7, "motorcyclist": two_wheels, "bus": two_wheels * 1.4,
-              "truck": two_wheels * 1.6 + 0.03, "van": two_wheels * 1.6 + 0.15, "car": 1.1}  # fmt: skip
+              "truck": two_wheels * 1.55 + 0.012, "van": two_wheels * 1.6 + 0.13, "car": 1.1}  # fmt: skip
     low = -1.0
     for kind, high in limits.items():
         chosen = (draw > low) & (draw <= high)

@@ -102,8 +102,8 @@ def person(rng: np.random.Generator, label: str = "person", seated: bool = False
     for side, swing in ((0.1, stride), (-0.1, -stride)):
         leg = frustum((0.07, 0.10), (0.0, 0.85), 6, "cloth", label)
         parts.append(moved(leg, -0.85 * np.sin(swing) * 0.5, side, 0.0, tilt=swing * 0.6))
-    trunk = join(frustum((0.17, 0.21), (0.0, 0.6), 8, "cloth", label), frustum((0.11, 0.10), (0.66, 0.9), 6, "skin", label),
-                 frustum((0.11, 0.02), (0.9, 0.95), 6, "skin", label))  # fmt: skip
+    trunk = join(frustum((0.16, 0.21), (0.0, 0.45), 8, "cloth", label), frustum((0.21, 0.07), (0.45, 0.62), 8, "cloth", label),
+                 frustum((0.06, 0.11), (0.6, 0.75), 6, "skin", label), frustum((0.11, 0.04), (0.75, 0.92), 6, "skin", label))  # fmt: skip
     arms = [moved(frustum((0.05, 0.06), (0.0, 0.6), 5, "cloth", label), 0.1 * s, 0.24 * s, -0.02, tilt=-0.3 * s)
             for s in (-1, 1)]  # fmt: skip
     return join(*parts, moved(join(trunk, *arms), z=0.83, tilt=lean))
@@ -168,7 +168,21 @@ def bush(rng: np.random.Generator, height: float, spread: float, count: int, lea
 def hedge(rng: np.random.Generator, height: float, depth: float) -> Mesh:
     """Two metres of cut hedge along x: a core and loose leaves on its faces."""
     core = box((-1.02, 1.02), (-depth / 2 + 0.12, depth / 2 - 0.12), (0, height - 0.12), "leaves", "vegetation")
-    return join(core, shapes.hedge_leaves(rng, 150, (1.05, depth / 2, height / 2), 0.09))
+    return join(core, shapes.hedge_leaves(rng, 80, (1.05, depth / 2, height / 2), 0.11))
+
+
+def wild_hedge(rng: np.random.Generator, height: float, depth: float) -> Mesh:
+    """Two metres of uncut greenery along x: a bulging core, leaves and twigs that stick out."""
+    parts = []
+    for x in (-0.75, 0.0, 0.75):
+        middle, half = height * rng.uniform(0.42, 0.55), depth * rng.uniform(0.3, 0.5)
+        z = np.array([0, middle, 2 * middle - 0.1])
+        width = np.array([half * 0.8, half * rng.uniform(0.8, 1.1), half * 0.35])
+        for low in (0, 1):
+            core = frustum((width[low], width[low + 1]), (z[low], z[low + 1]), 5, "leaves", "vegetation")
+            parts.append(moved(core, x, rng.normal(0, 0.1 * depth)))
+        parts.append(leaves(rng, 26, (x, 0, middle), (0.6, depth * 0.6, middle * 1.05), 0.14, 0.75))
+    return join(*parts)
 
 
 def fence(height: float, bars: int, thick: float, posts_only: bool = False) -> Mesh:
@@ -183,6 +197,14 @@ def fence(height: float, bars: int, thick: float, posts_only: bool = False) -> M
     return join(*parts)
 
 
+def guard_rail() -> Mesh:
+    """Two metres of crash barrier along x."""
+    corner = np.array([[-1.01, 0.04, 0.45], [1.01, 0.04, 0.45], [1.01, 0, 0.6], [-1.01, 0, 0.6]])
+    upper = corner * [1, 1, -1] + [0, 0, 1.2]
+    rail = shapes.mesh(shapes.quads(np.stack([corner, upper])), "fence", "fence")
+    return join(rail, box((-0.06, 0.06), (-0.12, 0.0), (0, 0.7), "fence", "fence"))
+
+
 def pole(height: float, radius: float) -> Mesh:
     """A lamp post, mast or bollard."""
     return frustum((radius * 1.1, radius * 0.8), (-0.1, height), 7, "pole", "pole")
@@ -191,7 +213,7 @@ def pole(height: float, radius: float) -> Mesh:
 def sign(rng: np.random.Generator, round_plate: bool, height: float) -> Mesh:
     """A post with a plate that faces +x: retro-reflecting in front, dull behind."""
     post = frustum((0.035, 0.035), (-0.1, height + 0.35), 6, "pole", "pole")
-    half = rng.uniform(0.28, 0.42)
+    half = rng.uniform(0.28, 0.5)
     sides = 10 if round_plate else 4
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False) + np.pi / 4
     rim = np.stack([np.zeros(sides), half * np.cos(angle), height + half * np.sin(angle)], axis=-1)
@@ -229,12 +251,14 @@ def library() -> dict[str, list[Mesh]]:
         **{name: [two_wheeler(name, heavy)] for name, heavy in two.items()},
         "tree": [tree(rng, rng.uniform(6, 10), rng.uniform(1.6, 3.2), rng.uniform(1.4, 2.6), 220) for _ in range(10)],
         "young tree": [tree(rng, rng.uniform(3, 5), rng.uniform(0.9, 1.8), rng.uniform(0.8, 1.4), 200) for _ in range(6)],
-        "bush": [bush(rng, rng.uniform(0.8, 2.2), rng.uniform(0.6, 1.4), 260, 0.11) for _ in range(8)],
+        "bush": [bush(rng, rng.uniform(0.8, 2.2), rng.uniform(0.6, 1.4), 220, 0.12) for _ in range(8)],
         "thicket": [bush(rng, rng.uniform(3, 6), rng.uniform(2, 3.5), 420, 0.28) for _ in range(6)],
         "hedge": [hedge(rng, h, d) for h, d in ((0.9, 0.6), (1.4, 0.8), (1.9, 0.9), (2.3, 1.1))],
+        "wild hedge": [wild_hedge(rng, h, d) for h, d in ((1.6, 1.2), (2.2, 1.6), (2.8, 1.8), (3.4, 2.2), (4.2, 2.6))],
         "fence": [fence(1.1, 14, 0.05), fence(1.3, 9, 0.11), fence(1.8, 18, 0.035), fence(0.8, 0, 0, posts_only=True)],
         "garden wall": [box((-1.01, 1.01), (-0.12, 0.12), (-0.3, h), "wall", "fence") for h in (0.5, 0.9, 1.3, 1.8, 2.2)],
         "lamp": [pole(6.0, 0.08), pole(7.0, 0.11), pole(9.0, 0.16)],
+        "guard rail": [guard_rail()],
         "bollard": [pole(0.9, 0.06), pole(1.0, 0.09)],
         "sign": [sign(rng, bool(k % 2), h) for k, h in enumerate((2.2, 2.3, 1.9, 2.5, 1.2, 2.1))],
         "bin": [box((-0.3, 0.3), (-0.3, 0.3), (0, 1.1), "door", "unlabeled"),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from lidarsynth.data.synthetic import hdl64e
 from lidarsynth.data.synthetic.layout import build
 from lidarsynth.data.synthetic.raycast import Caster
 from lidarsynth.data.synthetic.sensor_model import Returns, sense
-from lidarsynth.data.synthetic.world import POSES, World
+from lidarsynth.data.synthetic.world import POSES, World, visible
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 
@@ -22,7 +24,7 @@ class SyntheticStreets:
     length  number of scans; scan i does not depend on it
     sensor  beams, offsets, range limits, columns and mounting height
 
-    Eight consecutive scans are eight places in one world; reading in order builds each world once.
+    Sixteen consecutive scans are sixteen places in one world; reading in order builds each world once.
     Raises IndexError beyond the length, ImportError naming the extra when embreex is missing.
     """
 
@@ -73,7 +75,7 @@ class SyntheticStreets:
 
     def _world(self, number: int) -> tuple[World, Caster]:
         if number not in self._worlds:
-            world = build(np.random.default_rng((self.seed, number)))
+            world = visible(build(np.random.default_rng((self.seed, number))), self.sensor)
             if len(self._worlds) >= 2:
                 self._worlds.pop(next(iter(self._worlds)))
             self._worlds[number] = (world, Caster(world.corners))
@@ -91,21 +93,29 @@ class SyntheticStreets:
         start[:, 2] = sensor.mount
         if sensor.offsets:
             start[:, 2] += np.asarray(sensor.offsets, np.float32)
-        origins = np.repeat(start @ turn.T + place, sensor.width, axis=0)
-        loss = np.repeat(hdl64e.ring_loss(sensor), sensor.width)
-        returns = sense(world, caster, origins, rays.reshape(-1, 3) @ turn.T, loss, rng, sensor.max_range)
-        hidden = hdl64e.own_car(sensor, sensor.width).reshape(-1) | (returns.distance < sensor.min_range)
-        zero = np.float32(0)
-        kept = Returns(np.where(hidden, zero, returns.distance), np.where(hidden, zero, returns.reflectance),
-                       np.where(hidden, 0, returns.label))  # fmt: skip
-        return kept, rays
+        seen = ~hdl64e.own_car(sensor).reshape(-1)
+        origins = np.repeat(start @ turn.T + place, sensor.width, axis=0)[seen]
+        directions = rays.reshape(-1, 3)[seen] @ turn.T
+        found = sense(world, caster, origins, directions, hdl64e.lasers(sensor), rng, sensor.max_range)
+        kept = found.distance >= sensor.min_range
+        whole = []
+        for values in (found.distance, found.reflectance, found.label):
+            image = np.zeros(len(seen), values.dtype)
+            image[seen] = np.where(kept, values, 0)
+            whole.append(image)
+        return Returns(*whole), rays
+
+
+@lru_cache(maxsize=4)
+def _directions(sensor: Sensor) -> np.ndarray:
+    return sensor.directions()
 
 
 def _jittered(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
     """(H, W, 3) float32 rays: the sensor's, turned by a third of a column at most, each ring with its own phase."""
     phase = rng.uniform(-0.25, 0.25, (sensor.height, 1)) + rng.uniform(-0.08, 0.08, (sensor.height, sensor.width))
     angle = (phase * 2 * np.pi / sensor.width).astype(np.float32)
-    rays = sensor.directions()
+    rays = _directions(sensor)
     x = rays[..., 0] - angle * rays[..., 1]
     y = rays[..., 1] + angle * rays[..., 0]
     return np.stack([x, y, rays[..., 2]], axis=-1)  # small angles: the length stays 1 within 1e-6

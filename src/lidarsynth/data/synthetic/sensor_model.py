@@ -7,18 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarsynth.data.synthetic import facades
+from lidarsynth.data.synthetic.hdl64e import Lasers
 from lidarsynth.data.synthetic.materials import NUMBER, TABLE
 from lidarsynth.data.synthetic.raycast import Caster
 from lidarsynth.data.synthetic.world import FRONT, GROUND, SLAB, World
 
-# Reflectance reported for a signal: steep when dim, flat about 0.3, as KITTI's calibrated intensities are.
-RESPONSE = ((-0.02, 0.0, 0.12, 0.2, 0.3, 0.45, 0.7, 1.0), (0.0, 0.02, 0.25, 0.31, 0.37, 0.52, 0.75, 0.99))
-FADE = 0.06  # signal lost per natural logarithm of received power
-FADE_FROM = 0.0017  # power (cos / m^2) from which it fades: a road 10 m away
-VANISH = -0.055  # signal at which half of the returns vanish
-VANISH_WIDTH = 0.022
-RANGE_NOISE = 0.018  # metres
-ROUGH = {"grass": 0.05, "gravel": 0.02, "leaves": 0.03}  # metres, standard deviation of the surface along the beam
+# Reflectance reported for a signal: nothing when dim, then steep, flat about 0.3, so that the shares of all reported
+# values become those of real scans.
+RESPONSE = (
+    (0.026, 0.030, 0.044, 0.056, 0.071, 0.103, 0.128, 0.150, 0.186, 0.217, 0.262, 0.311, 0.366, 0.432, 0.513, 0.66, 0.8),
+    (0.000, 0.035, 0.060, 0.100, 0.150, 0.200, 0.250, 0.280, 0.310, 0.340, 0.380, 0.420, 0.470, 0.530, 0.600, 0.80, 0.99),
+)
+GRAZING = (0.13, 0.17)  # signal lost per natural logarithm of cos(incidence) below the second number
+FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) where positive
+DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
+VANISH = -0.14  # signal at which half of the returns vanish
+VANISH_WIDTH = 0.014
+NOISE = (0.0012, 0.004, 0.014)  # metres: standard deviation per metre, least, most
+ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.05, "stone": 0.02, "bark": 0.02}  # metres along the beam
 
 
 @dataclass(frozen=True)
@@ -35,49 +41,62 @@ def sense(
     caster: Caster,
     origins: np.ndarray,
     rays: np.ndarray,
-    ring_loss: np.ndarray,
+    lasers: Lasers,
     rng: np.random.Generator,
     max_range: float,
 ) -> Returns:
     """Sends N rays and reports their returns.
 
-    origins, rays (N, 3) float32 world frame; ring_loss (N,) float32 signal each ray's laser loses. The number of random
-    draws depends on N only, so a ray that just misses on another machine changes no other ray.
+    origins, rays (N, 3) float32 world frame. The number of random draws depends on N only, so a ray that just misses
+    on another machine changes no other ray.
     """
     count = len(rays)
-    chance = rng.random((3, count), dtype=np.float32)
-    noise = rng.standard_normal((2, count), dtype=np.float32)
+    chance = rng.random((2, count), dtype=np.float32)
+    noise = rng.standard_normal((3, count), dtype=np.float32)
     face, distance, cosine = caster.cast(origins, rays)
     material, label, tint, depth = _surface(world, face, origins, rays, distance)
-    through = chance[0] < TABLE[material, 5]
-    through &= face >= 0
+    steady = _steady(face, lasers.number)
+    through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
     if through.any():
         far = _behind(world, caster, origins[through], rays[through], distance[through])
         for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
             mine[through] = theirs
-    signal, grain, gloss, loss = _optics(material, tint, cosine)
-    power = np.log(np.maximum(cosine, 0.01) / np.clip(distance, 0.5, 999) ** 2 / FADE_FROM)
-    signal = signal + FADE * np.minimum(power, 0) + gloss * np.log(np.maximum(cosine, 0.02)) - ring_loss
-    lost = 1 / (1 + np.exp(np.clip((signal + 0.5 * ring_loss - VANISH) / VANISH_WIDTH, -30, 30)))
-    gone = (chance[1] < lost) | (chance[2] < loss) | (face < 0)
-    distance = distance + depth / np.maximum(cosine, 0.2) + noise[0] * _spread(material)
+    optics = TABLE[material]
+    strength = _signal(optics, tint, cosine, distance, lasers)
+    signal = strength - lasers.dip * np.interp(distance, DIP, (0, 1, 1, 0)).astype(np.float32)
+    doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
+    gone = (strength + doubt < VANISH) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
+    distance = distance + depth / np.maximum(cosine, 0.3) + noise[0] * _spread(material, distance) + lasers.shift
     gone |= ~(distance < max_range)
-    reflectance = np.interp(signal + grain * noise[1], *RESPONSE)
-    reflectance = np.round(reflectance.astype(np.float32) * 100) / np.float32(100)
+    # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
+    grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
+    reflectance = np.round(np.interp(signal + grain, *RESPONSE).astype(np.float32) * 100) / np.float32(100)
     zero = np.float32(0)
     return Returns(np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
 
 
-def _spread(material: np.ndarray) -> np.ndarray:
-    table = np.full(len(TABLE), RANGE_NOISE, np.float32)
+def _signal(optics: np.ndarray, tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers):
+    """(N,) signal before its noise: material, incidence, distance, and the laser's own loss."""
+    cosine = np.maximum(cosine, 0.01)
+    slant = np.log(cosine)
+    far = np.log(np.maximum(np.minimum(distance, 999) / FADE[2], 1))
+    signal = optics[:, 0] + tint * optics[:, 1] + optics[:, 3] * slant
+    signal = signal + GRAZING[0] * np.minimum(slant - np.float32(np.log(GRAZING[1])), 0)
+    return signal - far * (FADE[0] + FADE[1] * far) - lasers.loss
+
+
+def _steady(face: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """(N,) in [0, 1): a chance that one laser on one face keeps, so that panes drop out in stripes, not in grains."""
+    mixed = (face >> 1).astype(np.uint32) * np.uint32(2654435761) + (number >> 1) * np.uint32(1779033703)
+    return (mixed >> np.uint32(16)).astype(np.float32) * np.float32(2**-16)
+
+
+def _spread(material: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(N,) metres, standard deviation of the range: the sensor's noise and the surface's roughness."""
+    table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
-        table[NUMBER[name]] = np.hypot(RANGE_NOISE, rough)
-    return table[material]
-
-
-def _optics(material: np.ndarray, tint: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, ...]:
-    row = TABLE[material]
-    return row[:, 0] + tint * row[:, 1], row[:, 2], row[:, 3], row[:, 4]
+        table[NUMBER[name]] = rough
+    return np.hypot(table[material], np.clip(distance * np.float32(NOISE[0]), *NOISE[1:]))
 
 
 def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:

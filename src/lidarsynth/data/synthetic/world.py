@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,10 +10,11 @@ from lidarsynth.data.synthetic.areas import Area
 from lidarsynth.data.synthetic.ground import Ground, Road, ground_mesh, slab_mesh
 from lidarsynth.data.synthetic.materials import LABEL, NUMBER
 from lidarsynth.data.synthetic.objects import library
+from lidarsynth.lidar.sensor import Sensor
 
 GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
 REACH = (150.0, 90.0)  # half size of the world in metres, x and y
-POSES = 8  # scans taken in one world
+POSES = 16  # scans taken in one world
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class World:
 
     corners (T, 3, 3) float32 m; kind (T,) uint8 of GROUND, SLAB, THING, FRONT; material, label (T,) uint8;
     tint (T,) float32, the object's brightness in spreads of its material; front (T,) int16, row of `fronts`, -1 for none;
-    fronts (F, 12) float32, see `facades.py`; ground; poses (8, 6) float64: x, y, z, yaw, pitch, roll of the vehicle.
+    fronts (F, 12) float32, see `facades.py`; ground; poses (16, 6) float64: x, y, z, yaw, pitch, roll of the vehicle.
     """
 
     corners: np.ndarray
@@ -61,7 +62,7 @@ class Lot:
         variants = library()[kind]
         pick = self.rng.integers(0, len(variants), count)
         scale = self.rng.uniform(*size, (count, 3))
-        tint = self.rng.normal(size=count)
+        tint = np.clip(self.rng.normal(size=count), -1.5, 2.2)
         rows = np.column_stack([x, y, self.ground.height(x, y) + up, yaw, scale, tint])
         if clear is not None:
             keep = self.ground.carriageway(x, y) > clear
@@ -86,7 +87,7 @@ def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
     parking = (2.1 * (rng.random() < area.parking[0]), 2.1 * (rng.random() < area.parking[1]))
     half = lane + max(parking)
     parking = (parking[0], parking[1])
-    wave = (rng.uniform(*area.bend) * (rng.random() < 0.7), rng.uniform(110, 260), rng.uniform(0, 6.28))
+    wave = (rng.uniform(*area.bend) * (rng.random() < 0.7), rng.uniform(130, 300), rng.uniform(0, 6.28))
     draw = rng.random()
     lanes = "dashed" if draw < area.lanes[0] else "solid" if draw < sum(area.lanes) else "none"
     rails = bool(rng.random() < area.rails) and lane > 3.5
@@ -110,31 +111,43 @@ def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
 
 
 def draw_poses(rng: np.random.Generator, ground: Ground) -> tuple[np.ndarray, np.ndarray]:
-    """Vehicle poses (8, 6) and their places (8, 2), (s, d) along the main road."""
+    """Vehicle poses (16, 6) and their places (16, 2), (s, d) along the main road, far away for those on side roads."""
     road = ground.roads[0]
-    lane = -(road.half - road.parking[0]) / 2
+    lanes = np.array([-(road.half - road.parking[0]) / 2, (road.half - road.parking[1]) / 2])
     two_way = road.half - max(road.parking) > 2.6
-    s = np.linspace(-66, 66, POSES) + rng.uniform(-5, 5, POSES)
-    d = (lane if two_way else (road.parking[0] - road.parking[1]) / 2) + rng.normal(0, 0.25, POSES)
+    back = (rng.random(POSES) < 0.4) & two_way
+    s = np.linspace(-66, 66, POSES) + rng.uniform(-3, 3, POSES)
+    d = np.where(back, lanes[1], lanes[0] if two_way else lanes.sum()) + rng.normal(0, 0.25, POSES)
     x, y, yaw = road.at(s, d)
-    yaw = yaw + rng.normal(0, 0.03, POSES)
+    yaw = yaw + np.where(back, np.pi, 0) + rng.normal(0, 0.03, POSES)
     for k in range(POSES):
+        draw, swing = rng.random(2), rng.normal(0, 1, 2)
         near = [r for r in ground.roads[1:] if np.hypot(r.x - x[k], r.y - y[k]) < 10]
-        if near and rng.random() < 0.6:  # turning
-            x[k], y[k] = near[0].x + rng.normal(0, 1), near[0].y + rng.normal(0, 1)
-            yaw[k] += rng.uniform(-1.2, 1.2)
-    z = ground.height(x, y)
+        if near and draw[0] < 0.6:  # turning
+            x[k], y[k] = near[0].x + swing[0], near[0].y + swing[1]
+            yaw[k] += 2.4 * draw[1] - 1.2
+        elif len(ground.roads) > 1 and draw[0] > 0.85:  # on a side road
+            side = ground.roads[1 + k % (len(ground.roads) - 1)]
+            place = np.clip(side.start + (side.stop - side.start) * draw[1], -60, 60)
+            x[k], y[k], yaw[k] = side.at(place, np.float64(-side.half / 2))
+            s[k] = 1e6
+    return _settled(rng, ground, x, y, yaw), np.column_stack([s, d])
+
+
+def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """(N, 6) poses of vehicles that stand on the ground: its slope under the wheels, and half a degree of sway."""
     ahead, left = 1.3, 0.8
-    c, sn = np.cos(yaw), np.sin(yaw)
-    pitch = np.arctan((ground.height(x + ahead * c, y + ahead * sn) - ground.height(x - ahead * c, y - ahead * sn)) / (2 * ahead))
-    roll = np.arctan((ground.height(x - left * sn, y + left * c) - ground.height(x + left * sn, y - left * c)) / (2 * left))
-    pitch, roll = pitch + rng.normal(0, 0.008, POSES), roll + rng.normal(0, 0.008, POSES)
-    return np.column_stack([x, y, z, yaw, pitch, roll]), np.column_stack([s, d])
+    c, s = np.cos(yaw), np.sin(yaw)
+    rise = ground.height(x + ahead * c, y + ahead * s) - ground.height(x - ahead * c, y - ahead * s)
+    bank = ground.height(x - left * s, y + left * c) - ground.height(x + left * s, y - left * c)
+    sway = rng.normal(0, 0.008, (2, len(x)))
+    pitch, roll = np.arctan(rise / (2 * ahead)) + sway[0], np.arctan(bank / (2 * left)) + sway[1]
+    return np.column_stack([x, y, ground.height(x, y), yaw, pitch, roll])
 
 
 def assemble(lot: Lot, poses: np.ndarray) -> World:
     """One soup of the ground, the sidewalks, the walls and the things."""
-    bare = ground_mesh(lot.ground, REACH, 3.0)
+    bare = ground_mesh(lot.ground, REACH, 4.0)
     slab, kerb = slab_mesh(lot.ground)
     columns = [_soup(bare, GROUND, "road", "road"), _soup(slab, SLAB, "sidewalk", "sidewalk")]
     columns[1]["material"][kerb] = NUMBER["kerb"]
@@ -148,6 +161,18 @@ def assemble(lot: Lot, poses: np.ndarray) -> World:
     columns += [_instances(kind, variant, np.concatenate(rows)) for (kind, variant), rows in lot.things.items()]
     joined = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
     return World(**joined, fronts=fronts, ground=lot.ground, poses=poses)
+
+
+def visible(world: World, sensor: Sensor) -> World:
+    """The world without triangles that no pose can see: too far, or wholly above the highest beam. Faster to cast."""
+    middle = world.corners[:, 0]
+    steep = np.float32(np.tan(np.radians(sensor.elevations[0]) + 0.06))  # 0.06 rad: pitch, roll and slope of the poses
+    seen = world.kind != THING
+    for x, y, z, *_ in world.poses.astype(np.float32):
+        away = np.hypot(middle[:, 0] - x, middle[:, 1] - y)
+        seen |= (away < sensor.max_range + 5) & (middle[:, 2] - z - sensor.mount - 0.8 < steep * away)
+    table = {key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front")}
+    return replace(world, **table)
 
 
 def _soup(corners: np.ndarray, kind: int, material: str, label: str) -> dict[str, np.ndarray]:

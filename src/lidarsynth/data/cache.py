@@ -1,0 +1,176 @@
+"""Writing a cache: a folder of .npy shards of packed range images, an index with every image's name, and a report."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarsynth.data.index import open_index, whole, write_index
+from lidarsynth.data.workers import in_order
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+
+RANGE_STEP = 0.002  # metres per unit of the stored uint16; 0 = nothing returned, up to 131 m
+NO_LABEL = 255  # in every pixel of an image without labels
+SHARD = 64  # images per shard
+INDEX_EVERY = 2.0  # seconds between two writings of the index: what a kill can cost
+
+Namer = Callable[[int], Sequence[str]]  # image number -> (..., sequence, frame)
+
+
+def record_type(sensor: Sensor) -> np.dtype:
+    """One stored image: range in steps of 2 mm, reflectance in steps of 1/255, SemanticKITTI class or NO_LABEL."""
+    shape = (sensor.height, sensor.width)
+    return np.dtype([("range", "<u2", shape), ("reflectance", "u1", shape), ("label", "u1", shape)])
+
+
+def pack(image: RangeImage) -> np.ndarray:
+    """RangeImage -> one record (); measured pixels never become 0, empty ones always are."""
+    record = np.zeros((), record_type(image.sensor))
+    steps = np.clip(np.round(image.range / RANGE_STEP), 1, 65535)
+    record["range"] = np.where(image.mask, steps, 0)
+    record["reflectance"] = np.round(np.clip(image.reflectance, 0, 1) * 255)
+    record["label"] = NO_LABEL if image.label is None else image.label
+    return record
+
+
+def write_cache(
+    folder: str | Path,
+    image: Callable[[int], RangeImage],
+    count: int,
+    sensor: Sensor,
+    source: dict[str, Any],
+    name: Namer | None = None,
+    workers: int = 0,
+    check: bool = False,
+) -> Iterator[int]:
+    """Store images 0..count-1 and yield how many are done so far, shard by shard; skipped scans count as done.
+
+    image    image number -> its range image; ValueError = that scan is broken: it is skipped and named in REPORT
+    source   says what the images are; the same call goes on with a cache only where this and the names are the same
+    name     image number -> (..., sequence, frame), kept in the index
+    workers  processes; two or more need a picklable `image` and `name`, with fewer this one works itself
+    check    compare the checksums of the shards that are there, and make anew those that differ
+    Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
+    when the folder holds something else or no scan can be read, OSError of one line when the disk is full.
+    """
+    folder, task = Path(folder), _Task(Path(folder), image, name, count)
+    index = open_index(folder, sensor, source, count)
+    firsts = range(0, count, SHARD)
+    todo = [first for first in firsts if not _is_stored(index, task, record_type(sensor), first, check)]
+    done = count - sum(len(task.numbers(first)) for first in todo)
+    if done:
+        yield done
+    entries, written = in_order(task.store, todo, workers), time.monotonic()
+    try:
+        for first, entry in zip(todo, entries, strict=True):
+            _refuse_none(index, entry)
+            index["shards"][_shard(first)] = entry
+            done += len(task.numbers(first))
+            if time.monotonic() - written > INDEX_EVERY:
+                write_index(folder, index)
+                written = time.monotonic()
+            yield done
+    finally:
+        entries.close()
+        write_index(folder, index)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a worker has to know to make any shard."""
+
+    folder: Path
+    image: Callable[[int], RangeImage]
+    name: Namer | None
+    count: int
+
+    def numbers(self, first: int) -> range:
+        return range(first, min(first + SHARD, self.count))
+
+    def frame(self, i: int) -> list[str]:
+        """[sequence, frame] of image i."""
+        return [*self.name(i)][-2:] if self.name else ["", str(i)]
+
+    def store(self, first: int) -> dict[str, Any]:
+        """Make the shard whose first image is `first`, and say what its entry in the index is."""
+        records, frames, skipped = [], [], []
+        for i in self.numbers(first):
+            try:
+                records.append(pack(self.image(i)))
+                frames.append(self.frame(i))
+            except ValueError as error:
+                skipped.append([*self.frame(i), str(error)])
+        entry: dict[str, Any] = {"count": len(records), "tried": len(self.numbers(first))}
+        if records:
+            entry["sha256"] = _store(self.folder / _shard(first), np.stack(records))
+        if self.name:
+            entry["frames"] = frames
+        return entry | ({"skipped": skipped} if skipped else {})
+
+
+def _shard(first: int) -> str:
+    return f"{first:07d}.npy"
+
+
+def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, check: bool) -> bool:
+    """Whether the shard is there, whole and of the same scans. Raises ValueError when it holds others."""
+    entry, path = index["shards"].get(_shard(first)), task.folder / _shard(first)
+    if entry is None or entry.get("tried", entry["count"]) < len(task.numbers(first)):
+        return False
+    if "frames" in entry and task.name:
+        lost = [scan[:2] for scan in entry.get("skipped", [])]
+        now = [frame for i in task.numbers(first) if (frame := task.frame(i)) not in lost]
+        if now != entry["frames"][: len(now)]:
+            raise ValueError(f"{task.folder}: expected the scans {now[:1]}... from image {first} on, found "
+                             f"{entry['frames'][:1]}...; name another folder")  # fmt: skip
+    if entry["count"] == 0:
+        return True
+    size = len(npy_header(kind, entry["count"])) + entry["count"] * kind.itemsize
+    if not path.is_file() or path.stat().st_size != size:
+        return False
+    return not check or sha256(path) == entry["sha256"]
+
+
+def _refuse_none(index: dict[str, Any], entry: dict[str, Any]) -> None:
+    """One scan in many is broken; where a whole shard is, the projection or the disk is wrong."""
+    if entry["count"] == 0 and (entry["tried"] == SHARD or not any(e["count"] for e in index["shards"].values())):
+        sequence, frame, reason = entry["skipped"][0]
+        raise ValueError(f"expected a scan that can be projected among {entry['tried']}, found none; "
+                         f"the first, {sequence}/{frame}: {reason}")  # fmt: skip
+
+
+def npy_header(dtype: np.dtype, count: int) -> bytes:
+    """What stands before the records of a shard of `count` images."""
+    header = BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (count,)}
+    )
+    return header.getvalue()
+
+
+def _store(path: Path, records: np.ndarray) -> str:
+    """Write a shard, whole or not at all; returns its checksum."""
+    header, body = npy_header(records.dtype, len(records)), records.view(np.uint8)
+    with whole(path, len(header) + body.nbytes) as scratch, open(scratch, "wb") as file:
+        file.write(header)
+        file.write(body.data)
+    digest = hashlib.sha256(header)
+    digest.update(body.data)
+    return digest.hexdigest()
+
+
+def sha256(path: Path) -> str:
+    """The checksum of a file, read a piece at a time."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()

@@ -1,0 +1,123 @@
+"""What a reader is; a reader over the files of a data set, scan i = file i; the quick way into KITTI's files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lidarsynth.data.fields import MAX_METRES
+from lidarsynth.data.files import read
+from lidarsynth.lidar.scan import Scan
+
+
+class Name(NamedTuple):
+    """Where a scan comes from: the data set, the drive or scene in it, and the frame in that."""
+
+    source: str
+    sequence: str
+    frame: str
+
+
+class Reader(Protocol):
+    """Scans by number: `len(reader)`, `reader[i] -> Scan`, `reader.name(i)`; `missing` names absent sequences.
+
+    `reader[i]` raises ValueError, naming the file, where that one scan cannot be read.
+    """
+
+    @property
+    def missing(self) -> tuple[str, ...]: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, index: int, /) -> Scan: ...
+    def name(self, index: int, /) -> Name: ...
+
+
+class Frame(NamedTuple):
+    """One scan on disk; `labels` is its SemanticKITTI `.label` file, if it has one."""
+
+    path: str
+    sequence: str
+    frame: str
+    labels: str | None = None
+
+
+@dataclass(frozen=True)
+class Frames:
+    """A reader over scan files, in the order given.
+
+    source     word of the data set
+    frames     one per scan
+    missing    sequences of the chosen split that are not on this disk
+    intensity  scale of the files, as in `files.read`
+    """
+
+    source: str
+    frames: Sequence[Frame]
+    missing: tuple[str, ...] = ()
+    intensity: str = "unit"
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Scan:
+        frame = self.frames[index]
+        if frame.labels is None and self.intensity == "unit" and frame.path.endswith(".bin"):
+            return read_velodyne(frame.path)
+        return read(frame.path, self.intensity, frame.labels)
+
+    def name(self, index: int) -> Name:
+        """Source, sequence and frame of scan `index`."""
+        return Name(self.source, self.frames[index].sequence, self.frames[index].frame)
+
+
+def read_velodyne(path: str | Path) -> Scan:
+    """A KITTI `.bin` with reflectance 0-1: as `files.read(path, "unit")`, three times faster where nothing is amiss."""
+    try:
+        table = np.fromfile(path, "<f4")
+    except OSError:
+        return read(path, "unit")
+    columns = np.ascontiguousarray(table[: len(table) // 4 * 4].reshape(-1, 4).T)
+    if len(table) == 0 or os.path.getsize(path) % 16 or not _flawless(columns):
+        return read(path, "unit")  # drops what must be dropped, or says what is wrong
+    return Scan(table.reshape(-1, 4)[:, :3], columns[3])
+
+
+def _flawless(columns: np.ndarray) -> bool:
+    """Whether (4, N) x y z reflectance are finite metres with a reflectance of 0-1 and no point at the origin."""
+    limit = np.abs(columns[:3]).max(initial=0)  # NaN where any coordinate is
+    low, high = columns[3].min(initial=0), columns[3].max(initial=0)
+    return bool(limit <= MAX_METRES and low >= 0 and high <= 1 and columns[:2].any(axis=0).all())
+
+
+def list_frames(folder: Path, sequence: str, suffix: str = ".bin", labels: Path | None = None) -> list[Frame]:
+    """The scans of one sequence, sorted by name; none if the folder is not there. `labels`: the folder of `.label`s."""
+    known = set(_names(labels, ".label")) if labels else set()
+    return [
+        Frame(f"{folder}/{name}{suffix}", sequence, name, f"{labels}/{name}.label" if name in known else None)
+        for name in _names(folder, suffix)
+    ]
+
+
+def _names(folder: Path, suffix: str) -> list[str]:
+    if not folder.is_dir():
+        return []
+    return sorted(name.removesuffix(suffix) for name in os.listdir(folder) if name.endswith(suffix))
+
+
+def choose(word: str, split: str, splits: Sequence[str]) -> None:
+    """Raises ValueError when `split` is not one of the source's."""
+    if split not in splits:
+        raise ValueError(f"{word}: expected a split of {', '.join(splits)}, found {split!r}")
+
+
+def gather(source: str, root: Path, split: str, frames: dict[str, list[Frame]]) -> Frames:
+    """One reader over the sequences of a split, in order. Raises ValueError when there is no scan at all."""
+    if not any(frames.values()):
+        wanted = ", ".join([*list(frames)[:3], "..."]) if len(frames) > 3 else ", ".join(frames) or "any sequence"
+        raise ValueError(f"{root}: expected scans of the split {split} ({wanted}), found none; choose another split")
+    missing = tuple(sequence for sequence, found in frames.items() if not found)
+    return Frames(source, [frame for found in frames.values() for frame in found], missing)

@@ -1,0 +1,32 @@
+"""KITTI-360: the Velodyne turns of nine drives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidarsynth.data.frames import Frames, choose, gather, list_frames
+
+SPLITS: dict[str, tuple[int, ...]] = {  # LiDARGen's, used by R2DM; 81,106 scans in all
+    "train": (3, 4, 5, 6, 7, 9, 10),
+    "test": (0, 2),
+    "all": (3, 4, 5, 6, 7, 9, 10, 0, 2),
+}
+
+
+def kitti360(root: str | Path, split: str = "train") -> Frames:
+    """ROOT/data_3d_raw/2013_05_28_drive_0003_sync/velodyne_points/data/0000000000.bin; ROOT may be data_3d_raw itself.
+
+    split  a word of SPLITS. Points are not motion-compensated; single turns have no labels in this data set.
+    Raises ValueError when the split has no scan here.
+    """
+    choose("kitti360", split, tuple(SPLITS))
+    inner = Path(root) / "data_3d_raw"
+    folder = inner if inner.is_dir() else Path(root)
+    frames = {}
+    for sequence in SPLITS[split]:
+        drives = sorted(folder.glob(f"*_{sequence:04d}_sync"))
+        for drive in drives:
+            frames[drive.name] = list_frames(drive / "velodyne_points" / "data", drive.name)
+        if not drives:
+            frames[f"{sequence:04d}"] = []
+    return gather("kitti360", Path(root), split, frames)

@@ -1,0 +1,53 @@
+"""Work shared among processes, answered in order."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from typing import Any
+
+_make: list[Callable[[int], Any]] = []  # of this worker process; sent once, not with every item
+
+
+def in_order(make: Callable[[int], Any], items: Sequence[int], workers: int) -> Generator[Any, None, None]:
+    """make(item) of each item, in order, by `workers` processes, or by this one where fewer than two have work.
+
+    `make` must be picklable where there are workers. What it raises is raised here. Closing the generator ends the
+    workers after their present item. Raises OSError when a worker is gone.
+    """
+    workers = min(workers, len(items))
+    if workers < 2:
+        yield from map(make, items)
+        return
+    # Not fork: threads of torch in this process would be copied in whatever state they are.
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start, (make,))
+    try:
+        yield from pool.map(_work, items)
+    except BrokenProcessPool:
+        raise OSError(f"expected {workers} worker processes to stay, found one gone (out of memory?); the same command "
+                      "goes on, and --workers 1 needs the least") from None  # fmt: skip
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start(make: Callable[[int], Any]) -> None:
+    """Ctrl-C is the parent's to handle; a parent that was killed takes its workers along."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _make.append(make)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    if parent := multiprocessing.parent_process():
+        wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _work(item: int) -> Any:
+    return _make[0](item)

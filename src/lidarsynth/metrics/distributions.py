@@ -1,0 +1,219 @@
+"""How far two sets of features lie apart: Frechet distance, polynomial MMD (KID), Gaussian MMD, Jensen-Shannon.
+
+Features are (N, D) and come from any network, as numpy arrays or torch tensors on any device. `Moments` gathers what
+the Frechet distance needs batch by batch, and two of them merge, so that two machines can share a set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Array: TypeAlias = np.ndarray | Tensor
+Random: TypeAlias = np.random.Generator | np.random.RandomState
+
+
+def as_tensor(values: Array) -> Tensor:
+    """The values as a tensor on their own device, as float32 unless they are float64.
+
+    Read-only arrays (memory maps) are copied. Raises ValueError for NaN or infinity.
+    """
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.require(values, requirements=["C", "W"]))
+    tensor = tensor if tensor.dtype == torch.float64 else tensor.float()
+    if not torch.isfinite(tensor.sum(dtype=torch.float64)):  # a fifth of the time of looking at each
+        raise ValueError(f"expected finite values, found NaN or infinity among {tuple(tensor.shape)}")
+    return tensor
+
+
+class Moments:
+    """Count, mean and covariance of features that arrive in batches; float64 sums of bounded size.
+
+    count    number of features so far
+    mean     (D,) float64
+    scatter  (D, D) float64, sum of the outer products of the deviations from the mean
+
+    Batches may come in any size and order, and `merge` adds what another process gathered (Chan et al. 1979).
+    """
+
+    def __init__(self, dimensions: int, device: torch.device | str = "cpu"):
+        self.count = 0
+        self.mean = torch.zeros(dimensions, dtype=torch.float64, device=device)
+        self.scatter = torch.zeros(dimensions, dimensions, dtype=torch.float64, device=device)
+
+    def update(self, features: Array) -> None:
+        """Take in a batch (B, D). Raises ValueError for another shape, NaN or infinity."""
+        batch = as_tensor(features).to(self.mean)
+        if batch.ndim != 2 or batch.shape[1] != len(self.mean):
+            raise ValueError(f"features must be (B, {len(self.mean)}), got {tuple(batch.shape)}")
+        if len(batch):
+            mean = batch.mean(0)
+            self._join(len(batch), mean, batch - mean)
+
+    def merge(self, other: Moments) -> None:
+        """Take in all that `other` has seen; it stays as it is. Raises ValueError for another number of dimensions."""
+        if len(other.mean) != len(self.mean):
+            raise ValueError(f"expected moments of {len(self.mean)} dimensions, found {len(other.mean)}")
+        if other.count:
+            self.scatter += other.scatter.to(self.mean)
+            mean = other.mean.to(self.mean)
+            self._join(other.count, mean, mean.new_zeros(0, len(mean)))
+
+    def _join(self, count: int, mean: Tensor, deviations: Tensor) -> None:
+        total = self.count + count
+        shift = mean - self.mean
+        between = shift * math.sqrt(self.count * count / total)
+        # one pass over the large matrix: the distance of the two means is one more deviation
+        rows = torch.cat([deviations, between[None]])
+        self.scatter.addmm_(rows.T, rows)
+        self.mean += shift * (count / total)
+        self.count = total
+
+    def covariance(self) -> Tensor:
+        """(D, D) float64, divided by count - 1. Raises ValueError for fewer than two features."""
+        if self.count < 2:
+            raise ValueError(f"expected at least 2 features for a covariance, found {self.count}")
+        return self.scatter / (self.count - 1)
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors by name, for a file or another process; the inverse of `from_state`."""
+        return {"count": torch.tensor(self.count), "mean": self.mean, "scatter": self.scatter}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Tensor]) -> Moments:
+        """Moments as `state` gave them. Raises ValueError when names or shapes do not fit."""
+        found = {key: tuple(value.shape) for key, value in state.items()}
+        size = state["mean"].numel() if "mean" in state else 0
+        expected = {"count": (), "mean": (size,), "scatter": (size, size)}
+        if found != expected:
+            raise ValueError(f"expected count (), mean (D,) and scatter (D, D), found {found}")
+        moments = cls(size, state["mean"].device)
+        moments.count = int(state["count"])
+        moments.mean += state["mean"]
+        moments.scatter += state["scatter"]
+        return moments
+
+
+def moments(features: Array) -> Moments:
+    """Moments of one array (N, D), on its device. Raises ValueError for another shape, NaN or infinity."""
+    if features.ndim != 2:
+        raise ValueError(f"features must be (N, D), got {tuple(features.shape)}")
+    result = Moments(features.shape[1], features.device if isinstance(features, Tensor) else "cpu")
+    result.update(features)
+    return result
+
+
+def frechet_distance(a: Moments, b: Moments) -> float:
+    """|mu_a - mu_b|^2 + tr(S_a + S_b - 2 (S_a S_b)^(1/2)); symmetric, 0 for equal moments (Heusel et al. 2017).
+
+    FRD, FPD and FID by the features. With no more samples than dimensions the covariances are singular; the value is
+    then exact for these samples, but larger than that of many. Raises ValueError for different dimensions.
+    """
+    if len(a.mean) != len(b.mean):
+        raise ValueError(f"expected moments of {len(a.mean)} dimensions, found {len(b.mean)}")
+    first, second = a.covariance(), b.covariance().to(a.mean)
+    # S_a S_b = L (L^T S_b) has the eigenvalues of the symmetric L^T S_b L, whose roots add up to the trace
+    root = _factor(first)
+    eigenvalues = torch.linalg.eigvalsh(root.T @ second @ root).clamp(min=0)
+    distance = (a.mean - b.mean.to(a.mean)).square().sum() + first.trace() + second.trace()
+    return float(distance - 2 * eigenvalues.sqrt().sum())
+
+
+def _factor(covariance: Tensor) -> Tensor:
+    """L (D, R) with covariance = L L^T, R its rank: Cholesky, or the eigenvectors where it is singular."""
+    lower, failed = torch.linalg.cholesky_ex(covariance)
+    if not failed:
+        return lower
+    values, vectors = torch.linalg.eigh(covariance)
+    solid = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
+    return vectors[:, solid] * values[solid].sqrt()
+
+
+def kernel_distance(generated: Array, real: Array, rng: Random, subsets: int = 100, size: int = 1000) -> float:
+    """Unbiased squared MMD of features (N, D) and (M, D) under k(x, y) = (x.y / D + 1)^3 (KID, Binkowski et al. 2018).
+
+    The mean over `subsets` pairs of subsets of min(N, M, size) features without replacement; `rng` draws the generated
+    ones first. Features may be memory maps: only the drawn ones are read. Raises ValueError for fewer than two, other
+    shapes, NaN or infinity.
+    """
+    if generated.ndim != 2 or real.ndim != 2 or generated.shape[1] != real.shape[1]:
+        raise ValueError(f"features must be (N, D) and (M, D), got {tuple(generated.shape)} and {tuple(real.shape)}")
+    count = min(len(generated), len(real), size)
+    if count < 2:
+        raise ValueError(f"expected at least 2 features of either set, found {len(generated)} and {len(real)}")
+    total = 0.0
+    for _ in range(subsets):
+        x = as_tensor(generated[rng.choice(len(generated), count, replace=False)])
+        y = as_tensor(real[rng.choice(len(real), count, replace=False)]).to(x)
+        within = _cubic(x, x).fill_diagonal_(0).sum() + _cubic(y, y).fill_diagonal_(0).sum()
+        total += float(within / (count * (count - 1)) - 2 * _cubic(x, y).mean())
+    return total / subsets
+
+
+def _cubic(x: Tensor, y: Tensor) -> Tensor:
+    return ((x @ y.T).double() / x.shape[1] + 1) ** 3
+
+
+def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> float:
+    """Biased squared MMD under k(p, q) = exp(-|p - q|^2 / (2 width^2)) (Gretton et al. 2012), diagonals included.
+
+    x (N, ...) and y (M, ...) are histograms of one shape, each divided by its sum here. `block` scans at a time are made
+    float32, so 10,000 histograms of 100x100 counts need little more than themselves. Zero for equal sets. Raises
+    ValueError for other shapes, or a histogram without counts.
+    """
+    first, second = _rows(x), _rows(y)
+    if not len(first) or not len(second) or first.shape[1] != second.shape[1]:
+        raise ValueError(f"expected two sets of histograms of one shape, found {tuple(x.shape)} and {tuple(y.shape)}")
+    used = ((first != 0).any(0) | (second != 0).any(0).to(first.device)).nonzero()[:, 0]
+    scale = -0.5 / width**2
+    # k - 1 keeps the digits that k loses where all histograms are close; the ones cancel in the sum of the means
+    within = _mean_kernel(first, first, used, scale, block) + _mean_kernel(second, second, used, scale, block)
+    return within - 2 * _mean_kernel(first, second, used, scale, block)
+
+
+def _rows(values: Array) -> Tensor:
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.require(values, requirements=["C", "W"]))
+    return tensor.flatten(1)
+
+
+def _normalised(rows: Tensor, used: Tensor, block: int) -> Iterator[Tensor]:
+    """(block, D') float32 rows that sum to 1, of the columns `used` by any row."""
+    for part in rows.split(block):
+        total = part.sum(1, keepdim=True, dtype=torch.float64)
+        if not (total > 0).all() or not torch.isfinite(total).all():
+            raise ValueError("expected counts in every histogram, found one without")
+        yield part[:, used.to(part.device)].div(total).float()
+
+
+def _mean_kernel(x: Tensor, y: Tensor, used: Tensor, scale: float, block: int) -> float:
+    """Mean of exp(scale |p - q|^2) - 1 over all pairs; of one set with itself, over its upper triangle twice."""
+    total, same = 0.0, x is y
+    for i, p in enumerate(_normalised(x, used, block)):
+        for j, q in enumerate(_normalised(y[i * block :] if same else y, used, block)):
+            q = q.to(p)
+            squared = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * (p @ q.T)
+            if same and j == 0:
+                squared.fill_diagonal_(0)
+            part = float(torch.expm1(scale * squared.clamp(min=0)).sum(dtype=torch.float64))
+            total += 2 * part if same and j else part
+    return total / (len(x) * len(y))
+
+
+def jensen_shannon_distance(p: Array, q: Array) -> float:
+    """Square root of the Jensen-Shannon divergence, natural logarithm: 0 for equal, sqrt(ln 2) for disjoint ones.
+
+    p, q are counts of one shape, pooled over all scans; each is divided by its sum. Square the value for the divergence
+    (nats). Raises ValueError for other shapes, negative counts or none.
+    """
+    counts = [_rows(values[None]).double()[0].cpu() for values in (p, q)]
+    if p.shape != q.shape or any(not (c.sum() > 0) or c.min() < 0 for c in counts):
+        totals: Sequence[float] = [float(c.sum()) for c in counts]
+        raise ValueError(f"expected counts of one shape, found {tuple(p.shape)}, {tuple(q.shape)} with sums {totals}")
+    left, right = (c / c.sum() for c in counts)
+    middle = (left + right) / 2
+    divergence = sum(torch.special.xlogy(c, c / middle).nan_to_num(0).sum() for c in (left, right)) / 2
+    return math.sqrt(max(float(divergence), 0.0))

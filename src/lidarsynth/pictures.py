@@ -1,0 +1,58 @@
+"""The pictures that the verbs write: a portrait of one range image, and before / after / truth of a filled one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lidarsynth.lidar.figure import GAP, Picture, colour_bar, panel
+from lidarsynth.lidar.perspective import perspective
+from lidarsynth.lidar.render import bev, range_strip, reflectance_strip
+from lidarsynth.lidar.scan import RangeImage, Scan
+
+STRIP = 1024  # pixels, the width of a strip
+EXTENT = 32.0  # metres from the car to the left and right border of a view from above
+
+
+def portrait(image: RangeImage) -> np.ndarray:
+    """(H', W', 3) uint8: range and reflectance strips above a perspective view of the points."""
+    rows = [[("range", range_strip(image))], [("reflectance", reflectance_strip(image))]]
+    return panel([*rows, [("points", perspective(image, size=(1024, 576)))]])
+
+
+def before_and_after(images: Mapping[str, RangeImage], points: Mapping[str, Scan]) -> np.ndarray:
+    """(H', W', 3) uint8: a row of range and reflectance strips per caption, then all points in 3-D and from above.
+
+    points  what to draw in 3-D instead of an image's own pixels, by caption
+    """
+    first = next(iter(images.values()))
+    end, rows, columns = (
+        first.sensor.max_range,
+        max(round(192 / first.shape[0]), 1),
+        max(round(STRIP / first.shape[1]), 1),
+    )
+    strips: list[list[Picture]] = []
+    for name, image in images.items():
+        pictures = range_strip(image, end, rows), reflectance_strip(image, rows)
+        wide = [np.repeat(picture, columns, axis=1) for picture in pictures]
+        strips.append([(f"{name}: range", wide[0]), (f"{name}: reflectance", wide[1])])
+    bars = [("", colour_bar("range", STRIP, end)), ("", colour_bar("reflectance", STRIP))]
+    width = (2 * STRIP + GAP - GAP * (len(images) - 1)) // len(images)
+    drawn = {name: points.get(name, image) for name, image in images.items()}
+    views = [
+        (f"{name}: {_count(p)} points", perspective(p, size=(width, width * 9 // 16))) for name, p in drawn.items()
+    ]
+    above = [(f"{name}, from above", _ahead(p, width)) for name, p in drawn.items()]
+    return panel([*strips, bars, views, above], width=2 * STRIP + GAP)
+
+
+def _ahead(points: Scan | RangeImage, width: int) -> np.ndarray:
+    """(width * 9 // 16, width, 3) uint8: the bird's eye view turned so that the road runs to the right."""
+    square = np.rot90(bev(points, extent=EXTENT, size=width, background="white"), -1)
+    spare = (width - width * 9 // 16) // 2
+    return np.ascontiguousarray(square[spare : spare + width * 9 // 16])
+
+
+def _count(points: Scan | RangeImage) -> str:
+    return f"{len(points) if isinstance(points, Scan) else int(points.mask.sum()):,}"

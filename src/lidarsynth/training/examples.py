@@ -1,0 +1,140 @@
+"""What a training step sees: which images of a cache or of endless synthetic streets, read by worker processes."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from lidarsynth.build import build_sensor
+from lidarsynth.data.dataset import CachedImages
+from lidarsynth.data.frames import Name
+from lidarsynth.experiment import Experiment, Training
+from lidarsynth.lidar.depth import to_x_0
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.training.steps import Batch, draw
+
+SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
+
+
+class Streets:
+    """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
+
+    Raises ImportError naming the extra when the ray caster is missing.
+    """
+
+    def __init__(self, seed: int, sensor: Sensor):
+        self.seed = seed
+        self.sensor = sensor
+        self.source = {"name": SYNTHETIC, "seed": seed}
+        self._readers: dict[int, Any] = {}
+
+    def indices(self, step: int, batch_size: int) -> list[int]:
+        """The scans of a step, each from another world; steps in a row go through the places of their worlds."""
+        from lidarsynth.data.synthetic.world import POSES
+
+        return [(step // POSES * batch_size + p) * POSES + step % POSES for p in range(batch_size)]
+
+    def name(self, i: int) -> Name:
+        """What scan i is called."""
+        return Name(SYNTHETIC, f"seed {self.seed}", str(i))
+
+    def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
+        """(B, 2, H, W) float32 in [-1, 1]."""
+        from lidarsynth.data.synthetic.reader import SyntheticStreets
+
+        images = []
+        for slot, index in enumerate(indices):  # a reader per slot, because a reader remembers only two worlds
+            reader = self._readers.setdefault(slot, SyntheticStreets(self.seed, 1 << 62, self.sensor))
+            images.append(to_x_0(reader.image(index), codec))
+        return torch.stack(images)
+
+
+Images = CachedImages | Streets
+
+
+def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> Images:
+    """The images of a cache folder, or streets of `seed` (default the experiment's) for the word `synthetic`.
+
+    Raises ValueError when the folder is no cache.
+    """
+    if str(data) == SYNTHETIC:
+        return Streets(experiment.training.seed if seed is None else seed, build_sensor(experiment))
+    return CachedImages(data)
+
+
+@lru_cache(maxsize=4)
+def epoch_order(seed: int, epoch: int, length: int) -> Tensor:
+    """(length,) permutation of the data of one epoch, a function of the seed and the epoch only."""
+    return torch.randperm(length, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
+
+
+def batch_indices(training: Training, step: int, images: Images) -> list[int]:
+    """Which images the global batch of step `step` holds: each epoch visits every image of a cache once."""
+    if isinstance(images, Streets):
+        return images.indices(step, training.batch_size)
+    length = len(images)
+    positions = range(step * training.batch_size, (step + 1) * training.batch_size)
+    return [int(epoch_order(training.seed, p // length, length)[p % length]) for p in positions]
+
+
+class Examples(Dataset):
+    """`examples[step, part] -> Batch`: part of `parts` equal parts of a step's global batch, interleaved.
+
+    `parts` is processes times passes of gradient accumulation. Raises ValueError unless it divides the batch size.
+    """
+
+    def __init__(self, experiment: Experiment, images: Images, parts: int):
+        size = experiment.training.batch_size
+        if size % parts:
+            raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")
+        self.experiment = experiment
+        self.images = images
+        self.parts = parts
+
+    def names(self, step: int) -> str:
+        """The scans of a step, as a person looks for them."""
+        indices = batch_indices(self.experiment.training, step, self.images)
+        return ", ".join("/".join(filter(None, self.images.name(i))) for i in indices)
+
+    def __getitem__(self, key: tuple[int, int]) -> Batch:
+        step, part = key
+        training = self.experiment.training
+        indices = batch_indices(training, step, self.images)
+        positions = list(range(part, training.batch_size, self.parts))
+        x_0 = self.images.x_0([indices[p] for p in positions], self.experiment.data.codec)
+        return draw(self.experiment, x_0, step, positions)
+
+
+def load_batches(
+    examples: Examples, first: int, parts: range, workers: int = 0, pinned: bool = False
+) -> Iterator[Batch]:
+    """The batches of the steps from `first` to the last, for each step those of `parts` in turn.
+
+    The order does not depend on `workers`, the number of processes that read ahead.
+    """
+    return iter(
+        DataLoader(
+            examples,
+            batch_size=None,
+            sampler=product(range(first, examples.experiment.training.steps), parts),
+            num_workers=workers,
+            pin_memory=pinned,
+            worker_init_fn=_ignore_signals if workers else None,
+            prefetch_factor=4 if workers else None,
+            generator=torch.Generator(),  # leaves the global one alone
+        )
+    )
+
+
+def _ignore_signals(worker: int) -> None:
+    # a stop is for the main process, which saves first and then ends its workers
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)

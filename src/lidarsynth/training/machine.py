@@ -1,0 +1,80 @@
+"""The machine under a run: processes and devices through accelerate, workers, global randomness, stop signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from lidarsynth.training.options import Options
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+
+def accelerator_of(options: Options) -> Accelerator:
+    """What accelerate found: devices, processes, precision.
+
+    Raises ImportError naming the extra when accelerate is missing, ValueError when the device has no such precision.
+    """
+    try:
+        from accelerate import Accelerator, DistributedDataParallelKwargs
+    except ImportError:
+        raise ImportError("training needs accelerate: pip install 'lidarsynth[train]'") from None
+    return Accelerator(
+        mixed_precision="no" if options.precision == "fp32" else options.precision,
+        gradient_accumulation_steps=options.accumulate,
+        # buffers are ray angles, the same everywhere
+        kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],
+    )
+
+
+def workers_of(options: Options, wanted: bool) -> int:
+    """How many processes read ahead for this one; unless told, half of its cores where reading ahead is `wanted`."""
+    if options.workers is not None:
+        return options.workers
+    cores = (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return max(1, cores // 2) if wanted else 0
+
+
+@contextmanager
+def fixed_randomness(*key: int) -> Iterator[None]:
+    """torch's global generators, seeded by the numbers of `key` inside and put back behind it."""
+    devices = [torch.cuda.current_device()] if torch.cuda.is_available() and torch.cuda.is_initialized() else []
+    with torch.random.fork_rng(devices):
+        torch.random.manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
+        yield
+
+
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """A list that SIGTERM and the first Ctrl-C append to instead of ending the process; a second one ends it."""
+    received: list[int] = []
+    former = {}
+
+    def note(number: int, frame: object) -> None:
+        received.append(number)
+        signal.signal(number, former[number])
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        former[number] = signal.getsignal(number)
+        signal.signal(number, note)
+    try:
+        yield received
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def any_process(accelerator: Accelerator, flag: bool) -> bool:
+    """Whether the flag is up in any process; every process gets the same answer, so that all stop at one step."""
+    if accelerator.num_processes == 1:
+        return flag
+    count = accelerator.reduce(torch.tensor(float(flag), device=accelerator.device), reduction="sum")
+    assert isinstance(count, torch.Tensor)
+    return bool(count > 0)

@@ -1,0 +1,350 @@
+"""Caches: exact to their steps, resumable after a kill, honest about broken scans, full disks and damaged shards."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from lidarsynth.cli import main
+from lidarsynth.data import cache
+from lidarsynth.data.dataset import CachedImages, read_index, verify, write_cache
+from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, summary
+from lidarsynth.lidar.depth import CODECS, to_x_0
+from lidarsynth.lidar.projection import project, thin
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+SENSOR = Sensor("eight", tuple(range(4, -4, -1)), width=32, min_range=1.45, max_range=80.0)
+WHAT = {"name": "test"}
+
+
+def image(i: int) -> RangeImage:
+    """A random image of seed i; every third has labels."""
+    rng = np.random.default_rng(i)
+    mask = rng.random((8, 32)) < 0.8
+    distance = np.where(mask, rng.uniform(1, 90, mask.shape), 0).astype(np.float32)
+    reflectance = np.where(mask, rng.random(mask.shape), 0).astype(np.float32)
+    label = np.where(mask, rng.integers(0, 20, mask.shape), 0) if i % 3 == 0 else None
+    return RangeImage(distance, reflectance, mask, SENSOR, label)
+
+
+def name(i: int) -> tuple[str, str, str]:
+    return "test", f"drive{i // 100}", f"{i:06d}"
+
+
+def fails_at(*bad: int):
+    def make(i: int) -> RangeImage:
+        if i in bad:
+            raise ValueError(f"scan {i}: expected points, found none")
+        return image(i)
+
+    return make
+
+
+def state(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def scans(root: Path, count: int) -> None:
+    """`count` KITTI files of 600 points each on the beams of the HDL-64E, as sequence 00 of the odometry benchmark."""
+    folder = root / "sequences" / "00" / "velodyne"
+    folder.mkdir(parents=True)
+    for i in range(count):
+        rng = np.random.default_rng(i)
+        azimuth, elevation = rng.uniform(-np.pi, np.pi, 600), np.radians(rng.uniform(-24, 1, 600))
+        ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+        table = np.column_stack([ray * rng.uniform(2, 70, (600, 1)), rng.random(600)])
+        table.astype("<f4").tofile(folder / f"{i:06d}.bin")
+
+
+def test_images_come_back_to_a_millimetre(tmp_path: Path):
+    assert list(write_cache(tmp_path, image, 150, SENSOR, WHAT, name)) == [64, 128, 150]
+    images = CachedImages(tmp_path)
+    assert (len(images), images.sensor, images.source) == (150, SENSOR, WHAT)
+    for i in (0, 1, 63, 64, 149):
+        got, expected = images[i], image(i)
+        np.testing.assert_array_equal(got.mask, expected.mask)
+        np.testing.assert_allclose(got.range, expected.range, atol=0.00101)
+        np.testing.assert_allclose(got.reflectance, expected.reflectance, atol=0.5 / 255 + 1e-6)
+        assert images.name(i) == name(i)
+        assert (got.label is None) == (expected.label is None)
+        if got.label is not None:
+            np.testing.assert_array_equal(got.label, expected.label)
+    with pytest.raises(IndexError, match=r"0\.\.149, got 150"):
+        images.record(150)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_x_0_is_that_of_the_images(tmp_path: Path, codec: str):
+    list(write_cache(tmp_path, image, 70, SENSOR, WHAT))
+    images = CachedImages(tmp_path)
+    x_0 = images.x_0([69, 0, 7], codec)
+    assert x_0.dtype == torch.float32 and x_0.is_contiguous()
+    expected = torch.stack([to_x_0(images[i], codec) for i in (69, 0, 7)])
+    torch.testing.assert_close(x_0, expected, rtol=0, atol=2e-7)
+    assert ((x_0[:, 0] == -1) == (expected[:, 0] == -1)).all()
+
+
+def test_every_range_of_a_metre_has_its_own_code(tmp_path: Path):
+    """All 65,536 stored ranges through the table of logarithms and through the codec itself."""
+    wide = Sensor("wide", SENSOR.elevations, 8192, 1.45, 80.0)
+    distance = (np.arange(65536, dtype=np.float32) * np.float32(0.002)).reshape(8, 8192)
+    whole = RangeImage(distance, np.zeros_like(distance), distance > 0, wide)
+    list(write_cache(tmp_path, lambda i: whole, 1, wide, WHAT))
+    torch.testing.assert_close(CachedImages(tmp_path).x_0([0])[0], to_x_0(whole), rtol=0, atol=2e-7)
+
+
+def test_a_loader_reads_it_in_its_own_processes(tmp_path: Path):
+    list(write_cache(tmp_path, image, 70, SENSOR, WHAT))
+    images = CachedImages(tmp_path)
+    loader = DataLoader(range(70), batch_size=16, collate_fn=images.x_0, num_workers=1, multiprocessing_context="spawn")
+    torch.testing.assert_close(torch.cat(list(loader)), images.x_0(list(range(70))), rtol=0, atol=0)
+
+
+def test_open_files_and_memory_do_not_grow_with_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cache, "SHARD", 1)
+    list(write_cache(tmp_path, image, 300, SENSOR, WHAT))
+    images = CachedImages(tmp_path)
+    before = len(os.listdir("/proc/self/fd"))
+    batches = [images.x_0(list(range(300))) for _ in range(2)]
+    assert len(os.listdir("/proc/self/fd")) == before
+    torch.testing.assert_close(*batches, rtol=0, atol=0)
+    assert "0000299.npy" not in Path("/proc/self/maps").read_text()
+
+
+def test_a_cache_of_the_first_format_is_read_and_continued(tmp_path: Path):
+    """Made before images had names: shards with a count and a checksum only, label 0 where there were none."""
+    list(write_cache(tmp_path, image, 100, SENSOR, WHAT))
+    index = read_index(tmp_path)
+    index["shards"] = {n: {k: e[k] for k in ("count", "sha256")} for n, e in index["shards"].items()}
+    (tmp_path / "index.json").write_text(json.dumps(index, indent=1))
+    assert CachedImages(tmp_path).name(99) == ("test", "", "99")
+    assert verify(tmp_path) == 100
+    assert list(write_cache(tmp_path, image, 200, SENSOR, WHAT)) == [64, 128, 192, 200]
+    images = CachedImages(tmp_path)
+    assert len(images) == 200
+    np.testing.assert_array_equal(images[120].mask, image(120).mask)
+
+
+def test_workers_write_what_one_process_writes(tmp_path: Path):
+    for folder, workers in (("one", 0), ("two", 2)):
+        done = list(write_cache(tmp_path / folder, image, 130, SENSOR, WHAT, name, workers))
+        assert done == [64, 128, 130]
+    assert state(tmp_path / "one") == state(tmp_path / "two")
+
+
+def test_an_interrupted_call_goes_on_where_it_was(tmp_path: Path):
+    list(write_cache(tmp_path / "whole", image, 300, SENSOR, WHAT, name))
+    first = write_cache(tmp_path / "part", image, 300, SENSOR, WHAT, name)
+    assert [next(first), next(first)] == [64, 128]
+    first.close()
+    asked = []
+
+    def watched(i: int) -> RangeImage:
+        asked.append(i)
+        return image(i)
+
+    assert list(write_cache(tmp_path / "part", watched, 300, SENSOR, WHAT, name)) == [128, 192, 256, 300]
+    assert asked == list(range(128, 300))
+    assert state(tmp_path / "whole") == state(tmp_path / "part")
+    assert list(write_cache(tmp_path / "part", fails_at(*range(300)), 300, SENSOR, WHAT, name)) == [300]
+
+
+def test_killed_at_any_moment_the_same_command_goes_on(tmp_path: Path):
+    scans(tmp_path, 400)
+    command = [sys.executable, "-m", "lidarsynth", "data", "kitti", str(tmp_path), str(tmp_path / "cache"),
+               "--projection", "spherical", "--width", "1024", "--workers", "2"]  # fmt: skip
+    kills = 0
+    for shards in (1, 3, 5):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None and len(list((tmp_path / "cache").glob("*.npy"))) < shards:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        kills += process.wait() == -signal.SIGKILL
+    assert kills >= 2
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "wrote 400 images of 1 sequence in" in done.stdout
+    list(cache_source("kitti", tmp_path, tmp_path / "whole", projection="spherical", width=1024))
+    assert state(tmp_path / "cache") == state(tmp_path / "whole"), "no leftovers of the killed processes either"
+
+
+def test_broken_scans_are_skipped_named_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scans(tmp_path, 70)
+    velodyne = tmp_path / "sequences" / "00" / "velodyne"
+    (velodyne / "000003.bin").write_bytes(b"broken")
+    (velodyne / "000066.bin").write_bytes(b"")
+    folder = tmp_path / "cache"
+    main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical"])
+    assert "wrote 68 images of 1 sequence" in (said := capsys.readouterr().out)
+    assert f"2 broken scans skipped (named in {folder}/report.json)" in said
+    told = json.loads((folder / "report.json").read_text())
+    assert told["stored"] == 68 and told["sequences"] == {"00": 68}
+    assert [(s["sequence"], s["frame"]) for s in told["skipped"]] == [("00", "000003"), ("00", "000066")]
+    assert "000003.bin: expected whole points" in told["skipped"][0]["reason"]
+    images = CachedImages(folder)
+    assert [images.name(i).frame for i in (2, 3, 62, 65, 67)] == ["000002", "000004", "000063", "000067", "000069"]
+    assert verify(folder) == 68
+    before = state(folder)
+    main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical"])
+    assert state(folder) == before
+
+
+def test_a_wrong_projection_stops_at_once(tmp_path: Path):
+    scans(tmp_path, 70)
+    with pytest.raises(ValueError, match=r"projected among 64, found none; the first, 00/000000: unfolding expects"):
+        list(cache_source("kitti", tmp_path, tmp_path / "cache"))
+    assert not list((tmp_path / "cache").glob("*.npy"))
+
+
+LIMITED = """
+import resource, sys
+from lidarsynth.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_full_disk_is_one_clear_line(tmp_path: Path, workers: str):
+    scans(tmp_path, 130)
+    words = ["data", "kitti", str(tmp_path), str(tmp_path / "cache"), "--projection", "spherical", "--workers", workers]
+    script = tmp_path / "limited.py"
+    script.write_text(LIMITED.replace("main(sys.argv[1:])", "if __name__ == '__main__':\n    main(sys.argv[1:])"))
+    done = subprocess.run([sys.executable, str(script), *words], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    line = done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert f"{tmp_path}/cache: expected a writable folder with room for 8.0 MiB more, found: File too large" in line
+    assert not list((tmp_path / "cache").glob("*.npy")) and not list((tmp_path / "cache").glob(".*"))
+    main(words)
+    assert verify(tmp_path / "cache") == 130
+
+
+def test_a_disk_that_fills_up_keeps_what_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    writing = write_cache(tmp_path, image, 200, SENSOR, WHAT, name)
+    next(writing)
+    with monkeypatch.context() as patch:
+        patch.setattr(cache.os if hasattr(cache, "os") else os, "replace", full)
+        with pytest.raises(
+            OSError, match=r"room for .* MiB more, found: No space left on device; the same command goes on"
+        ):
+            list(writing)
+    assert list(write_cache(tmp_path, image, 200, SENSOR, WHAT, name))[-1] == 200
+    assert verify(tmp_path) == 200
+
+
+def test_damage_is_found_and_mended(tmp_path: Path):
+    list(write_cache(tmp_path, image, 200, SENSOR, WHAT, name))
+    before = state(tmp_path)
+    path = tmp_path / "0000064.npy"
+    path.write_bytes(before[path.name][:-1] + bytes([before[path.name][-1] ^ 1]))
+    with pytest.raises(ValueError, match=r"expected the checksums of index.json, found others in 0000064.npy;"):
+        verify(tmp_path)
+    list(write_cache(tmp_path, image, 200, SENSOR, WHAT, name, check=True))
+    assert state(tmp_path) == before
+    path.write_bytes(before[path.name][:-1])
+    with pytest.raises(ValueError, match=r"0000064.npy: expected \d+ bytes, found \d+; prepare the cache again"):
+        CachedImages(tmp_path)
+    list(write_cache(tmp_path, image, 200, SENSOR, WHAT, name))
+    assert state(tmp_path) == before
+
+
+def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
+    list(write_cache(tmp_path, image, 10, SENSOR, WHAT, name))
+    with pytest.raises(ValueError, match="expected a cache of source {'name': 'other'}, found one of {'name': 'test'}"):
+        list(write_cache(tmp_path, image, 10, SENSOR, {"name": "other"}, name))
+    with pytest.raises(ValueError, match="expected a cache of sensor {'width': 64}, found one of {'width': 32}"):
+        list(write_cache(tmp_path, image, 10, SENSOR.resized(width=64), WHAT, name))
+    with pytest.raises(ValueError, match=r"expected the scans .*'000007'.*found .*'000000'.*name another folder"):
+        list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: name(i + 7)))
+    with pytest.raises(ValueError, match=r"expected a cache folder with index.json, found No such file"):
+        CachedImages(tmp_path / "nowhere")
+
+
+def test_words_are_checked(tmp_path: Path):
+    with pytest.raises(ValueError, match="expected a source of kitti360, kitti, .* or synthetic, found 'waymo'"):
+        list(cache_source("waymo", tmp_path, tmp_path))
+    with pytest.raises(ValueError, match="expected a projection of auto, spherical, unfolding, found 'flat'"):
+        list(cache_source("kitti", tmp_path, tmp_path, projection="flat"))
+    with pytest.raises(SystemExit):
+        main(["data", "waymo", "root", "cache"])
+    for word in SOURCES:  # the command line's own list has them all
+        with pytest.raises(SystemExit) as stop:
+            main(["data", word, str(tmp_path / "nowhere"), str(tmp_path / "cache")])
+        assert stop.value.code == 2
+
+
+def test_synthetic_streets_have_labels(tmp_path: Path):
+    pytest.importorskip("embreex")
+    assert list(cache_synthetic(tmp_path, 2, width=64)) == [(2, 2)]
+    label = CachedImages(tmp_path)[0].label
+    assert label is not None and 9 in label
+    assert summary(tmp_path) == f"2 images in {tmp_path}/"
+
+
+@pytest.mark.parametrize(
+    ("method", "columns", "size", "codec", "key"),
+    [
+        ("unfolding", 2048, (64, 512), "log", "train_x0.unfolding-2048.to64x512.log_depth"),
+        ("spherical", 1024, (64, 256), "log", "train_x0.spherical-1024.to64x256.log_depth"),
+        ("spherical", 1024, (32, 128), "metric", "train_x0.spherical-1024.to32x128.depth"),
+        ("spherical", 1024, (32, 128), "inverse", "train_x0.spherical-1024.to32x128.inverse_depth"),
+    ],
+)
+def test_training_images_are_the_published_ones(shared: Path, fixture_tensors, method, columns, size, codec, key):
+    expected = fixture_tensors("projection/preprocess")[key][0]
+    table = np.fromfile(shared / "fixtures" / "projection" / "scan64.bin", "<f4").reshape(-1, 4)
+    scan = Scan(table[:, :3], table[:, 3])
+    small = thin(project(scan, SENSORS["hdl-64e"], method, columns), *size)
+    assert small.shape == size == (small.sensor.height, small.sensor.width)
+    torch.testing.assert_close(to_x_0(small, codec), expected, rtol=0, atol=1e-5)
+
+
+def test_a_cache_of_kitti_raw_is_the_papers(shared: Path, fixture_tensors, tmp_path: Path):
+    folder = tmp_path / "2011_10_03" / "2011_10_03_drive_0027_sync" / "velodyne_points" / "data"
+    folder.mkdir(parents=True)
+    (folder / "0000000000.bin").symlink_to((shared / "fixtures" / "projection" / "scan64.bin").resolve())
+    main(["data", "kitti", str(tmp_path), str(tmp_path / "cache"), "--sensor", "hdl-64e"])
+    images = CachedImages(tmp_path / "cache")
+    assert (images.source["projection"], images.source["columns"], images[0].shape) == ("unfolding", 2048, (64, 512))
+    expected = fixture_tensors("projection/preprocess")["train_x0.unfolding-2048.to64x512.log_depth"][0]
+    x_0 = images.x_0([0])[0]
+    # 1 mm at 1.45 m is 1.3e-4 of the logarithm's range, twice that of [-1, 1]; half a step of reflectance is 1/255.
+    torch.testing.assert_close(x_0[0], expected[0], rtol=0, atol=2 * 0.001 / (2.45 * np.log(81)) + 1e-6)
+    torch.testing.assert_close(x_0[1], expected[1], rtol=0, atol=1 / 255 + 1e-6)
+    assert ((x_0[0] == -1) == (expected[0] == -1)).all()
+
+
+def test_real_beams_keep_their_angles_when_thinned():
+    beams = SENSORS["hdl-64e-kitti"]
+    rows = np.broadcast_to(np.arange(64, dtype=np.float32)[:, None], (64, 1024))
+    tall = RangeImage(rows, np.zeros_like(rows), rows > 0, beams, rows.astype(int), np.stack([rows] * 3, axis=-1))
+    small = thin(tall, 16, 256)
+    assert small.sensor == beams.resized(16, 256)
+    assert [beams.elevations[int(row)] for row in small.range[:, 0]] == list(small.sensor.elevations)
+    assert small.label is not None and small.xyz is not None
+    np.testing.assert_array_equal(small.label, small.range)
+    np.testing.assert_array_equal(small.xyz[..., 2], small.range)
+
+
+def test_a_narrow_cache_keeps_the_ray_drop(shared: Path):
+    """A pixel of 64 x 512 is one pixel of the turn, so as many are empty; drawing at 512 columns would fill them."""
+    table = np.fromfile(shared / "fixtures" / "projection" / "scan64.bin", "<f4").reshape(-1, 4)
+    scan = Scan(table[:, :3], table[:, 3])
+    sensor = SENSORS["hdl-64e"].resized(width=512)
+    thinned = Projected([scan], sensor, "unfolding", 2048)(0)
+    turn = project(scan, sensor, "unfolding", 2048)
+    assert abs(thinned.mask.mean() - turn.mask.mean()) < 0.01
+    assert project(scan, sensor, "unfolding").mask.mean() > turn.mask.mean() + 0.05

@@ -1,0 +1,104 @@
+"""What the columns of a file mean: intensity scales, ring order, times, labels, lost points."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_scan import N, full_scan, same
+
+from lidarsynth.data.fields import NAMES, reflectance_from, rings_from_top, seconds_from
+from lidarsynth.data.files import read, read_with_report, write
+from lidarsynth.data.labels import CLASS_OF_RAW, read_labels
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS
+
+
+@pytest.fixture
+def scan() -> Scan:
+    return full_scan()
+
+
+@pytest.mark.parametrize(
+    ("values", "scale"),
+    [
+        (np.array([0, 0.5, 1.0], np.float32), 1),
+        (np.array([0, 3, 255.0], np.float32), 255),
+        (np.array([0, 3, 256.0], np.float64), 65535),
+        (np.array([0, 1], np.uint8), 255),
+        (np.array([0, 1], np.uint16), 255),
+        (np.array([0, 200], np.int32), 255),
+        (np.array([0, 300], np.uint16), 65535),
+    ],
+)
+def test_intensity_scales_are_recognised(values: np.ndarray, scale: float):
+    np.testing.assert_allclose(reflectance_from(values), values / np.float64(scale), rtol=1e-6)
+
+
+def test_intensity_scales_can_be_forced():
+    values = np.array([0, 0.5, 1.0])
+    np.testing.assert_allclose(reflectance_from(values, "byte"), values / 255, rtol=1e-6)
+    np.testing.assert_allclose(reflectance_from(values, "uint16"), values / 65535, rtol=1e-6)
+    np.testing.assert_array_equal(reflectance_from(np.array([0, 1], np.uint8), "unit"), [0, 1])
+
+
+def test_points_without_return_are_dropped_and_counted(scan: Scan, tmp_path: Path):
+    table = np.column_stack([scan.xyz, scan.reflectance])
+    table[3, 0], table[5, 2], table[7, 3] = np.nan, np.inf, np.nan
+    table[9, :3] = 0
+    table.astype(np.float32).tofile(tmp_path / "scan.bin")
+    found, dropped = read_with_report(tmp_path / "scan.bin")
+    assert dropped == 4
+    same(found, scan[np.setdiff1d(np.arange(N), [3, 5, 7, 9])], ("xyz", "reflectance"))
+
+
+def test_rings_count_from_the_top(scan: Scan):
+    np.testing.assert_array_equal(rings_from_top(scan.ring, scan.xyz), scan.ring)
+    np.testing.assert_array_equal(rings_from_top(9.0 - scan.ring, scan.xyz), scan.ring)
+    firing = np.array([0, 5, 1, 6, 2, 7, 3, 8, 4, 9])  # laser ids in the order they fire
+    np.testing.assert_array_equal(rings_from_top(firing[scan.ring], scan.xyz), scan.ring)
+
+
+def test_rings_of_empty_beams_at_the_top_are_not_lost():
+    """30 of 32 rings, from the bottom, are the lower 30 of an HDL-32E."""
+    grid = SENSORS["hdl-32e"].points(np.full((32, 1024), 10, np.float32))
+    ring = np.repeat(np.arange(2, 32), 1024)
+    np.testing.assert_array_equal(rings_from_top(31 - ring, grid[2:].reshape(-1, 3)), ring)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
+def test_whole_times_find_their_unit(unit: float):
+    seconds = np.linspace(0, 0.1, 101)
+    found = seconds_from(np.round((1.6e9 + seconds) / unit).astype(np.int64))
+    np.testing.assert_allclose(found, seconds, atol=2 * unit + 1e-6)
+
+
+def test_semantic_kitti_labels(scan: Scan, tmp_path: Path):
+    write(tmp_path / "scan.bin", scan)
+    raws = np.array([0, 10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81])
+    np.testing.assert_array_equal(CLASS_OF_RAW[raws], np.arange(20))  # the published inverse map
+    assert (CLASS_OF_RAW >= 0).sum() == 34
+    words = raws[scan.label].astype("<u4") | np.uint32(77 << 16)  # the high half is the instance
+    words.tofile(tmp_path / "scan.label")
+    np.testing.assert_array_equal(read_labels(tmp_path / "scan.label", N), scan.label)
+    np.testing.assert_array_equal(read(tmp_path / "scan.bin", labels=tmp_path / "scan.label").label, scan.label)
+
+
+def test_labels_stay_with_their_points_when_some_are_dropped(scan: Scan, tmp_path: Path):
+    xyz = scan.xyz.copy()
+    xyz[::5] = 0
+    write(tmp_path / "scan.bin", Scan(xyz, scan.reflectance))
+    raw = np.where(np.arange(N) % 5 == 1, 50, 40).astype("<u4")
+    raw.tofile(tmp_path / "scan.label")
+    found = read(tmp_path / "scan.bin", labels=tmp_path / "scan.label")
+    np.testing.assert_array_equal(found.label, np.where(np.arange(N) % 5 == 1, 13, 9)[np.arange(N) % 5 != 0])
+
+
+def test_labels_of_another_data_set_are_left_out(scan: Scan, tmp_path: Path):
+    write(tmp_path / "scan.pcd", replace(scan, label=scan.label + 100))
+    assert read(tmp_path / "scan.pcd").label is None
+
+
+def test_every_usual_name_is_lower_case_and_unique():
+    names = [usual for usuals in NAMES.values() for usual in usuals]
+    assert len(names) == len(set(names)) and all(name == name.lower() for name in names)

@@ -1,0 +1,146 @@
+"""The sensor is found from the points alone, on real scans and on ideal ones; what is not known is asked for."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarsynth.data.files import read
+from lidarsynth.data.recognise import elevations_of, recognise, rings_in_order
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+
+def turn(sensor: Sensor, rings: bool = True, keep: float = 0.8, rows: slice = slice(None)) -> Scan:
+    """A turn of an ideal sensor in a round room on flat ground, some points lost."""
+    rng = np.random.default_rng(0)
+    sensor = sensor.resized(width=512)
+    rays = sensor.directions()
+    with np.errstate(divide="ignore"):
+        ground = np.where(rays[..., 2] < 0, 1.7 / -rays[..., 2], 60)
+    distance = np.clip(np.minimum(ground, 60), 3.5, 60) * rng.uniform(0.98, 1.02, ground.shape)
+    xyz = sensor.points(distance.astype(np.float32))[rows]
+    ring = np.broadcast_to(np.arange(len(xyz))[:, None], xyz.shape[:2])
+    kept = rng.random(ring.shape) < keep
+    return Scan(xyz[kept], np.zeros(kept.sum(), np.float32), ring=ring[kept] if rings else None)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_is_recognised_by_its_rings(name: str):
+    assert recognise(turn(SENSORS[name]))[0] == name
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_is_recognised_by_the_order_of_its_points(name: str):
+    assert recognise(turn(SENSORS[name], rings=False))[0] == name
+
+
+@pytest.mark.parametrize("name", ["hdl-32e", "vlp-16", "vlp-32c", "os1-64", "os1-128", "pandar64"])
+def test_a_sensor_without_rings_is_recognised_by_its_points(name: str):
+    scan = turn(SENSORS[name], rings=False)
+    shuffled = scan[np.random.default_rng(1).permutation(len(scan))]
+    assert rings_in_order(shuffled.xyz) is None
+    assert recognise(shuffled)[0] == name
+
+
+@pytest.mark.parametrize("first", range(4))
+def test_every_fourth_ring_of_a_64_beam_sensor_is_no_vlp_16(first: int):
+    name, reason = recognise(turn(SENSORS["hdl-64e-kitti"], rows=slice(first, None, 4)))
+    assert name == "hdl-64e-kitti"
+    assert "16 of the 64 beams" in reason
+
+
+def test_a_sensor_close_to_the_ground_keeps_its_lowest_beams():
+    scan = turn(SENSORS["vlp-16"])
+    low = Scan(scan.xyz * np.float32(0.3), scan.reflectance, ring=scan.ring)
+    assert recognise(low)[0] == "vlp-16"
+
+
+def test_empty_beams_towards_the_sky_do_no_harm():
+    assert recognise(turn(SENSORS["pandar64"], rows=slice(3, None)))[0] == "pandar64"
+
+
+def test_an_unknown_sensor_is_asked_for_in_one_line():
+    other = Sensor("fan", tuple(np.linspace(40, -30, 40)))
+    for scan in (turn(other), turn(other, rings=False)):
+        name, reason = recognise(scan, Path("scan.pcd"))
+        assert name is None
+        assert reason.startswith("scan.pcd: expected the beams of hdl-64e") and "--sensor" in reason
+        assert "\n" not in reason and "+40.0 to -30.0" in reason
+
+
+def test_points_of_no_spinning_sensor_are_asked_for():
+    xyz = np.random.default_rng(0).normal(0, 10, (5000, 3)).astype(np.float32)
+    assert recognise(Scan(xyz, np.zeros(5000, np.float32)))[0] is None
+    name, reason = recognise(Scan(xyz[:50], np.zeros(50, np.float32)))
+    assert name is None and "at least 100 points" in reason and "found 50" in reason
+    near = Scan(xyz * np.float32(0.01), np.zeros(5000, np.float32))
+    assert recognise(near)[0] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "sensor"),
+    [
+        ("nuscenes_hdl32e.pcd.bin", "hdl-32e"),
+        ("fast_gicp_251370668.pcd", "hdl-32e"),  # not named by its source: 32 beams from 10.67 to -30.67 degrees
+        ("pandaset_pandar64_0001.pcd", "pandar64"),
+        ("sensorscalibration_top.pcd", "pandar64"),  # not named by its source: its rings are the Pandar64's
+    ],
+)
+def test_real_scans_of_other_sensors(name: str, sensor: str, shared: Path):
+    found, reason = recognise(read(shared / "scans" / "other" / name))
+    assert found == sensor, reason
+
+
+def test_two_stacked_sensors_are_asked_for(shared: Path):
+    """An Argoverse 2 sweep is two VLP-32C in the vehicle's frame: no single sensor's rings."""
+    pytest.importorskip("pyarrow", reason="pyarrow comes with the extra `data`")
+    name, reason = recognise(read(shared / "scans" / "other" / "argoverse2_2xvlp32c.feather"))
+    assert name is None and "64 rings" in reason
+
+
+@pytest.fixture(scope="module")
+def kitti(shared: Path) -> list[Scan]:
+    return [read(path) for path in sorted((shared / "scans" / "test").glob("*.bin"))]
+
+
+def test_real_kitti_scans_are_hdl_64e(kitti: list[Scan]):
+    assert len(kitti) == 6
+    for scan in kitti:
+        ring = rings_in_order(scan.xyz)
+        assert ring is not None and ring.max() == 63
+        name, reason = recognise(scan)
+        assert name == "hdl-64e-kitti", reason
+
+
+@pytest.mark.parametrize("step", [2, 4])
+def test_rings_taken_out_of_a_real_scan_are_still_hdl_64e(step: int, kitti: list[Scan]):
+    for scan in kitti[:3]:
+        ring = rings_in_order(scan.xyz)
+        assert ring is not None
+        for first in range(0, step, step - 1):
+            name, reason = recognise(scan[ring % step == first])
+            assert name == "hdl-64e-kitti" and f"{64 // step} of the 64" in reason
+
+
+@pytest.mark.parametrize(
+    ("file", "sensor", "tolerance"),
+    [("nuscenes_hdl32e.pcd.bin", "hdl-32e", 0.05), ("sensorscalibration_top.pcd", "pandar64", 0.002)],
+)
+def test_tables_are_what_real_sensors_do(file: str, sensor: str, tolerance: float, shared: Path):
+    """Median elevation of each ring beyond 10 m against the table; nuScenes is compensated for motion."""
+    scan = read(shared / "scans" / "other" / file)
+    assert scan.ring is not None
+    far = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) > (10 if sensor == "hdl-32e" else 3)
+    elevation = elevations_of(scan.xyz)
+    rows = [row for row in range(SENSORS[sensor].height) if (far & (scan.ring == row)).sum() > 100]
+    assert len(rows) >= 16
+    for row in rows:
+        here = np.median(elevation[far & (scan.ring == row)])
+        assert abs(here - SENSORS[sensor].elevations[row]) < tolerance, row
+
+
+def test_the_points_of_an_unnamed_scan_lie_on_the_table_of_the_hdl_32e(shared: Path):
+    elevation = elevations_of(read(shared / "scans" / "other" / "fast_gicp_251370668.pcd").xyz)
+    table = np.array(SENSORS["hdl-32e"].elevations)
+    assert np.abs(elevation[:, None] - table).min(axis=1).max() < 0.01

@@ -1,0 +1,168 @@
+"""Sensors: their rays, their own files, and one clear line for each thing that can be wrong in such a file."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from lidarsynth.lidar.sensor import SENSORS, Sensor, from_dict, get_sensor, read_sensor
+
+
+def test_the_grid_of_r2dm_equals_the_reference(fixture_tensors):
+    coords, utility = fixture_tensors("r2dm/coords"), fixture_tensors("r2dm/lidar_utility")
+    tight = {"rtol": 0, "atol": 1e-6}
+    grid = get_sensor("hdl-64e").resized(16, 64)
+    torch.testing.assert_close(torch.from_numpy(grid.ray_angles())[None], coords["16x64.ray_angles"], **tight)
+    torch.testing.assert_close(torch.from_numpy(grid.ray_angles())[None], utility["ray_angles"], **tight)
+    odd = Sensor("odd", tuple(3 - 28 * i / 24 for i in range(24)), 32, edges=True)
+    torch.testing.assert_close(torch.from_numpy(odd.ray_angles())[None], coords["24x32.ray_angles"], **tight)
+
+
+def test_points_along_the_grid_equal_the_reference(fixture_tensors):
+    expected = fixture_tensors("r2dm/lidar_utility")
+    grid = get_sensor("hdl-64e").resized(16, 64)
+    for metric, mask, xyz in zip(expected["metric"], expected["mask"], expected["xyz"], strict=True):
+        points = grid.points((metric * mask)[0].numpy())
+        np.testing.assert_allclose(points, xyz.permute(1, 2, 0).numpy(), rtol=0, atol=1e-5 * 80)
+
+
+def test_hdl_64e_is_the_grid_of_kitti_360():
+    sensor = get_sensor("hdl-64e")
+    elevation, azimuth = np.degrees(sensor.ray_angles().astype(np.float64))
+    np.testing.assert_allclose(elevation[:, 0], 3 - 28 * np.arange(64) / 64, atol=1e-5)
+    np.testing.assert_allclose(azimuth[0], 180 - 360 * np.arange(1024) / 1024, atol=2e-5)
+    assert (sensor.min_range, sensor.max_range) == (1.45, 80.0)
+
+
+def test_real_beams_have_their_azimuth_in_the_middle_of_the_pixel():
+    azimuth = np.degrees(get_sensor("vlp-16").ray_angles()[1, 0])
+    np.testing.assert_allclose(azimuth, 180 - 360 * (np.arange(1024) + 0.5) / 1024, atol=2e-5)
+    assert (np.diff(azimuth) < 0).all()
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_points_along_its_angles(name):
+    sensor = get_sensor(name)
+    assert sensor.name == name and sensor.height == len(sensor.elevations)
+    directions = sensor.directions()
+    assert directions.shape == (sensor.height, sensor.width, 3) and directions.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
+    elevation, azimuth = sensor.ray_angles()
+    np.testing.assert_allclose(np.arcsin(directions[..., 2]), elevation, atol=1e-5)
+    turn = np.arctan2(directions[..., 1], directions[..., 0]) - azimuth
+    np.testing.assert_allclose(np.abs(np.exp(1j * turn) - 1), 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_points_lie_at_the_asked_range_on_the_line_of_their_beam(name):
+    sensor = get_sensor(name)
+    rng = np.random.default_rng(0)
+    distance = rng.uniform(2, sensor.max_range, (sensor.height, sensor.width)).astype(np.float32)
+    distance[rng.random(distance.shape) < 0.1] = 0
+    points = sensor.points(distance)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=-1), distance, rtol=2e-6, atol=1e-6)
+    assert not points[distance == 0].any()
+    assert points.dtype == np.float32
+    height = np.asarray(sensor.offsets or [0.0] * sensor.height)[:, None]
+    origin = np.stack(np.broadcast_arrays(0.0, 0.0, height), axis=-1)
+    way = (points - origin)[distance > 0]
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    np.testing.assert_allclose(way, sensor.directions()[distance > 0], atol=1e-5)
+
+
+def test_resized_sensors_keep_evenly_spaced_beams_of_their_own():
+    sensor = get_sensor("hdl-64e-kitti")
+    quarter = sensor.resized(16, 256)
+    assert quarter.elevations == sensor.elevations[::4] and quarter.offsets == sensor.offsets[::4]
+    assert (quarter.name, quarter.width, quarter.max_range) == ("hdl-64e-kitti/16", 256, 80.0)
+    assert sensor.resized() == sensor
+    assert sensor.resized(width=2048).elevations == sensor.elevations
+    assert sensor.rows([5, 9]).elevations == (sensor.elevations[5], sensor.elevations[9])
+    with pytest.raises(ValueError, match="sensor hdl-64e-kitti: height must divide its 64 beams, got 24"):
+        sensor.resized(24)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_tables_and_sensors_are_inverses(name):
+    sensor = get_sensor(name)
+    assert from_dict(sensor.to_dict()) == sensor
+    assert from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
+
+
+def test_files_of_the_user_make_sensors(tmp_path):
+    (tmp_path / "mine.toml").write_text("beams = 16\ntop = 15\nbottom = -15\nwidth = 1800\nmax_range = 100\n")
+    sensor = get_sensor(str(tmp_path / "mine.toml"))
+    assert sensor.name == "mine" and sensor.width == 1800 and sensor.max_range == 100
+    np.testing.assert_allclose(sensor.elevations, np.linspace(15, -15, 16))
+    (tmp_path / "rising.json").write_text(
+        json.dumps({"name": "up", "elevations": [-2, 0, 3], "offsets": [0.1, 0, 0.2]})
+    )
+    sensor = read_sensor(tmp_path / "rising.json")
+    assert sensor.name == "up" and sensor.elevations == (3.0, 0.0, -2.0)
+    assert sensor.offsets == (0.2, 0.0, 0.1), "each height stays with its beam"
+
+
+def test_a_file_is_read_again_after_it_changed(tmp_path):
+    path = tmp_path / "mine.toml"
+    for beams in (16, 32):
+        path.write_text(f"beams = {beams}\ntop = 15\nbottom = -15\n")
+        assert get_sensor(str(path)).height == beams
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", r"expected elevations, or beams with top and bottom, found \[\]"),
+        ("width = 100", r"expected elevations, or beams with top and bottom, found \['width'\]"),
+        ("elevation = [1, 2]", r"expected the fields \['edges', 'elevations', .*\] or .*, found \['elevation'\]"),
+        ("beams = 4\ntop = 1", r"expected the fields .* found \['beams', 'top'\]"),
+        ("beams = 0\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found 0"),
+        ("beams = 2.5\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found 2.5"),
+        ("beams = 2\ntop = 1\nbottom = 1", r"elevations must fall from top to bottom within \+-90 degrees"),
+        ("beams = 2\ntop = 'a'\nbottom = 1", r"mine: expected numbers in the sensor's fields, found"),
+        ("elevations = ['a']", r"mine: expected numbers in the sensor's fields, found"),
+        ("elevations = 3", r"mine: expected numbers in the sensor's fields, found"),
+        ("elevations = []", r"sensor mine: elevations must fall .* got \[\]"),
+        ("elevations = [1, 1]", r"elevations must fall .* got \[1.0, 1.0\]"),
+        ("elevations = [91, 1]", r"elevations must fall .* got \[91.0, 1.0\]"),
+        ("elevations = [nan, 1]", r"elevations must fall .* got \[nan, 1.0\]"),
+        ("elevations = [1]\nwidth = 3", r"sensor mine: width must be at least 4 columns, got 3"),
+        ("elevations = [1]\nwidth = 1024.5", r"mine: expected a whole number of columns as width, found 1024.5"),
+        ("elevations = [1]\nwidth = '9'", r"mine: expected a whole number of columns as width, found '9'"),
+        ("elevations = [1]\nmax_range = 'far'", r"mine: expected numbers in the sensor's fields, found"),
+        ("elevations = [1]\nmin_range = 5\nmax_range = 5", r"expected 0 <= min_range < max_range, got 5 and 5"),
+        ("elevations = [1]\nmin_range = -1", r"expected 0 <= min_range < max_range, got -1 and 100.0"),
+        ("elevations = [1]\nmax_range = nan", r"expected 0 <= min_range < max_range, got 1.0 and nan"),
+        ("elevations = [2, 1]\noffsets = [1]", r"offsets must have one height per beam \(2\), got 1"),
+        ("elevations = [1", r"mine.toml: expected a sensor file in TOML, found"),
+    ],
+)
+def test_files_that_make_no_sensor_get_one_line(tmp_path, content, message):
+    (tmp_path / "mine.toml").write_text(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_sensor(tmp_path / "mine.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_files_of_another_kind_get_one_line(tmp_path):
+    (tmp_path / "list.json").write_text("[1, 2]")
+    (tmp_path / "bad.json").write_text("{")
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "folder.toml").mkdir()
+    for name, message in {
+        "list.json": r"list: expected .*, found \[1, 2\]",
+        "bad.json": "bad.json: expected a sensor file in JSON, found",
+        "binary.json": "binary.json: expected a sensor file in JSON, found 'utf-8' codec",
+        "folder.toml": "folder.toml: expected a readable sensor file, found Is a directory",
+        "absent.toml": "absent.toml: expected a readable sensor file, found No such file",
+        "sensor.yaml": "sensor.yaml: expected a .toml or .json sensor file, found .yaml",
+        "sensor": "sensor: expected a .toml or .json sensor file, found no suffix",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            read_sensor(tmp_path / name)
+
+
+def test_unknown_words_list_the_known_ones():
+    with pytest.raises(ValueError, match=r"expected a sensor of hdl-64e, hdl-64e-kitti, .*, found 'hdl64'"):
+        get_sensor("hdl64")

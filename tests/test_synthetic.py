@@ -1,0 +1,165 @@
+"""Synthetic streets: a reader like any other, reproducible, for any sensor, and close to what KITTI's sensor sees."""
+
+import numpy as np
+import pytest
+
+from lidarsynth.data.synthetic import hdl64e
+from lidarsynth.data.synthetic.facades import shade
+from lidarsynth.data.synthetic.ground import Ground, Road
+from lidarsynth.data.synthetic.materials import MATERIALS, NUMBER, TABLE
+from lidarsynth.data.synthetic.objects import library
+from lidarsynth.data.synthetic.reader import SyntheticStreets
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+
+KITTI = SENSORS["hdl-64e-kitti"]
+
+
+@pytest.fixture(scope="module")
+def images() -> list[RangeImage]:
+    reader = SyntheticStreets(seed=0, length=96)
+    return [reader.image(i) for i in range(0, 96, 16)]
+
+
+def test_scan_has_rings_labels_and_sensor_frame():
+    scan = SyntheticStreets(seed=3, length=4)[1]
+    assert len(scan) > 80_000
+    assert scan.ring is not None and scan.label is not None
+    assert np.all(np.diff(scan.ring) >= 0) and scan.ring.max() == 63
+    assert set(np.unique(scan.label)) <= set(range(20)) and 9 in scan.label
+    distance = np.linalg.norm(scan.xyz, axis=1)
+    assert distance.min() >= KITTI.min_range and distance.max() < KITTI.max_range + 1
+    road = scan.xyz[(scan.label == 9) & (distance < 8)]
+    assert abs(np.median(road[:, 2]) + KITTI.mount) < 0.2
+    assert 0 <= scan.reflectance.min() and scan.reflectance.max() <= 1
+
+
+def test_points_come_in_kitti_order():
+    """Ring after ring from straight ahead counter-clockwise, so that unfolding without `ring` finds the same rows."""
+    scan = SyntheticStreets(seed=3, length=4)[1]
+    azimuth = np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) % (2 * np.pi)
+    ring = np.cumsum(np.diff(azimuth, prepend=azimuth[:1]) < -np.pi)
+    assert (ring == scan.ring).mean() > 0.99
+
+
+def test_image_is_the_projection_of_its_scan():
+    """Same place and beams: where both have a return, the ranges agree but at edges and in foliage."""
+    reader = SyntheticStreets(seed=5, length=4)
+    image, projected = reader.image(2), project(reader[2], KITTI, method="unfolding")
+    both = image.mask & projected.mask
+    assert both.mean() > 0.65
+    apart = np.abs(np.log(image.range[both] / projected.range[both]))
+    assert np.median(apart) < 0.01 and (apart < 0.05).mean() > 0.85
+
+
+def test_scan_is_a_function_of_seed_and_number():
+    reader = SyntheticStreets(seed=7, length=100)
+    first = reader.image(30)
+    reader.image(2)
+    fresh = SyntheticStreets(seed=7, length=31)
+    np.testing.assert_array_equal(fresh.image(30).range, first.range)
+    np.testing.assert_array_equal(fresh.image(30).reflectance, first.reflectance)
+    assert np.abs(SyntheticStreets(seed=8).image(30).range - first.range).mean() > 0.5
+    assert np.abs(reader.image(31).range - first.range).mean() > 0.5
+
+
+def test_scans_stay_the_same_from_machine_to_machine():
+    """Coarse numbers of scan 0 of seed 0, stored: a change here means that published data sets change."""
+    image = SyntheticStreets(seed=0, length=1).image(0)
+    found = [image.mask.mean(), np.log(image.range[image.mask]).mean(), image.reflectance[image.mask].mean()]
+    np.testing.assert_allclose(found, GOLDEN, rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "os1-128"])
+def test_any_sensor(name: str):
+    sensor = SENSORS[name].resized(width=256)
+    image = SyntheticStreets(seed=1, length=2, sensor=sensor).image(1)
+    assert image.shape == (sensor.height, 256)
+    assert 0.3 < image.mask.mean() < 0.95
+    assert image.range[image.mask].max() < sensor.max_range + 1
+    assert not hdl64e.own_car(sensor).any()
+
+
+def test_statistics_are_those_of_kitti(images: list[RangeImage]):
+    """Bands around the numbers of the real training scans (docs/synthetic.md)."""
+    mask = np.stack([im.mask for im in images])
+    distance = np.stack([im.range for im in images])
+    reflectance = np.stack([im.reflectance for im in images])
+    assert 0.80 < mask.mean() < 0.92
+    assert 4.5 < np.median(distance[:, 48:][mask[:, 48:]]) < 5.7
+    assert 12 < np.median(distance[:, :8][mask[:, :8]]) < 27
+    assert 0.2 < np.median(reflectance[mask]) < 0.32
+    assert 0.05 < (reflectance[mask] < 0.02).mean() < 0.25
+    np.testing.assert_allclose(reflectance * 100, np.round(reflectance * 100), atol=1e-3)
+
+
+def test_every_class_of_traffic_occurs():
+    reader = SyntheticStreets(seed=2, length=800)
+    seen = np.zeros(20, bool)
+    for index in range(0, 800, 32):
+        label = reader.image(index).label
+        assert label is not None
+        seen[np.unique(label)] = True
+    assert seen[[1, 6, 9, 10, 11, 13, 14, 15, 16, 17, 18, 19]].all()
+
+
+def test_own_car_hides_the_same_pixels(images: list[RangeImage]):
+    hidden = hdl64e.own_car(KITTI)
+    assert 0.04 < hidden.mean() < 0.1
+    assert not any((im.mask & hidden).any() for im in images)
+
+
+def test_road_coordinates_invert_places():
+    road = Road(3.0, -2.0, 0.7, 4.0, 2.0, wave=(4.0, 200.0, 1.0))
+    s, d = np.linspace(-80, 80, 9), np.linspace(-6, 6, 9)
+    x, y, _ = road.at(s, d)
+    s_again, d_again = road.coordinates(x, y)
+    np.testing.assert_allclose(d_again, d, atol=0.03)
+    np.testing.assert_allclose(s_again, s, atol=0.3)
+
+
+def test_surface_across_a_street():
+    ground = Ground((Road(0, 0, 0, 5.0, 2.0, parking=(2.0, 0.0), lanes="solid"),))
+    y = np.array([2.0, -4.0, 8.0, 1.0])
+    material, label, _ = ground.surface(np.zeros(4), y, np.zeros(4, bool))
+    assert label.tolist() == [9, 10, 17, 9]
+    assert material[3] == NUMBER["marking"] and material[0] == NUMBER["road"]
+
+
+def test_windows_lie_behind_the_wall():
+    row = np.array([0, 0, 1, 0, 0, 3.0, 0.5, 1.0, 2.2, 0.2, 0, 0])
+    u = np.linspace(0, 60, 400)
+    points = np.column_stack([u, np.zeros(400), np.full(400, 1.5)])
+    material, depth = shade(points, np.tile(row, (400, 1)))
+    glass = material == NUMBER["window"]
+    assert 0.1 < glass.mean() < 0.6
+    np.testing.assert_allclose(depth[glass], 0.2)
+    assert np.abs(depth[material == NUMBER["plaster"]]).max() < 0.2
+
+
+def test_library_things_stand_on_the_ground():
+    for kind, variants in library().items():
+        for shape in variants:
+            assert np.isfinite(shape.corners).all(), kind
+            assert -1.5 < shape.corners[..., 2].min() < 0.45, kind
+            assert len(shape.material) == len(shape.label) == len(shape)
+    assert TABLE.shape == (len(MATERIALS), 6)
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(ValueError, match="expected seed >= 0"):
+        SyntheticStreets(seed=-1)
+    with pytest.raises(IndexError, match=r"0\.\.9, got 10"):
+        SyntheticStreets(length=10).image(10)
+
+
+def test_a_sensor_with_one_beam():
+    sensor = Sensor("line", (-10.0,), width=512, max_range=50.0)
+    image = SyntheticStreets(seed=0, length=1, sensor=sensor).image(0)
+    assert image.mask.mean() > 0.5
+
+
+GOLDEN = [0.8, 2.0, 0.2]
