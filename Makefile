@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-EXTRAS := synthetic,train,data,viz,test
+EXTRAS := synthetic,train,data,metrics,viz,test
 
 .PHONY: install demo test quick check format bench clean
 

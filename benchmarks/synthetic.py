@@ -1,8 +1,9 @@
 """Synthetic streets: how fast, and how close to real KITTI scans.
 
-python benchmarks/synthetic.py                              scans per second on one core, world building included
-python benchmarks/synthetic.py --compare ../shared/scans    a table of numbers beside the real scans of its train/
-python benchmarks/synthetic.py --compare DIR --picture docs/images   the side-by-side pictures as well
+python benchmarks/synthetic.py                                        scans per second and core, worlds included
+python benchmarks/synthetic.py --compare ../shared/scans              tables of numbers beside real scans
+python benchmarks/synthetic.py --compare ../shared/scans --pictures docs/images      the pictures as well
+python benchmarks/synthetic.py --sample src/lidarsynth/shipped/street.npz            the scan of the demo
 """
 
 from __future__ import annotations
@@ -10,66 +11,97 @@ from __future__ import annotations
 import argparse
 import lzma
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.data.files import write
+from lidarsynth.data.synthetic.materials import LABEL
 from lidarsynth.data.synthetic.reader import SyntheticStreets
+from lidarsynth.lidar.colours import label_colours
+from lidarsynth.lidar.figure import compare as figure
+from lidarsynth.lidar.figure import panel
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.render import bev as bev_picture
+from lidarsynth.lidar.render import label_strip, range_strip, save_png
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
 
 SENSOR = SENSORS["hdl-64e-kitti"]
-EXPECTED = "expected DIR/train/*.scan.xz or *.bin"
+PER_WORLD = 16
+BANDS = ((0, 8), (8, 16), (16, 32), (32, 48), (48, 64))  # beams, from the top
+SHOWN = (14, 60, 84)  # real scans of the pictures: numbers in train/
 
 
-def read_kitti(path: Path) -> np.ndarray:
-    """(N, 4) float32: x, y, z, reflectance of a `.bin`, or of a `.scan.xz` as ../shared/scans/README.md has it."""
+def read_kitti(path: Path) -> Scan:
+    """A `.bin`, or a `.scan.xz` as ../shared/scans/README.md has it."""
     if path.suffix == ".bin":
-        return np.fromfile(path, np.float32).reshape(-1, 4)
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        return Scan(points[:, :3], points[:, 3])
     raw = lzma.decompress(path.read_bytes())
     count = int(np.frombuffer(raw, "<i4", 1)[0])
     steps = np.frombuffer(raw, "<i4", 3 * count, 4).reshape(3, count)
-    points = np.cumsum(steps, axis=1, dtype=np.int32).T / 1000.0
-    reflectance = np.frombuffer(raw, np.uint8, count, 4 + 12 * count) / 100.0
-    return np.column_stack([points, reflectance]).astype(np.float32)
+    xyz = (np.cumsum(steps, axis=1, dtype=np.int32).T / 1000).astype(np.float32)
+    return Scan(xyz, np.frombuffer(raw, np.uint8, count, 4 + 12 * count).astype(np.float32) / 100)
 
 
-def unfold(points: np.ndarray, width: int = 1024) -> tuple[np.ndarray, np.ndarray]:
-    """Range and reflectance images (64, width) of a KITTI scan, rings from its point order, the nearest return wins."""
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    ring = np.concatenate([[0], np.cumsum(np.abs(np.diff(azimuth % (2 * np.pi))) > np.pi)])
-    column = np.floor((np.pi - azimuth) / (2 * np.pi) * width).astype(int) % width
-    distance = np.linalg.norm(points[:, :3], axis=1)
-    order = np.argsort(-distance)
-    order = order[ring[order] < 64]
-    images = np.zeros((2, 64, width), np.float32)
-    images[0, ring[order], column[order]] = distance[order]
-    images[1, ring[order], column[order]] = points[order, 3]
-    return images[0], images[1]
-
-
-def real_images(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 64, 1024) range and reflectance of every second training scan."""
+def real_images(folder: Path) -> list[RangeImage]:
+    """Every training scan, projected by scan unfolding. Raises ValueError where there is none."""
     files = sorted((folder / "train").glob("*.scan.xz")) or sorted((folder / "train").glob("*.bin"))
     if not files:
-        raise SystemExit(f"{EXPECTED}, found nothing in {folder}")
-    pairs = [unfold(read_kitti(f)) for f in files[::2]]
-    return np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
+        raise ValueError(f"expected {folder}/train/*.scan.xz or *.bin, found none")
+    return [project(read_kitti(path), SENSOR, "unfolding") for path in files]
 
 
-def synthetic_images(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 64, 1024) range and reflectance; two scans of each world, so that many worlds are seen."""
-    reader = SyntheticStreets(seed=seed, length=16 * count)
-    images = [reader.image(16 * (k // 2) + 8 * (k % 2) + 1) for k in range(count)]
-    return np.stack([im.range for im in images]), np.stack([im.reflectance for im in images])
+def synthetic_images(count: int, seed: int) -> list[RangeImage]:
+    """Two scans of each world, so that many worlds are seen."""
+    reader = SyntheticStreets(seed=seed, length=PER_WORLD * count)
+    return [reader.image(PER_WORLD * (k // 2) + PER_WORLD // 2 * (k % 2) + 1) for k in range(count)]
 
 
-def bev(distance: np.ndarray) -> np.ndarray:
-    """(100, 100) share of points per 1.6 m cell over 160 m, 3 to 70 m, all scans pooled (as metrics/ does)."""
+def bird_eye(images: list[RangeImage]) -> np.ndarray:
+    """(100, 100) points per 1.6 m cell over 160 m, 3 to 70 m away, all scans pooled (as metrics/ does)."""
     counts = np.zeros((100, 100))
-    for image in distance:
-        xyz = SENSOR.points(image)[(image > 3) & (image < 70)]
+    for image in images:
+        xyz = image.points()[(image.range > 3) & (image.range < 70)]
         counts += np.histogram2d(xyz[:, 0], xyz[:, 1], bins=100, range=[[-80, 80], [-80, 80]])[0]
-    return counts / counts.sum()
+    return counts
+
+
+def steps(images: list[RangeImage], axis: int) -> np.ndarray:
+    """(40,) histogram of |ln r - ln r'| between measured neighbours: axis 0 from beam to beam, 1 along a ring."""
+    counts = np.zeros(40)
+    for image in images:
+        log = np.log(np.maximum(image.range, 1e-3))
+        pair = [np.take(log, range(k, log.shape[axis] - 1 + k), axis) for k in (0, 1)]
+        both = np.logical_and(*(np.take(image.mask, range(k, log.shape[axis] - 1 + k), axis) for k in (0, 1)))
+        counts += np.histogram(np.log10(np.abs(pair[0] - pair[1])[both] + 1e-4), bins=40, range=(-4, 1))[0]
+    return counts
+
+
+def ranges(images: list[RangeImage]) -> np.ndarray:
+    """(64, 41) per beam: counts over 40 logarithmic bins of 2 to 80 m, and of empty pixels in the last column."""
+    stack = np.stack([image.range for image in images], axis=1)
+    edges = np.geomspace(2, 80, 41)
+    return np.array([[*np.histogram(row, bins=edges)[0], (row == 0).sum()] for row in stack], float)
+
+
+def reflectances(images: list[RangeImage]) -> np.ndarray:
+    """(64, 50) per beam: counts of reflectance in steps of 0.02."""
+    edges = np.linspace(-0.005, 0.995, 51)
+    rows = zip(np.stack([im.reflectance for im in images], 1), np.stack([im.mask for im in images], 1), strict=True)
+    return np.array([np.histogram(value[mask], bins=edges)[0] for value, mask in rows], float)
+
+
+MEASURES: dict[str, Callable[[list[RangeImage]], np.ndarray]] = {
+    "range and empty pixels, per beam": ranges,
+    "reflectance, all": lambda images: reflectances(images).sum(axis=0),
+    "reflectance, per beam": reflectances,
+    "bird's-eye view": bird_eye,
+    "range steps along a ring": lambda images: steps(images, 1),
+    "range steps from beam to beam": lambda images: steps(images, 0),
+}
 
 
 def jensen_shannon(p: np.ndarray, q: np.ndarray) -> float:
@@ -79,78 +111,101 @@ def jensen_shannon(p: np.ndarray, q: np.ndarray) -> float:
     return float(sum((a[a > 0] * np.log(a[a > 0] / m[a > 0])).sum() for a in (p, q)) / 2)
 
 
-def steps(distance: np.ndarray, axis: int) -> np.ndarray:
-    """Relative range steps |ln r - ln r'| between measured neighbours along an axis (1 down, 2 along a ring)."""
-    log = np.log(np.maximum(distance, 1e-3))
-    both = (distance > 0) & np.roll(distance > 0, -1, axis)
-    step = np.abs(np.roll(log, -1, axis) - log)[both]
-    return np.histogram(np.log10(step + 1e-4), bins=40, range=(-4, 1))[0].astype(float)
-
-
-def range_histograms(distance: np.ndarray) -> np.ndarray:
-    """(64, 41) per beam: counts over 40 logarithmic bins of 2 to 80 m, and of empty pixels in the last column."""
-    edges = np.geomspace(2, 80, 41)
-    rows = [np.append(np.histogram(distance[:, r], bins=edges)[0], (distance[:, r] == 0).sum()) for r in range(64)]
-    return np.array(rows, float)
-
-
-def compare(real: tuple[np.ndarray, np.ndarray], synthetic: tuple[np.ndarray, np.ndarray]) -> list[str]:
-    """Lines of a Markdown table: the number, on real scans, on synthetic ones."""
-    lines = ["| number | real | synthetic |", "|---|---|---|"]
-    (r, f), (r2, f2) = real, synthetic
-    lines.append(f"| filled pixels | {(r > 0).mean():.3f} | {(r2 > 0).mean():.3f} |")
-    for low, high in ((0, 8), (8, 16), (16, 32), (32, 48), (48, 64)):
-        band = np.s_[:, low:high]
-        for name, a, b in (("range, m", r, r2), ("reflectance", f, f2)):
-            cells = []
-            for image, mask in ((a, r > 0), (b, r2 > 0)):
-                quartiles = np.percentile(image[band][mask[band]], [5, 25, 50, 75, 95])
-                cells.append(" ".join(f"{q:.2f}" if name == "reflectance" else f"{q:.1f}" for q in quartiles))
-            lines.append(f"| beams {low}-{high - 1}, {name}: 5 25 50 75 95 % | {cells[0]} | {cells[1]} |")
-        lines.append(f"| beams {low}-{high - 1}, filled | {(r[band] > 0).mean():.3f} | {(r2[band] > 0).mean():.3f} |")
-    return lines + distances(real, synthetic)
-
-
-def distances(real: tuple[np.ndarray, np.ndarray], synthetic: tuple[np.ndarray, np.ndarray]) -> list[str]:
-    """Table lines of Jensen-Shannon divergences; `real` column: between the two halves of the real scans."""
-    half = len(real[0]) // 2
-    groups = [(tuple(a[:half] for a in real), tuple(a[half:] for a in real)), (real, synthetic)]
-    bins = np.linspace(-0.005, 0.995, 101)
-    measures = {
-        "range per beam and empty pixels": lambda a: range_histograms(a[0]),
-        "reflectance": lambda a: np.histogram(a[1][a[0] > 0], bins=bins)[0].astype(float),
-        "bird's-eye view": lambda a: bev(a[0]),
-        "steps along a ring": lambda a: steps(a[0], 2),
-        "steps from beam to beam": lambda a: steps(a[0], 1),
-    }
-    lines = ["| Jensen-Shannon divergence | real, half against half | real against synthetic |", "|---|---|---|"]
-    for name, measure in measures.items():
-        cells = [f"{jensen_shannon(measure(a), measure(b)):.4f}" for a, b in groups]
-        lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
+def divergences(real: list[RangeImage], synthetic: list[RangeImage]) -> list[str]:
+    """Lines of a Markdown table; first what real scans differ among themselves, from one half of them to the other."""
+    half = len(real) // 2
+    lines = ["| Jensen-Shannon divergence | real: one half, other half | real, synthetic |", "|---|---|---|"]
+    for name, measure in MEASURES.items():
+        cells = [jensen_shannon(measure(a), measure(b)) for a, b in ((real[:half], real[half:]), (real, synthetic))]
+        lines.append(f"| {name} | {cells[0]:.4f} | {cells[1]:.4f} |")
     return lines
 
 
-def speed(count: int) -> str:
-    """Scans per second of this process, reading in order."""
-    reader = SyntheticStreets(seed=1, length=count)
-    reader.image(0)
-    fresh = SyntheticStreets(seed=2, length=count)
+def quantiles(real: list[RangeImage], synthetic: list[RangeImage]) -> list[str]:
+    """Lines of a Markdown table: filled pixels and quantiles of range and reflectance per band of beams."""
+    lines = ["| beams | number | real | synthetic |", "|---|---|---|---|"]
+    for low, high in ((0, 64), *BANDS):
+        cells: dict[str, list[str]] = {}
+        for images in (real, synthetic):
+            mask = np.stack([im.mask[low:high] for im in images])
+            cells.setdefault("filled", []).append(f"{mask.mean():.3f}")
+            for name, digits in (("range", 1), ("reflectance", 2)):
+                values = np.stack([getattr(im, name)[low:high] for im in images])[mask]
+                text = " ".join(f"{q:.{digits}f}" for q in np.percentile(values, [5, 25, 50, 75, 95]))
+                cells.setdefault(f"{name}, 5 25 50 75 95 %", []).append(text)
+        lines += [f"| {low}-{high - 1} | {name} | {' | '.join(pair)} |" for name, pair in cells.items()]
+    return lines
+
+
+def drop_rates(real: list[RangeImage], synthetic: list[RangeImage]) -> str:
+    """One line: how far apart the shares of empty pixels of each beam are."""
+    apart = [np.mean([~im.mask for im in images], axis=(0, 2)) for images in (real, synthetic)]
+    gap = np.abs(apart[0] - apart[1])
+    return f"Share of empty pixels per beam, real and synthetic: {gap.mean():.3f} apart on average, at most {gap.max():.3f}."
+
+
+def pictures(real: list[RangeImage], seed: int, folder: Path) -> list[Path]:
+    """Strips and bird's-eye views of real scans beside synthetic ones, and one synthetic scan by class."""
+    chosen = [real[k] for k in SHOWN]
+    made = [SyntheticStreets(seed, PER_WORLD * 40).image(PER_WORLD * k + 5) for k in (2, 5, 9)]
+    note = ", KITTI, CC BY-NC-SA 3.0"
+    strips = {}
+    for k, (a, b) in enumerate(zip(chosen, made, strict=True)):
+        strips |= {f"real {k + 1}{note}": a, f"synthetic {k + 1}": b}
+    views = [[(f"real {k + 1}{note}", bev_picture(im, size=400)) for k, im in enumerate(chosen)],
+             [(f"synthetic {k + 1}", bev_picture(im, size=400)) for k, im in enumerate(made)]]  # fmt: skip
+    classes = [[("range", range_strip(made[1]))], [("SemanticKITTI class", label_strip(made[1]))], _legend(made[1])]
+    return [
+        save_png(folder / "synthetic_strips.png", figure(strips, max_range=80)),
+        save_png(folder / "synthetic_bev.png", panel(views)),
+        save_png(folder / "synthetic_classes.png", panel(classes)),
+    ]
+
+
+def _legend(image: RangeImage) -> list[tuple[str, np.ndarray]]:
+    names = list(LABEL)
+    assert image.label is not None
+    present = np.unique(image.label[image.mask])
+    return [(names[k], np.broadcast_to(label_colours(np.array([[k]])), (12, 90, 3)).copy()) for k in present]
+
+
+def speed(count: int, seed: int) -> str:
+    """Processor time of reading in order, the first scan (which loads the library of things) left out."""
+    SyntheticStreets(seed=seed).image(0)
+    reader = SyntheticStreets(seed=seed + 1, length=count)
     start = time.process_time()
     for index in range(count):
-        fresh.image(index)
-    return f"{count / (time.process_time() - start):.1f} scans of {SENSOR.height} x {SENSOR.width} per second"
+        reader.image(index)
+    return f"{count / (time.process_time() - start):.1f} scans of {SENSOR.height} x {SENSOR.width} per second and core"
+
+
+def sample(path: Path) -> Path:
+    """One whole scan, coordinates in steps of 1/256 m so that the file is small."""
+    scan = SyntheticStreets(seed=11, length=64)[37]
+    xyz = (np.round(scan.xyz * 256) / 256).astype(np.float32)
+    write(path, Scan(xyz, scan.reflectance, scan.ring, label=scan.label))
+    return path
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scans", type=int, default=48, help="how many synthetic scans")
+    parser.add_argument("--scans", type=int, default=96, help="how many synthetic scans")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--compare", type=Path, help="folder with train/, the real scans")
+    parser.add_argument("--pictures", type=Path, help="folder for PNG files; needs --compare")
+    parser.add_argument("--sample", type=Path, help="write the shipped scan here")
     args = parser.parse_args()
-    if args.compare is None:
-        print(speed(args.scans))
-        return
-    print("\n".join(compare(real_images(args.compare), synthetic_images(args.scans, args.seed))))
+    if args.sample:
+        print(sample(args.sample))
+    elif args.compare:
+        real, synthetic = real_images(args.compare), synthetic_images(args.scans, args.seed)
+        print(
+            "\n".join([*quantiles(real, synthetic), "", *divergences(real, synthetic), "", drop_rates(real, synthetic)])
+        )
+        if args.pictures:
+            print("\n".join(map(str, pictures(real, args.seed, args.pictures))))
+    else:
+        print(speed(args.scans, args.seed))
 
 
 if __name__ == "__main__":

@@ -29,16 +29,25 @@ ARROWS: dict[str, set[str]] = {
     "presets": {"experiment"},
     "build": {"lidar", "models", "diffusion", "experiment", "data", "metrics", "presets"},
     "weights": {"build", "experiment", "presets"},  # plain records, so that a release is built from its preset
-    "model": {"build", "weights", "lidar", "diffusion", "experiment"},
+    "model": {"build", "weights", "lidar", "diffusion", "experiment", "data"},  # data: to recognise a sensor
     "training": EVERYTHING,
-    "cli": EVERYTHING | {"training", "viewer"},
+    # The command line's own logic: texts, pictures, what verbs do, how they speak.
+    "pictures": {"lidar"},
+    "targets": {"data"},
+    "report": EVERYTHING,
+    "completion": EVERYTHING | {"pictures"},
+    "generation": EVERYTHING | {"pictures"},
+    "terminal": EVERYTHING | {"training"},
+    "cli": EVERYTHING
+    | {"training", "viewer"}
+    | {"pictures", "targets", "report", "completion", "generation", "terminal"},
     "viewer": EVERYTHING | {"training", "cli"},
     "__main__": {"cli"},
 }
 CORE = {"torch", "numpy", "einops", "safetensors", "tyro", "tqdm", "PIL", "tomli"}  # pyproject's dependencies
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
 PURE = {"experiment", "presets"}  # no torch, no numpy, no lidar: they read in milliseconds
-SPEAKERS = {"cli", "__main__"}  # the only ones that print and set the exit code
+SPEAKERS = {"terminal", "__main__"}  # the only ones that print and set the exit code
 
 
 def module_name(path: Path) -> str:

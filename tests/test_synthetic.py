@@ -34,7 +34,7 @@ def test_scan_has_rings_labels_and_sensor_frame():
     assert distance.min() >= KITTI.min_range and distance.max() < KITTI.max_range + 1
     road = scan.xyz[(scan.label == 9) & (distance < 8)]
     assert abs(np.median(road[:, 2]) + KITTI.mount) < 0.2
-    assert 0 <= scan.reflectance.min() and scan.reflectance.max() <= 1
+    assert scan.reflectance.min() >= 0 and scan.reflectance.max() <= 1
 
 
 def test_points_come_in_kitti_order():
@@ -124,7 +124,7 @@ def test_road_coordinates_invert_places():
 def test_surface_across_a_street():
     ground = Ground((Road(0, 0, 0, 5.0, 2.0, parking=(2.0, 0.0), lanes="solid"),))
     y = np.array([2.0, -4.0, 8.0, 1.0])
-    material, label, _ = ground.surface(np.zeros(4), y, np.zeros(4, bool))
+    material, label, _, _ = ground.surface(np.zeros(4), y, np.zeros(4, bool))
     assert label.tolist() == [9, 10, 17, 9]
     assert material[3] == NUMBER["marking"] and material[0] == NUMBER["road"]
 

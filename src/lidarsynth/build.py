@@ -112,6 +112,8 @@ def read_experiment(folder: str | Path) -> Experiment:
         return from_dict(json.loads(path.read_text()), str(path))
     except FileNotFoundError:
         raise ValueError(f"{folder}: expected a model folder with {WEIGHTS} and {RECORD}, found no {RECORD}") from None
+    except OSError as error:
+        raise ValueError(f"{path}: expected a readable record, found {error.strerror}") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: expected JSON, found {error}") from None
 

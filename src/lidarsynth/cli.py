@@ -42,6 +42,10 @@ Intensity = Annotated[
 ]
 Picture = Annotated[bool, arg(help="write a .png beside each file.")]
 Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the range image.")]
+Recipe = Annotated[
+    str | None,
+    arg(metavar="RECIPE", help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +."),
+]
 SensorWord = Annotated[
     str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")
 ]
@@ -62,8 +66,8 @@ def generate(
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.generation import batches, claim, fingerprint, generate_into
 
-    at_least(1, count=count, steps=steps, batch_size=batch_size)
-    at_least(0, seed=seed)
+    at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
+    at_least(0, {"seed": seed})
     loaded = load_with_bar(model, device)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
     claim(out, settings)
@@ -78,13 +82,7 @@ def generate(
 def complete(
     scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, or one folder of scans.")],
     out: Annotated[Path, arg(help="file to write, as in upsample, or a folder where there are several scans.")],
-    corrupt: Annotated[
-        str | None,
-        arg(
-            metavar="RECIPE",
-            help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +.",
-        ),
-    ] = None,
+    corrupt: Recipe = None,
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -103,8 +101,8 @@ def complete(
     from lidarsynth.report import errors_table, mean_table
     from lidarsynth.targets import targets
 
-    at_least(1, steps=steps, resamples=resamples)
-    at_least(0, seed=seed)
+    at_least(1, {"steps": steps, "resamples": resamples})
+    at_least(0, {"seed": seed})
     loaded, tables = None, []
     for path, target in targets(scans, out):
         scan = _read(path, intensity)
@@ -136,8 +134,8 @@ def upsample(
     from lidarsynth.completion import named_sensor, upsample_scan
     from lidarsynth.targets import target
 
-    at_least(1, steps=steps, resamples=resamples)
-    at_least(0, seed=seed)
+    at_least(1, {"steps": steps, "resamples": resamples})
+    at_least(0, {"seed": seed})
     target(out, scan)
     sparse = _read(scan, intensity)
     sensor = named_sensor(sparse, scan, "--from", sensor_in)
@@ -167,7 +165,7 @@ def project(
     from lidarsynth.pictures import portrait
     from lidarsynth.targets import target
 
-    at_least(4, width=width)
+    at_least(4, {"width": width})
     target(out, scan)
     points = _read(scan, intensity)
     image = projection.project(points, named_sensor(points, scan, "--sensor", sensor), method, width)
@@ -232,18 +230,11 @@ def data(
         check: also compare the checksums of what is there already, and make anew what is damaged.
         seed: of the synthetic streets.
     """
-    from lidarsynth.data.sources import cache_source, cache_synthetic, summary
+    from lidarsynth.data.sources import prepare, summary
 
-    if source != "synthetic" and cache is None:
-        raise ValueError(f"expected data {source} ROOT CACHE, found no CACHE")
-    folder = cache or root
-    if source == "synthetic":
-        stored = cache_synthetic(folder, count, sensor or "hdl-64e-kitti", width or 1024, seed, workers, check)
-    else:
-        stored = cache_source(source, root, folder, split, sensor, projection, width, workers, check)
-    for _ in counted(stored):
+    for _ in counted(prepare(source, root, cache, split, sensor, projection, width, workers, count, check, seed)):
         pass
-    say(f"wrote {summary(folder)}")
+    say(f"wrote {summary(cache or root)}")
 
 
 def train(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -103,11 +103,14 @@ def from_dict(values: Any, source: str = "experiment", record: type = Experiment
     hints = get_type_hints(record)
     if unknown := values.keys() - hints.keys():
         raise ValueError(f"{source}: expected the fields {sorted(hints)}, found {sorted(unknown)}")
+    needed = {f.name for f in fields(record) if f.default is MISSING and f.default_factory is MISSING}
+    if missing := needed - values.keys():
+        raise ValueError(f"{source}: expected the field {', '.join(sorted(missing))}, found {sorted(values)}")
     return record(**{key: _value(v, hints[key], f"{source}.{key}") for key, v in values.items()})
 
 
 def _value(value: Any, hint: Any, source: str) -> Any:
-    """A value as the field's hint wants it: tables become records, lists tuples. Raises ValueError by the field's name."""
+    """A value as the field's hint wants it: tables become records, lists tuples. Raises ValueError by field."""
     if is_dataclass(hint):
         return from_dict(value, source, hint)  # type: ignore[arg-type]
     value = tuple(value) if isinstance(value, list) else value

@@ -116,7 +116,7 @@ class LidarModel:
         if known.shape != image.shape or known.dtype != np.bool_:
             raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
         method = self._method(method)
-        steps = steps or (4 if method == "conditional" else 32)
+        steps = (4 if method == "conditional" else 32) if steps is None else steps
         x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
         mask = torch.from_numpy(known).to(self._device).expand(1, 2, *known.shape).clone()
         mask[:, 1] &= bool(image.reflectance[known].any())
@@ -164,8 +164,8 @@ class LidarModel:
     def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
         """How many network evaluations `complete` takes."""
         if self._method(method) == "conditional":
-            return steps or 4
-        return evaluations(steps or 32, resamples)
+            return 4 if steps is None else steps
+        return evaluations(32 if steps is None else steps, resamples)
 
     def _method(self, method: str) -> str:
         if method not in METHODS:

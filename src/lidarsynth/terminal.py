@@ -25,11 +25,11 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-def at_least(least: int, **numbers: int | None) -> None:
+def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
     """Raises ValueError by the option's name unless each number is None or from `least` to 2^62."""
     for name, number in numbers.items():
         if number is not None and not least <= number < 2**62:
-            raise ValueError(f"expected --{name.replace('_', '-')} of at least {least}, found {number}")
+            raise ValueError(f"expected --{name} of at least {least}, found {number}")
 
 
 @contextmanager

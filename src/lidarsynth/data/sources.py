@@ -19,7 +19,7 @@ from lidarsynth.lidar.projection import PROJECTIONS, project, thin
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
-__all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "scan_files", "summary"]
+__all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "prepare", "scan_files", "summary"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "files": Source(lambda root, split: scan_folder(root), "all", "hdl-64e-kitti", "auto", 1024),
 }
 
+SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
+
 
 @dataclass(frozen=True)
 class Projected:
@@ -59,6 +61,28 @@ def columns_of(projection: str, width: int) -> int:
     """Columns to draw at before thinning to `width`: R2DM's 2048 for unfolding and 1024 else, where `width` is below
     1024; so a narrow image keeps the ray-drop of a turn instead of the nearest point of many."""
     return width if width >= 1024 else 2048 if projection == "unfolding" else 1024
+
+
+def prepare(
+    name: str,
+    root: Path,
+    folder: Path | None,
+    split: str | None = None,
+    sensor: str | None = None,
+    projection: str | None = None,
+    width: int | None = None,
+    workers: int | None = 0,
+    count: int = 1000,
+    check: bool = False,
+    seed: int = 0,
+) -> Iterator[tuple[int, int]]:
+    """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others."""
+    if name == "synthetic":
+        spec = SYNTHETIC if sensor is None else sensor
+        return cache_synthetic(folder or root, count, spec, 1024 if width is None else width, seed, workers, check)
+    if folder is None:
+        raise ValueError(f"expected data {name} ROOT CACHE, found no CACHE")
+    return cache_source(name, root, folder, split, sensor, projection, width, workers, check)
 
 
 def cache_source(
@@ -81,7 +105,7 @@ def cache_source(
     if name not in SOURCES:
         raise ValueError(f"expected a source of {', '.join(SOURCES)} or synthetic, found {name!r}")
     own = SOURCES[name]
-    split, projection, width = split or own.split, projection or own.projection, width or own.width
+    split, projection, width = split or own.split, projection or own.projection, own.width if width is None else width
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
     spec = get_sensor(sensor or own.sensor).resized(width=width)
@@ -96,7 +120,7 @@ def cache_source(
 def cache_synthetic(
     folder: str | Path,
     count: int,
-    sensor: str = "hdl-64e-kitti",
+    sensor: str = SYNTHETIC,
     width: int = 1024,
     seed: int = 0,
     workers: int | None = 0,
@@ -113,6 +137,8 @@ def cache_synthetic(
 
 
 def _processes(workers: int | None) -> int:
+    if workers is not None and workers < 0:
+        raise ValueError(f"expected --workers of at least 0, found {workers}")
     return (os.cpu_count() or 1) if workers is None else workers
 
 

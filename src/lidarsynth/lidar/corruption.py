@@ -49,7 +49,8 @@ def region(
     when it meets the road plane `sensor.mount` below the sensor there. (H, W) bool, True = known.
     """
     if not (x_min < x_max and y_min < y_max):
-        raise ValueError(f"region expects X_MIN < X_MAX and Y_MIN < Y_MAX, found {x_min:g}:{x_max:g}:{y_min:g}:{y_max:g}")
+        found = f"{x_min:g}:{x_max:g}:{y_min:g}:{y_max:g}"
+        raise ValueError(f"region expects X_MIN < X_MAX and Y_MIN < Y_MAX, found {found}")
     rays = image.sensor.directions()
     down = np.minimum(rays[..., 2:], -1e-3)
     road = rays * (-image.sensor.mount / down)
@@ -84,6 +85,8 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
             values = [float(n) for n in numbers]
         except ValueError:
             raise ValueError(f"{name} expects numbers after the colon, found {part!r}") from None
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} expects finite numbers, found {part!r}")
         takes = CORRUPTIONS[name].__code__.co_argcount - 2
         if len(values) > takes:
             raise ValueError(f"{name} expects at most {takes} numbers, found {len(values)} in {part!r}")

@@ -74,15 +74,18 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
             f"unfolding expects about {sensor.height} rings, one after the other, found {count}; "
             "use --projection spherical"
         )
+    if scan.ring is not None:
+        return np.where(ring < sensor.height, ring, -1)
     # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
-    return np.maximum(ring + (sensor.height - count), 0)
+    return np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
 
 
 def ring_of_points(scan: Scan) -> tuple[np.ndarray, int]:
     """(N,) int64 ring of each point counted from the top, and the number of rings.
 
     From `scan.ring` if present; else from the order of the points: a ring starts where the azimuth passes from the
-    fourth quadrant (x >= 0, y < 0) to the first (x >= 0, y >= 0). Points before the first start join the first ring.
+    fourth quadrant (x >= 0, y < 0) to the first (x >= 0, y >= 0). Points before the first start are of ring -1, which
+    is drawn into the top row, as published.
     """
     if scan.ring is not None:
         ring = scan.ring.astype(np.int64)
@@ -90,7 +93,7 @@ def ring_of_points(scan: Scan) -> tuple[np.ndarray, int]:
     x, y = scan.xyz[:, 0], scan.xyz[:, 1]
     fourth, first = (x >= 0) & (y < 0), (x >= 0) & (y >= 0)
     starts = np.roll(fourth, 1) & first
-    return np.maximum(np.cumsum(starts) - 1, 0), int(starts.sum())
+    return np.cumsum(starts) - 1, int(starts.sum())
 
 
 def _rows_by_elevation(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -132,7 +135,7 @@ def _borders(values: np.ndarray) -> np.ndarray:
 def _rows_of_even_grid(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
     """R2DM's grid: floor, and points out of view pile up on the border rows. All in float32, as published."""
     height, top = sensor.height, np.radians(sensor.elevations[0])
-    view = np.radians(sensor.elevations[0] - sensor.elevations[1]) * height
+    view = np.radians(sensor.elevations[0] - sensor.elevations[1]) * height if height > 1 else 1.0
     x, y, z = np.ascontiguousarray(xyz.T)
     elevation = np.arcsin(np.clip(z / _length(x, y, z), -1, 1))
     row = (1 - (elevation - np.float32(top - view)) / np.float32(view)) * height

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -112,23 +113,37 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
 
     Raises ValueError that names the unknown or missing field.
     """
+    if not isinstance(values, dict):
+        raise ValueError(f"{source}: expected a table of a sensor's fields, found {values!r:.60}")
     values = dict(values)
     if {"beams", "top", "bottom"} <= values.keys():
         if not (isinstance(values["beams"], int) and 1 <= values["beams"] <= 1024):
             raise ValueError(f"{source}: expected beams of 1 to 1024, found {values['beams']!r}")
-        spaced = np.linspace(values.pop("top"), values.pop("bottom"), values.pop("beams"))
+        ends = _numbers([values.pop("top"), values.pop("bottom")], source)
+        spaced = np.linspace(*ends, values.pop("beams"))
         values.setdefault("elevations", spaced.tolist())
     known = set(Sensor.__dataclass_fields__)
     if unknown := values.keys() - known:
         raise ValueError(f"{source}: expected the fields {sorted(known)} or beams/top/bottom, found {sorted(unknown)}")
     if "elevations" not in values:
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
+    if not isinstance(values.get("width", 4), int):
+        raise ValueError(f"{source}: expected a whole number of columns as width, found {values['width']!r:.60}")
+    elevations, offsets = _numbers(values["elevations"], source), _numbers(values.get("offsets", ()), source)
+    if offsets and len(offsets) == len(elevations):  # each height goes with its beam
+        elevations, offsets = zip(*sorted(zip(elevations, offsets, strict=True), reverse=True), strict=True)
+    values |= {"elevations": tuple(sorted(elevations, reverse=True)), "offsets": tuple(offsets)}
     try:
-        values["elevations"] = tuple(sorted((float(e) for e in values["elevations"]), reverse=True))
-        values["offsets"] = tuple(float(h) for h in values.get("offsets", ()))
         return Sensor(**{"name": source, **values})
     except TypeError as error:
         raise ValueError(f"{source}: expected numbers in the sensor's fields, found {error}") from None
+
+
+def _numbers(values: Any, source: str) -> Sequence[float]:
+    try:
+        return [float(value) for value in values]
+    except (TypeError, ValueError):
+        raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values!r:.60}") from None
 
 
 def read_sensor(path: str | Path) -> Sensor:
@@ -189,7 +204,6 @@ SENSORS: dict[str, Sensor] = {
 }
 
 
-@lru_cache
 def get_sensor(name: str) -> Sensor:
     """A sensor by its word (`hdl-64e`, ...) or from the path of a `.toml` / `.json` file. Raises ValueError."""
     if name in SENSORS:

@@ -1,7 +1,7 @@
 """Bird's-eye-view histograms: where the points of a scan lie on the ground plane, counted in a grid.
 
-LiDARGen's measure (Zyrianov et al. 2022), taken over by R2DM: histograms of all scans pooled give the JSD, one histogram
-per scan gives the MMD (`distributions.jensen_shannon_distance`, `distributions.gaussian_mmd`).
+LiDARGen's measure (Zyrianov et al. 2022), taken over by R2DM: the histograms of all scans pooled give the JSD, one per
+scan gives the MMD (`distributions.jensen_shannon_distance`, `distributions.gaussian_mmd`).
 """
 
 from __future__ import annotations

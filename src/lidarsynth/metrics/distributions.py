@@ -161,9 +161,9 @@ def _cubic(x: Tensor, y: Tensor) -> Tensor:
 def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> float:
     """Biased squared MMD under k(p, q) = exp(-|p - q|^2 / (2 width^2)) (Gretton et al. 2012), diagonals included.
 
-    x (N, ...) and y (M, ...) are histograms of one shape, each divided by its sum here. `block` scans at a time are made
-    float32, so 10,000 histograms of 100x100 counts need little more than themselves. Zero for equal sets. Raises
-    ValueError for other shapes, or a histogram without counts.
+    x (N, ...) and y (M, ...) are histograms of one shape, each divided by its sum here. `block` of them at a time
+    become float32, so 10,000 histograms of 100x100 counts need little more memory than themselves. Zero, to 1e-8, for
+    equal sets. Raises ValueError for other shapes, or a histogram without counts.
     """
     first, second = _rows(x), _rows(y)
     if not len(first) or not len(second) or first.shape[1] != second.shape[1]:

@@ -22,7 +22,7 @@ def distance_matrix(a: Sequence, b: Sequence, distance: Callable[..., float]) ->
 
 
 def minimum_matching_distance(between: np.ndarray) -> float:
-    """Mean over the real ones of the distance to the nearest generated one; `between` (G, R) (Achlioptas et al. 2018)."""
+    """Mean over real ones of the distance to the nearest generated one; `between` (G, R) (Achlioptas et al. 2018)."""
     return float(_matrix(between).min(axis=0).mean())
 
 
@@ -37,8 +37,8 @@ def coverage(between: np.ndarray) -> float:
 def nearest_neighbour_accuracy(generated: np.ndarray, between: np.ndarray, real: np.ndarray) -> float:
     """1-NNA: share of all items whose nearest other item is of their own set; 0.5 is best, 1 tells the sets apart.
 
-    generated (G, G), between (G, R) and real (R, R) distances (Lopez-Paz & Oquab 2017, Yang et al. 2019). An item as near
-    to both sets counts as told apart, as in the published programs. Raises ValueError for shapes that do not fit or NaN.
+    generated (G, G), between (G, R) and real (R, R) distances (Lopez-Paz & Oquab 2017, Yang et al. 2019). An item as
+    near to both sets counts as told apart. Raises ValueError for shapes that do not fit or NaN.
     """
     between = _matrix(between)
     g, r = between.shape

@@ -7,14 +7,19 @@ names and colours of the 20 classes are in `lidar/colours.py`.
 from __future__ import annotations
 
 import random
+import tarfile
+import zlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path, PurePosixPath
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from lidarsynth.lidar.colours import CLASSES
+from lidarsynth.metrics.checkpoint import load_state, read_state
 
 BLOCKS: dict[int, tuple[int, ...]] = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # layers -> residual units per stage
 MEANS = (12.12, 10.88, 0.23, -1.04, 0.21)  # range, x, y, z in metres, remission: of SemanticKITTI's pixels
@@ -171,84 +176,92 @@ def frechet_features(network: RangeNet, image: Tensor, mask: Tensor, count: int 
     return maps.flatten(1)[:, frechet_positions(height, width, channels, count).to(maps.device)]
 
 
-def _inverse_gaussian(size: int, sigma: float) -> Tensor:
-    """(size, size) one minus the Gaussian window of sum 1."""
-    axis = torch.arange(size, dtype=torch.float32) - (size - 1) / 2
-    window = torch.exp(-(axis[:, None] ** 2 + axis**2) / (2 * sigma**2))
-    return 1 - window / window.sum()
+def read_rangenet(path: str | Path) -> RangeNet:
+    """The network of an official archive `<name>.tar.gz`, or of a folder with its files, in evaluation mode.
 
-
-def _windows(image: Tensor, size: int) -> Tensor:
-    """(size^2, H * W) the zero-padded window around every pixel of (H, W)."""
-    return nn.functional.unfold(image[None, None].float(), size, padding=(size - 1) // 2)[0]
-
-
-def _vote(distance: Tensor, labels: Tensor, k: int, cutoff: float, first: int, classes: int) -> Tensor:
-    """(P,) the label most frequent among the k nearest candidates (S, P) within `cutoff`, from class `first` on."""
-    nearest, index = distance.topk(k, dim=0, largest=False)
-    near = labels.long().gather(0, index)
-    near = torch.where(nearest > cutoff, classes, near)  # one class more, which has no vote
-    votes = nn.functional.one_hot(near, classes + 1).sum(0)
-    return votes[:, first:classes].argmax(1) + first
-
-
-def knn_labels(
-    image_range: np.ndarray | Tensor,
-    image_label: np.ndarray | Tensor,
-    row: np.ndarray | Tensor,
-    column: np.ndarray | Tensor,
-    distance: np.ndarray | Tensor,
-    k: int = 5,
-    search: int = 5,
-    sigma: float = 1.0,
-    cutoff: float = 1.0,
-    classes: int = len(CLASSES),
-) -> Tensor:
-    """(N,) int64 class 1 to classes - 1 of every point of a scan, by its k nearest pixels (RangeNet++ section III-E).
-
-    image_range   (H, W) metres, negative where empty
-    image_label   (H, W) classes as predicted
-    row, column   (N,) pixel of each point
-    distance      (N,) metres, range of each point
-    search        odd side of the window; `cutoff` in metres, farther pixels have no vote
-
-    Raises ValueError when k exceeds the window or the window has no middle.
+    Nothing is written to disk: the files are read in memory, weights with `weights_only`. Raises ValueError when the
+    archive is damaged, lacks a file, holds links or paths that lead outside, or another network; ImportError without
+    pyyaml.
     """
-    ranges, labels, rows, columns, own = map(torch.as_tensor, (image_range, image_label, row, column, distance))
-    _check_window(k, search)
-    pixel = rows.long() * ranges.shape[1] + columns.long()
-    near = _windows(ranges, search)[:, pixel]
-    near = torch.where(near < 0, torch.inf, near)
-    near[search**2 // 2] = own.float()
-    weighted = (near - own.float()).abs() * _inverse_gaussian(search, sigma).view(-1, 1).to(near)
-    return _vote(weighted, _windows(labels, search)[:, pixel], k, cutoff, 1, classes)
+    path = Path(path)
+    files = _files_of_folder(path) if path.is_dir() else _files_of_archive(path)
+    config = _read_config(files["arch_cfg.yaml"], f"{path}: arch_cfg.yaml")
+    sensor = config["dataset"]["sensor"]
+    try:
+        network = RangeNet(config["backbone"]["extra"]["layers"], means=sensor["img_means"], stds=sensor["img_stds"])
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: arch_cfg.yaml: {error}") from None
+    parts = {"backbone": network.backbone, "segmentation_decoder": network.decoder, "segmentation_head": network.head}
+    for name, module in parts.items():
+        load_state(module, read_state(BytesIO(files[name]), f"{path}: {name}"), f"{path}: {name}")
+    return network.eval()
 
 
-def smooth_labels(
-    image_range: np.ndarray | Tensor,
-    image_label: np.ndarray | Tensor,
-    k: int = 3,
-    search: int = 3,
-    sigma: float = 1.0,
-    cutoff: float = 1.0,
-    classes: int = len(CLASSES),
-) -> Tensor:
-    """(H, W) int64 classes by the k nearest pixels, R2DM's version of `knn_labels` for images; 0 may win.
-
-    It convolves the difference to each neighbour with one minus a Gaussian, instead of weighting neighbours by where they
-    are; kept as published. Arguments and errors as in `knn_labels`.
-    """
-    ranges, labels = torch.as_tensor(image_range).float(), torch.as_tensor(image_label)
-    _check_window(k, search)
-    height, width = ranges.shape
-    near = _windows(ranges, search)
-    near = torch.where(near < 0, torch.inf, near)
-    difference = (near - ranges.view(1, -1)).abs().view(-1, 1, height, width)
-    kernel = _inverse_gaussian(search, sigma)[None, None].to(near)
-    weighted = nn.functional.conv2d(difference, kernel, padding=(search - 1) // 2).view(-1, height * width)
-    return _vote(weighted, _windows(labels, search), k, cutoff, 0, classes).view(height, width)
+# File of an archive -> the most bytes it may have; RangeNet-53's encoder has 163 MB.
+FILES: dict[str, int] = {
+    "backbone": 1 << 29,
+    "segmentation_decoder": 1 << 29,
+    "segmentation_head": 1 << 26,
+    "arch_cfg.yaml": 1 << 20,
+}
 
 
-def _check_window(k: int, search: int) -> None:
-    if search % 2 != 1 or not 1 <= k <= search**2:
-        raise ValueError(f"expected an odd window and k within its pixels, found search {search} and k {k}")
+def _files_of_folder(path: Path) -> dict[str, bytes]:
+    absent = [name for name in FILES if not (path / name).is_file()]
+    if absent:
+        raise ValueError(f"{path}: expected the files {', '.join(FILES)}, found no {', '.join(absent)}")
+    return {name: (path / name).read_bytes() for name in FILES}
+
+
+def _files_of_archive(path: Path) -> dict[str, bytes]:
+    files: dict[str, bytes] = {}
+    try:
+        with tarfile.open(path, "r:*") as archive:
+            for member in archive:
+                name = PurePosixPath(member.name).name
+                if name in FILES:
+                    _check_member(path, member, name in files)
+                    content = archive.extractfile(member)
+                    files[name] = content.read() if content else b""
+    except (OSError, EOFError, tarfile.TarError, zlib.error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ValueError(f"{path}: expected a RangeNet archive (.tar.gz), found {reason:.120}") from None
+    absent = [name for name in FILES if name not in files]
+    if absent:
+        raise ValueError(f"{path}: expected the files {', '.join(FILES)}, found no {', '.join(absent)}")
+    return files
+
+
+def _check_member(path: Path, member: tarfile.TarInfo, twice: bool) -> None:
+    place = PurePosixPath(member.name)
+    if not member.isfile() or place.is_absolute() or ".." in place.parts or twice:
+        raise ValueError(f"{path}: expected each file once, in one folder, found {member.name!r:.80} "
+                         f"({'again' if twice else 'a link or a path that leads outside'})")  # fmt: skip
+    if member.size > FILES[place.name]:
+        raise ValueError(f"{path}: expected {place.name} of at most {FILES[place.name]} bytes, found {member.size}")
+
+
+def _read_config(text: bytes, where: str) -> Mapping[str, Any]:
+    """The arch_cfg.yaml of a network that we can build, fields as in the RangeNet repository."""
+    try:
+        import yaml
+    except ImportError as error:
+        raise ImportError("RangeNet archives need pyyaml: pip install 'lidarsynth[metrics]'") from error
+    try:
+        config = yaml.safe_load(text)
+        found = [
+            config["backbone"]["OS"],
+            *(config["backbone"]["input_depth"][k] for k in ("range", "xyz", "remission")),
+        ]
+        fields = [
+            config["backbone"]["extra"]["layers"],
+            *(config["dataset"]["sensor"][k] for k in ("img_means", "img_stds")),
+        ]
+    except (yaml.YAMLError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{where}: expected the fields of RangeNet, found {str(error)!r:.100}") from None
+    if found != [32, True, True, True]:
+        raise ValueError(f"{where}: expected backbone OS 32 with range, xyz and remission, found {found}")
+    numbers = [value for values in fields[1:] for value in (values if isinstance(values, list) else [None])]
+    if not all(isinstance(value, int | float) for value in numbers):
+        raise ValueError(f"{where}: expected img_means and img_stds as numbers, found {fields[1:]}")
+    return config

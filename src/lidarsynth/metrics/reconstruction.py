@@ -23,7 +23,7 @@ class Errors:
 
 
 def reconstruction_errors(result: RangeImage, truth: RangeImage, where: np.ndarray | None = None) -> Errors:
-    """Errors of `result` over the pixels `where` (H, W) bool, or all. Raises ValueError for other shapes or no pixel."""
+    """Errors of `result` over the pixels `where` (H, W) bool, or all. Raises ValueError for other shapes, no pixel."""
     where = np.ones(truth.shape, bool) if where is None else where
     if result.shape != truth.shape or where.shape != truth.shape:
         raise ValueError(f"expected images and pixels of {truth.shape}, found {result.shape} and {where.shape}")
@@ -55,11 +55,11 @@ def nearest_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     Raises ValueError for other shapes, no points or NaN; ImportError without scipy, naming the extra that brings it.
     """
     try:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
     except ImportError as error:
         raise ImportError("distances of points need scipy: pip install 'lidarsynth[metrics]'") from error
     sets = [_points(values) for values in (points, others)]
-    return cKDTree(sets[1]).query(sets[0])[0]
+    return KDTree(sets[1]).query(sets[0])[0]
 
 
 def _points(values: np.ndarray) -> np.ndarray:

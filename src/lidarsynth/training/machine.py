@@ -23,14 +23,13 @@ def accelerator_of(options: Options) -> Accelerator:
     Raises ImportError naming the extra when accelerate is missing, ValueError when the device has no such precision.
     """
     try:
-        from accelerate import Accelerator, DistributedDataParallelKwargs
+        from accelerate import Accelerator
     except ImportError:
         raise ImportError("training needs accelerate: pip install 'lidarsynth[train]'") from None
     return Accelerator(
         mixed_precision="no" if options.precision == "fp32" else options.precision,
         gradient_accumulation_steps=options.accumulate,
-        # buffers are ray angles, the same everywhere
-        kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],
+        cpu=not torch.accelerator.is_available(),  # without this, two processes on CPUs would not know of each other
     )
 
 

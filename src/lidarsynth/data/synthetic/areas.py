@@ -56,7 +56,8 @@ AREAS: dict[str, Area] = {
         weight=0.38, half=(2.4, 3.3), walk=(1.3, 3.5), parking=(0.5, 0.4), parked=(0.2, 0.8), setback=(2.0, 11.0),
         house=(9, 17), gap=(2, 12), vacant=0.15, shops=0.02, borders=(0.17, 0.55, 0.18, 0.1), trees=(0, 6),
         garden=(6, 24), thicket=(2, 12), lamps=2.5, signs=4.0, people=(0, 2), bicycles=(0, 1), traffic=(0, 1),
-        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 10), slope=0.03, verge=("grass", "grass", "gravel"), closed=0.5, bank=0.07),
+        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 10), slope=0.03, verge=("grass", "grass", "gravel"),
+        closed=0.5, bank=0.07),
     "avenue": Area(
         weight=0.13, half=(5.5, 9.0), walk=(1.5, 4.0), parking=(0.2, 0.2), parked=(0.2, 0.7), setback=(4.0, 18.0),
         house=(15, 45), gap=(3, 25), vacant=0.35, shops=0.15, borders=(0.1, 0.35, 0.15, 0.4), trees=(0, 10),
@@ -72,6 +73,7 @@ AREAS: dict[str, Area] = {
         weight=0.09, half=(2.4, 4.0), walk=(1.5, 4.0), parking=(0.5, 0.3), parked=(0.3, 0.8), setback=(5.0, 22.0),
         house=(15, 50), gap=(5, 25), vacant=0.2, shops=0.3, borders=(0.08, 0.4, 0.1, 0.42), trees=(1, 9),
         garden=(4, 18), thicket=(1, 8), lamps=3.0, signs=3.0, people=(1, 8), bicycles=(0, 12), traffic=(0, 1),
-        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 5), slope=0.012, verge=("grass", "sidewalk"), closed=0.7, bank=0.03),
+        crossings=(1, 3), lanes=(0.1, 0.0), bend=(0, 5), slope=0.012, verge=("grass", "sidewalk"), closed=0.7,
+        bank=0.03),
 }
 # fmt: on

@@ -29,7 +29,9 @@ def shade(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     material = np.full(len(points), NUMBER["plaster"], np.uint8)
     plinth = up < np.mod(seed, 7) * 0.15
     material[plinth] = NUMBER["stone"]
-    pane = np.array([NUMBER[k] for k in ("window", "window", "window", "window", "room", "room", "room", "void")], np.uint8)
+    pane = np.array(
+        [NUMBER[k] for k in ("window", "window", "window", "window", "room", "room", "room", "void")], np.uint8
+    )
     kind = np.floor(np.mod(chance * 37.7, 1.0) * len(pane)).astype(int)
     material[window] = pane[kind][window]
     frame = window & ((np.abs(np.abs(u - 0.5) - share / 2) * period < 0.07) | (np.abs(u - 0.5) * period < 0.04))
@@ -41,7 +43,9 @@ def shade(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return material, np.where(room, depth + 0.4 + 2.5 * np.mod(chance * 11.3, 1.0), depth).astype(np.float32)
 
 
-def _relief(along: np.ndarray, up: np.ndarray, from_edge: np.ndarray, plinth: np.ndarray, seed: np.ndarray) -> np.ndarray:
+def _relief(
+    along: np.ndarray, up: np.ndarray, from_edge: np.ndarray, plinth: np.ndarray, seed: np.ndarray
+) -> np.ndarray:
     """Metres behind the plane of plain wall: uneven plaster, bossed stone, pilasters, a plinth that stands out."""
     rough = 0.004 + 0.03 * np.mod(seed * 0.173, 1.0) ** 3
     uneven = rough * (np.sin(along * 3.1 + seed) + np.sin(up * 7.3 + along * 1.7) + np.sin(along * 11.0 - up * 5.0))

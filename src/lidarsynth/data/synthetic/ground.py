@@ -9,6 +9,8 @@ import numpy as np
 from lidarsynth.data.synthetic.materials import LABEL, NUMBER
 
 KERB = 0.12  # metres from carriageway to sidewalk
+CROWN = 0.018  # fall of a carriageway from its middle to its edges
+BUMPS = (0.006, 0.014)  # metres, unevenness of paved and of other ground
 
 
 @dataclass(frozen=True)
@@ -89,19 +91,21 @@ class Ground:
                 gap = np.minimum(gap, np.abs(road.coordinates(x, y)[1]) - road.half)
         return gap
 
-    def surface(self, x: np.ndarray, y: np.ndarray, raised: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def surface(self, x: np.ndarray, y: np.ndarray, raised: np.ndarray) -> tuple[np.ndarray, ...]:
         """What the ground is made of at world points x, y (N,).
 
-        raised (N,) bool: the beam met a sidewalk slab. Returns material (N,), label (N,) uint8 and the change of signal
-        by wear (N,) float32.
+        raised (N,) bool: the beam met a sidewalk slab. Returns material (N,), label (N,) uint8, the change of signal by
+        wear (N,) float32, and how far the real surface lies below the smooth one (N,) float32 metres: crown and bumps.
         """
         material = np.full(x.shape, NUMBER[self.verge], np.uint8)
         label = np.full(x.shape, LABEL["sidewalk" if self.verge == "sidewalk" else "terrain"], np.uint8)
+        sag = np.zeros(x.shape, np.float32)
         tracks, roadway = np.zeros(x.shape, np.float32), np.zeros(x.shape, bool)
         for road in self.roads:
             s, d = road.coordinates(x, y)
             inside = np.abs(d) < road.half
             roadway |= inside
+            sag[inside] = CROWN * np.abs(d[inside])
             tracks[inside] = 1.6 * np.cos(4 * np.pi * d[inside] / road.half + self.phase)  # two wheels a lane
             material[inside] = NUMBER["road" if road.paved else "gravel"]
             label[inside] = LABEL["road"]
@@ -113,7 +117,10 @@ class Ground:
         wear[roadway] = tracks[roadway]
         for kx, ky, phase in self.patches:
             wear += np.sin(kx * x + ky * y + phase).astype(np.float32)
-        return material, label, np.float32(0.012) * wear
+        uneven = BUMPS[0] if self.verge == "sidewalk" else BUMPS[1]
+        sag[raised] = 0
+        bumps = np.where(roadway | raised, np.float32(BUMPS[0]), np.float32(uneven)) * (wear - tracks)
+        return material, label, np.float32(0.012) * wear, sag + bumps
 
     def _paint(self, road: Road, s: np.ndarray, d: np.ndarray, material: np.ndarray) -> None:
         """Lane markings, stop lines and rails, written into `material`."""

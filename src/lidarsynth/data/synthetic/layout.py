@@ -71,7 +71,9 @@ def fronts(lot: Lot, road: Road, side: int) -> None:
         _houses(lot, road, side, s, rng.uniform(1.2, 3.5, bays.sum()), near[bays] - out, out + 0.5)
 
 
-def _houses(lot: Lot, road: Road, side: int, s: Array, length: Array, near: Array, depth: Array, across: bool = False) -> None:
+def _houses(
+    lot: Lot, road: Road, side: int, s: Array, length: Array, near: Array, depth: Array, across: bool = False
+) -> None:
     """Boxes from (s, near) to (s + length, near + depth) beside a road; those on a carriageway are left out."""
     rng, count = lot.rng, len(s)
     if not count:
@@ -135,7 +137,7 @@ def _borders(lot: Lot, road: Road, side: int, start: Array, length: Array) -> No
             s = np.delete(s, gate[gate < len(s)]) + 1.0
             d = np.full(s.shape, side * (_edge(road) + 0.35 + (0.6 if code == 1 else 0)))
             x, y, yaw = road.at(s, d)
-            first = (rng.integers(0, 64), rng.uniform(0.9, 1.1), rng.normal())
+            first = (int(rng.integers(0, 64)), rng.uniform(0.9, 1.1), rng.normal())
             wild = code == 1 and rng.random() < 0.45
             lot.put_row("wild hedge" if wild else name, x, y, yaw, first)
 
@@ -148,7 +150,7 @@ def gardens(lot: Lot, road: Road, side: int) -> None:
         count = _count(lot, share * rng.uniform(*area.garden), road)
         s = _along(lot, road, count)
         d = side * (_edge(road) + 0.8 + rng.uniform(0, 1, count) * depth)
-        x, y, yaw = road.at(s, d)
+        x, y, _ = road.at(s, d)
         lot.put(kind, x, y, rng.uniform(0, 6.28, count), clear=1.2, size=(0.6, 1.3))
 
 
@@ -157,7 +159,9 @@ def backdrop(lot: Lot, road: Road, side: int) -> None:
     rng, area = lot.rng, lot.area
     for kind, share in (("thicket", 0.7), ("tree", 0.3)):
         count = _count(lot, share * rng.uniform(*area.thicket), road)
-        x, y, _ = road.at(_along(lot, road, count), side * (_edge(road) + area.setback[0] + 3 + rng.gamma(1.5, 12, count)))
+        x, y, _ = road.at(
+            _along(lot, road, count), side * (_edge(road) + area.setback[0] + 3 + rng.gamma(1.5, 12, count))
+        )
         lot.put(kind, x, y, rng.uniform(0, 6.28, count), clear=3.5, size=(0.7, 1.5))
     count = _count(lot, 18.0 * area.closed, road)
     s = _along(lot, road, count)
@@ -249,8 +253,8 @@ def parked(lot: Lot, road: Road, side: int, places: Array) -> None:
     for place in places:
         free &= (np.abs(s - place[0]) > 4.5) | (np.abs(d - place[1]) > 2.1)
     free &= lot.ground.carriageway(*road.at(s, d)[:2], skip=0) > 2.5
-    _vehicles(lot, road, s[free], d[free], np.where(rng.random(len(s[free])) < 0.85, 0, np.pi) + (np.pi if side > 0 else 0),
-              up)  # fmt: skip
+    turn = np.where(rng.random(int(free.sum())) < 0.85, 0, np.pi) + (np.pi if side > 0 else 0)
+    _vehicles(lot, road, s[free], d[free], turn, up)
 
 
 def moving(lot: Lot, road: Road, side: int, places: Array) -> None:

@@ -1,4 +1,4 @@
-"""The things that stand in a street, each built once at the origin (x forward, z up, z = 0 on the ground), in metres."""
+"""The things that stand in a street, each built once at the origin: metres, x forward, z up, 0 on the ground."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ def car(length: float, belt: float, roof: float, half: float, cabin: tuple[float
             parts.append(shapes.mesh(shapes.quads(post * [1, side, 1]), "paint", "car"))
     for side in (-1, 1):
         mirror = sorted((side * half, side * (half + 0.16)))
-        parts.append(box((cabin[3] - 0.35, cabin[3] - 0.22), (mirror[0], mirror[1]), (belt, belt + 0.14), "paint", "car"))
+        parts.append(
+            box((cabin[3] - 0.35, cabin[3] - 0.22), (mirror[0], mirror[1]), (belt, belt + 0.14), "paint", "car")
+        )
     parts += _wheels("car", (-h + 0.75, h - 0.85), 0.32, half - 0.14)
     return join(*parts, *_plates_and_lamps("car", h, -h, half - 0.1, 0.66))
 
@@ -64,7 +66,7 @@ def van(length: float, roof: float, half: float, label: str = "car") -> Mesh:
     parts = [extrusion(body, widths, "paint", label)]
     screen = np.array([[h - 1.24, -half + 0.25, roof - 0.1], [h - 1.24, half - 0.25, roof - 0.1],
                        [h - 0.5, half - 0.22, 1.16], [h - 0.5, -half + 0.22, 1.16]])  # fmt: skip
-    parts.append(shapes.mesh(shapes.quads(screen + [0.03, 0, 0]), "glass", label))
+    parts.append(shapes.mesh(shapes.quads(screen + np.array([0.03, 0, 0])), "glass", label))
     for side in (-1, 1):
         pane = sorted((side * (half - 0.06), side * (half - 0.03)))
         parts.append(box((h - 1.75, h - 0.85), (pane[0], pane[1]), (1.15, roof - 0.3), "glass", label))
@@ -102,11 +104,13 @@ def person(rng: np.random.Generator, label: str = "person", seated: bool = False
     for side, swing in ((0.1, stride), (-0.1, -stride)):
         leg = frustum((0.07, 0.10), (0.0, 0.85), 6, "cloth", label)
         parts.append(moved(leg, -0.85 * np.sin(swing) * 0.5, side, 0.0, tilt=swing * 0.6))
-    trunk = join(frustum((0.16, 0.21), (0.0, 0.45), 8, "cloth", label), frustum((0.21, 0.07), (0.45, 0.62), 8, "cloth", label),
-                 frustum((0.06, 0.11), (0.6, 0.75), 6, "skin", label), frustum((0.11, 0.04), (0.75, 0.92), 6, "skin", label))  # fmt: skip
+    rings = (((0.16, 0.21), (0.0, 0.45)), ((0.21, 0.07), (0.45, 0.62)))  # waist to shoulders to neck
+    head = (((0.06, 0.11), (0.6, 0.75)), ((0.11, 0.04), (0.75, 0.92)))
+    trunk = [frustum(radii, z, 8, "cloth", label) for radii, z in rings]
+    trunk += [frustum(radii, z, 6, "skin", label) for radii, z in head]
     arms = [moved(frustum((0.05, 0.06), (0.0, 0.6), 5, "cloth", label), 0.1 * s, 0.24 * s, -0.02, tilt=-0.3 * s)
             for s in (-1, 1)]  # fmt: skip
-    return join(*parts, moved(join(trunk, *arms), z=0.83, tilt=lean))
+    return join(*parts, moved(join(*trunk, *arms), z=0.83, tilt=lean))
 
 
 def two_wheeler(label: str, heavy: bool) -> Mesh:
@@ -250,13 +254,17 @@ def library() -> dict[str, list[Mesh]]:
         "motorcyclist": [rider(rng, "motorcyclist", True) for _ in range(2)],
         **{name: [two_wheeler(name, heavy)] for name, heavy in two.items()},
         "tree": [tree(rng, rng.uniform(6, 10), rng.uniform(1.6, 3.2), rng.uniform(1.4, 2.6), 220) for _ in range(10)],
-        "young tree": [tree(rng, rng.uniform(3, 5), rng.uniform(0.9, 1.8), rng.uniform(0.8, 1.4), 200) for _ in range(6)],
+        "young tree": [
+            tree(rng, rng.uniform(3, 5), rng.uniform(0.9, 1.8), rng.uniform(0.8, 1.4), 200) for _ in range(6)
+        ],
         "bush": [bush(rng, rng.uniform(0.8, 2.2), rng.uniform(0.6, 1.4), 220, 0.12) for _ in range(8)],
         "thicket": [bush(rng, rng.uniform(3, 6), rng.uniform(2, 3.5), 420, 0.28) for _ in range(6)],
         "hedge": [hedge(rng, h, d) for h, d in ((0.9, 0.6), (1.4, 0.8), (1.9, 0.9), (2.3, 1.1))],
         "wild hedge": [wild_hedge(rng, h, d) for h, d in ((1.6, 1.2), (2.2, 1.6), (2.8, 1.8), (3.4, 2.2), (4.2, 2.6))],
         "fence": [fence(1.1, 14, 0.05), fence(1.3, 9, 0.11), fence(1.8, 18, 0.035), fence(0.8, 0, 0, posts_only=True)],
-        "garden wall": [box((-1.01, 1.01), (-0.12, 0.12), (-0.3, h), "wall", "fence") for h in (0.5, 0.9, 1.3, 1.8, 2.2)],
+        "garden wall": [
+            box((-1.01, 1.01), (-0.12, 0.12), (-0.3, h), "wall", "fence") for h in (0.5, 0.9, 1.3, 1.8, 2.2)
+        ],
         "lamp": [pole(6.0, 0.08), pole(7.0, 0.11), pole(9.0, 0.16)],
         "guard rail": [guard_rail()],
         "bollard": [pole(0.9, 0.06), pole(1.0, 0.09)],

@@ -25,8 +25,8 @@ class Caster:
     def cast(self, origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where each ray first meets the scene.
 
-        origins, rays (N, 3) float32, rays of length 1. Returns the triangle's number (N,) int32, -1 where there is none;
-        the distance (N,) float32 metres, infinite there; and |cos| of the angle between ray and normal, (N,) float32.
+        origins, rays (N, 3) float32, rays of length 1. Returns, each (N,): the triangle's number, int32, -1 for none;
+        the distance, float32 metres, infinite for none; and |cos| of the angle between ray and normal, float32.
         """
         face = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(rays), query="INTERSECT")
         normal = self.normal[face]

@@ -15,8 +15,44 @@ from lidarsynth.data.synthetic.world import FRONT, GROUND, SLAB, World
 # Reflectance reported for a signal: nothing when dim, then steep, flat about 0.3, so that the shares of all reported
 # values become those of real scans.
 RESPONSE = (
-    (0.026, 0.030, 0.044, 0.056, 0.071, 0.103, 0.128, 0.150, 0.186, 0.217, 0.262, 0.311, 0.366, 0.432, 0.513, 0.66, 0.8),
-    (0.000, 0.035, 0.060, 0.100, 0.150, 0.200, 0.250, 0.280, 0.310, 0.340, 0.380, 0.420, 0.470, 0.530, 0.600, 0.80, 0.99),
+    (
+        0.026,
+        0.030,
+        0.044,
+        0.056,
+        0.071,
+        0.103,
+        0.128,
+        0.150,
+        0.186,
+        0.217,
+        0.262,
+        0.311,
+        0.366,
+        0.432,
+        0.513,
+        0.66,
+        0.8,
+    ),
+    (
+        0.000,
+        0.035,
+        0.060,
+        0.100,
+        0.150,
+        0.200,
+        0.250,
+        0.280,
+        0.310,
+        0.340,
+        0.380,
+        0.420,
+        0.470,
+        0.530,
+        0.600,
+        0.80,
+        0.99,
+    ),
 )
 GRAZING = (0.13, 0.17)  # signal lost per natural logarithm of cos(incidence) below the second number
 FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) where positive
@@ -29,7 +65,7 @@ ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.05, "stone": 0.02, "bark":
 
 @dataclass(frozen=True)
 class Returns:
-    """What N beams brought back. distance (N,) float32 m along the ray, 0 for none; reflectance (N,); label (N,) uint8."""
+    """What N beams brought back: distance (N,) float32 m along the ray, 0 for none; reflectance and label (N,)."""
 
     distance: np.ndarray
     reflectance: np.ndarray
@@ -66,7 +102,7 @@ def sense(
     signal = strength - lasers.dip * np.interp(distance, DIP, (0, 1, 1, 0)).astype(np.float32)
     doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
     gone = (strength + doubt < VANISH) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
-    distance = distance + depth / np.maximum(cosine, 0.3) + noise[0] * _spread(material, distance) + lasers.shift
+    distance = distance + depth / np.maximum(cosine, 0.12) + noise[0] * _spread(material, distance) + lasers.shift
     gone |= ~(distance < max_range)
     # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
     grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
@@ -106,7 +142,7 @@ def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarr
     hit = face >= 0
     low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
     spot = origins[low] + rays[low] * distance[low, None]
-    material[low], label[low], wear = world.ground.surface(spot[:, 0], spot[:, 1], kind[low] == SLAB)
+    material[low], label[low], wear, depth[low] = world.ground.surface(spot[:, 0], spot[:, 1], kind[low] == SLAB)
     tint[low] = wear / TABLE[material[low], 1]
     wall = np.flatnonzero(hit & (kind == FRONT))
     spot = origins[wall] + rays[wall] * distance[wall, None]

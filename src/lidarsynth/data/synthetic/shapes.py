@@ -11,7 +11,7 @@ from lidarsynth.data.synthetic.materials import LABEL, NUMBER
 
 @dataclass(frozen=True)
 class Mesh:
-    """T triangles. corners (T, 3, 3) float32 metres; material (T,) uint8 into MATERIALS; label (T,) uint8, class 0-19."""
+    """T triangles: corners (T, 3, 3) float32 metres; material (T,) uint8 into MATERIALS; label (T,) uint8, 0-19."""
 
     corners: np.ndarray
     material: np.ndarray
@@ -69,7 +69,8 @@ def wheel(radius: float, width: float, material: str, label: str, sides: int = 1
     """A closed disk of that width about the y axis, centred on the origin."""
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([radius * np.cos(angle), np.zeros(sides + 1), radius * np.sin(angle)], axis=-1)
-    left, right = ring + [0, width / 2, 0], ring - [0, width / 2, 0]
+    out = np.array([0, width / 2, 0])
+    left, right = ring + out, ring - out
     tread = quads(np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1))
     faces = [np.stack([np.broadcast_to([0, y, 0], (sides, 3)), e[:-1], e[1:]], axis=1)
              for y, e in ((width / 2, left), (-width / 2, right))]  # fmt: skip

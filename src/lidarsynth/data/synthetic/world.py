@@ -22,7 +22,7 @@ class World:
     """T triangles and what they are.
 
     corners (T, 3, 3) float32 m; kind (T,) uint8 of GROUND, SLAB, THING, FRONT; material, label (T,) uint8;
-    tint (T,) float32, the object's brightness in spreads of its material; front (T,) int16, row of `fronts`, -1 for none;
+    tint (T,) float32, the object's brightness in spreads of its material; front (T,) int16, row of `fronts` or -1;
     fronts (F, 12) float32, see `facades.py`; ground; poses (16, 6) float64: x, y, z, yaw, pitch, roll of the vehicle.
     """
 
@@ -70,8 +70,9 @@ class Lot:
         for variant in np.unique(pick):
             self.things.setdefault((kind, int(variant)), []).append(rows[pick == variant])
 
-
-    def put_row(self, kind: str, x: np.ndarray, y: np.ndarray, yaw: np.ndarray, first: tuple[int, float, float]) -> None:
+    def put_row(
+        self, kind: str, x: np.ndarray, y: np.ndarray, yaw: np.ndarray, first: tuple[int, float, float]
+    ) -> None:
         """Pieces of one hedge or fence: all of the same variant, height scale and tint, given by `first`."""
         keep = self.ground.carriageway(x, y) > 0.4
         variant = first[0] % len(library()[kind])
@@ -96,10 +97,10 @@ def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
     places = rng.permutation(np.arange(-100, 101, 40.0))
     for k in range(rng.integers(area.crossings[0], area.crossings[1] + 1)):
         place = places[k] + rng.uniform(-14, 14)
-        x, y, yaw = roads[0].at(np.float64(place), np.float64(0))
+        x, y, yaw = roads[0].at(np.asarray(place), np.asarray(0.0))
         one_sided = rng.choice([(-90, 90), (-90, 0), (0, 90)])
         side = Road(float(x), float(y), float(yaw) + np.pi / 2 + rng.normal(0, 0.12), rng.uniform(2.2, max(3.0, lane)),
-                    walk * rng.uniform(0.5, 1), (0.0, 0.0), (0.0, 100.0, 0.0), *map(float, one_sided))  # fmt: skip
+                    walk * rng.uniform(0.5, 1), start=float(one_sided[0]), stop=float(one_sided[1]))  # fmt: skip
         roads.append(side)
     slope = rng.normal(0, area.slope, 2)
     hills = np.column_stack([rng.uniform(0, 0.35, 3) * area.slope / 0.02, rng.uniform(-0.04, 0.04, (3, 2)),
@@ -129,7 +130,7 @@ def draw_poses(rng: np.random.Generator, ground: Ground) -> tuple[np.ndarray, np
         elif len(ground.roads) > 1 and draw[0] > 0.85:  # on a side road
             side = ground.roads[1 + k % (len(ground.roads) - 1)]
             place = np.clip(side.start + (side.stop - side.start) * draw[1], -60, 60)
-            x[k], y[k], yaw[k] = side.at(place, np.float64(-side.half / 2))
+            x[k], y[k], yaw[k] = side.at(np.asarray(place), np.asarray(-side.half / 2))
             s[k] = 1e6
     return _settled(rng, ground, x, y, yaw), np.column_stack([s, d])
 
@@ -203,4 +204,3 @@ def _instances(kind: str, variant: int, rows: np.ndarray) -> dict[str, np.ndarra
         "tint": np.repeat(rows[:, 7], len(shape)),
         "front": np.full(count * len(shape), -1, np.int16),
     }
-

@@ -1,0 +1,479 @@
+"""The verbs as a user meets them: what they write, that they go on where they were stopped, and how they refuse."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from broken import BROKEN
+from networks import trained
+
+from lidarsynth import build
+from lidarsynth.cli import VERBS, main
+from lidarsynth.data.files import read, read_image, write
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.presets import preset
+
+
+class Answer(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Answer]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the command line in this process."""
+
+    def run(*words: object) -> Answer:
+        code = 0
+        try:
+            main([str(word) for word in words])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return Answer(code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model folder of the preset `tiny`, 16 x 64 pixels."""
+    experiment = preset("tiny")
+    return build.save(tmp_path_factory.mktemp("model"), experiment, trained(experiment))
+
+
+def street(name: str = "hdl-64e-kitti") -> Scan:
+    """A road between walls with ray-drop, as a sensor sees it."""
+    sensor = SENSORS[name].resized(width=256)
+    rays = sensor.directions()
+    with np.errstate(divide="ignore"):
+        distance = np.minimum(np.where(rays[..., 2] < 0, -1.7 / rays[..., 2], np.inf), 8 / np.abs(rays[..., 1]))
+    rng = np.random.default_rng(0)
+    mask = (distance < 60) & (distance > 2) & (rng.random(distance.shape) < 0.9)
+    reflectance = rng.random(distance.shape).astype(np.float32) * mask
+    return RangeImage(np.where(mask, distance, 0).astype(np.float32), reflectance, mask, sensor).to_scan()
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scans") / "street.pcd"
+    write(path, street())
+    return path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def refused(answer: Answer, *words: str) -> None:
+    """Exit code 2, nothing on stdout, one line on stderr that holds the words."""
+    assert answer.code == 2, answer
+    assert answer.out == ""
+    assert answer.err.startswith("lidarsynth: ") and answer.err.count("\n") == 1 and answer.err.endswith("\n")
+    for word in words:
+        assert word in answer.err
+
+
+def started(*words: object, **options) -> subprocess.Popen[str]:
+    """The command line in a process of its own."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "lidarsynth", *map(str, words)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    return subprocess.Popen(command, env=environment, **pipes)
+
+
+# generate
+
+
+def test_generate_writes_scans_and_pictures(run: Run, tiny: Path, tmp_path: Path):
+    answer = run("generate", "-n", 2, "--out", tmp_path / "g", "--model", tiny, "--steps", 2)
+    assert (answer.code, answer.err) == (0, "")
+    names = ["000000.ply", "000000.png", "000001.ply", "000001.png", "generate.json"]
+    assert list(files(tmp_path / "g")) == names
+    assert "2 scans, 2 of them new" in answer.out
+    assert 0 < len(read(tmp_path / "g" / "000001.ply")) <= 16 * 64
+
+
+def test_scans_are_the_same_bytes_whatever_the_batch_and_the_count(run: Run, tiny: Path, tmp_path: Path):
+    for name, count, batch in (("a", 5, 1), ("b", 5, 4), ("c", 3, 2)):
+        words = ("--model", tiny, "--steps", 2, "--seed", 7, "--batch-size", batch, "--format", "bin")
+        assert run("generate", "-n", count, "--out", tmp_path / name, *words).code == 0
+    a, b, c = (files(tmp_path / name) for name in "abc")
+    assert a == b
+    assert {name: a[name] for name in c} == c
+    assert len({data for name, data in a.items() if name.endswith(".bin")}) == 5
+
+
+def test_generate_makes_only_what_lacks(run: Run, tiny: Path, tmp_path: Path):
+    words = ("generate", "--out", tmp_path, "--model", tiny, "--steps", 2, "-n")
+    assert run(*words, 4).code == 0
+    whole = files(tmp_path)
+    (tmp_path / "000001.ply").unlink()
+    (tmp_path / "000002.png").unlink()
+    kept = (tmp_path / "000003.ply").stat().st_mtime_ns
+    assert "4 scans, 2 of them new" in run(*words, 4).out
+    assert files(tmp_path) == whole
+    assert (tmp_path / "000003.ply").stat().st_mtime_ns == kept
+    assert "2 scans, 0 of them new" in run(*words, 2).out
+
+
+def test_killed_in_the_middle_the_same_command_goes_on(run: Run, tiny: Path, tmp_path: Path):
+    words = ("generate", "-n", 12, "--model", tiny, "--steps", 3, "--out")
+    process = started(*words, tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not (tmp_path / "killed" / "000003.ply").exists():
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait(timeout=60) == -signal.SIGKILL, "it ended before it was killed"
+    half = {name: data for name, data in files(tmp_path / "killed").items() if not name.startswith(".unfinished")}
+    assert run(*words, tmp_path / "whole").code == 0
+    whole = files(tmp_path / "whole")
+    assert 4 < len(half) < len(whole) == 25
+    assert half == {name: whole[name] for name in half}, "every file in its place is whole"
+    assert run(*words, tmp_path / "killed").code == 0
+    assert files(tmp_path / "killed") == whole
+    assert not (tmp_path / "killed" / ".unfinished").exists()
+
+
+def test_ctrl_c_is_one_line(tiny: Path, tmp_path: Path):
+    process = started("generate", "-n", 100000, "--model", tiny, "--steps", 2, "--out", tmp_path)
+    while process.poll() is None and not (tmp_path / "000002.ply").exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out == ""
+    assert err.strip().splitlines()[-1] == "lidarsynth: stopped"
+    assert "Traceback" not in err
+    assert not (tmp_path / ".unfinished").exists()
+    assert all(len(read(path)) > 0 for path in tmp_path.glob("*.ply"))
+
+
+@pytest.mark.parametrize("other", [("--steps", 3), ("--seed", 1), ("--sampler", "ddim"), ("--format", "bin")])
+def test_a_folder_made_with_other_settings_is_refused(run: Run, tiny: Path, tmp_path: Path, other: tuple):
+    words = ("generate", "-n", 1, "--out", tmp_path, "--model", tiny)
+    assert run(*words, "--steps", 2).code == 0
+    before = files(tmp_path)
+    refused(
+        run(*words, "--steps", 2, *other), f"{tmp_path}: expected a folder of scans made with", other[0][2:], "found"
+    )
+    assert files(tmp_path) == before
+
+
+def test_a_folder_of_other_weights_is_refused_and_one_of_the_same_is_not(run: Run, tiny: Path, tmp_path: Path):
+    experiment = preset("tiny")
+    same = build.save(tmp_path / "same", experiment, trained(experiment))
+    other = build.save(tmp_path / "other", experiment, trained(experiment, seed=1))
+    words = ("generate", "-n", 1, "--out", tmp_path / "g", "--steps", 2, "--model")
+    assert run(*words, tiny).code == 0
+    assert "0 of them new" in run(*words, same).out
+    refused(run(*words, other), "weights")
+
+
+def test_scans_of_others_are_not_taken_for_generated_ones(run: Run, tiny: Path, tmp_path: Path):
+    write(tmp_path / "000000.ply", street())
+    before = files(tmp_path)
+    words = ("generate", "-n", 2, "--out", tmp_path, "--model", tiny, "--steps", 2)
+    refused(run(*words), "found 000000.ply")
+    assert files(tmp_path) == before
+    (tmp_path / "generate.json").write_text("[]")
+    refused(run(*words), "generate.json", "found []")
+    (tmp_path / "generate.json").write_text("{")
+    refused(run(*words), "generate.json", "JSON")
+
+
+# complete and upsample
+
+
+def measured_in(points: Scan, scan: Scan) -> bool:
+    """Whether every point of `scan` is in `points`, bit by bit, reflectance too."""
+    have, want = (
+        np.column_stack([s.xyz, s.reflectance]).astype(np.float32).view(np.void(16).dtype).ravel()
+        for s in (points, scan)
+    )
+    return bool(np.isin(want, have).all())
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "bin", "npy"])
+def test_complete_keeps_every_measured_point(run: Run, tiny: Path, scan: Path, tmp_path: Path, suffix: str):
+    answer = run("complete", scan, "--out", tmp_path / f"new/dense.{suffix}", "--model", tiny)
+    assert (answer.code, answer.err) == (0, "")
+    assert sorted(files(tmp_path)) == [f"new/dense.{suffix}", "new/dense.png"]
+    assert measured_in(read(tmp_path / f"new/dense.{suffix}"), read(scan))
+
+
+@pytest.mark.parametrize("method", ["conditional", "repaint"])
+def test_complete_with_a_corruption_prints_errors_and_keeps_known_points(
+    run: Run, tiny: Path, scan: Path, tmp_path: Path, method: str
+):
+    out = tmp_path / "dense.npz"
+    words = ("--corrupt", "beams:4", "--steps", 2, "--resamples", 2, "--method", method, "--no-picture")
+    answer = run("complete", scan, "--out", out, "--model", tiny, *words)
+    assert answer.code == 0, answer.err
+    table = answer.out.splitlines()
+    assert "768 hidden pixels" in table[1]
+    assert [line.split()[0] for line in table[3:]] == ["lidarsynth", "nearest", "bilinear", "bicubic", "left"]
+    image = read_image(out)
+    truth = project(read(scan), image.sensor)
+    known = truth.mask & (np.arange(16) % 4 == 0)[:, None]
+    assert known.any() and image.xyz is not None and truth.xyz is not None
+    np.testing.assert_array_equal(image.xyz[known], truth.xyz[known])
+    np.testing.assert_array_equal(image.range[known], truth.range[known])
+    np.testing.assert_array_equal(image.reflectance[known], truth.reflectance[known])
+
+
+def test_complete_takes_several_scans_or_a_folder(run: Run, tiny: Path, tmp_path: Path):
+    scans = tmp_path / "in"
+    scans.mkdir()
+    write(scans / "a.b.bin", street())
+    write(scans / "c.ply", street())
+    words = ("--model", tiny, "--corrupt", "sector:90", "--no-picture", "--steps", 1)
+    folder = run("complete", scans, "--out", tmp_path / "x", *words)
+    several = run("complete", scans / "a.b.bin", scans / "c.ply", "--out", tmp_path / "y", *words)
+    assert folder.code == several.code == 0
+    assert list(files(tmp_path / "x")) == list(files(tmp_path / "y")) == ["a.b.ply", "c.ply"]
+    assert "mean of 2 scans" in folder.out
+    write(scans / "c.bin", street())
+    refused(run("complete", scans, "--out", tmp_path / "z", *words), "found two named c")
+    refused(run("complete", scans, "--out", tmp_path / "z.ply", *words), "the name of a folder for 3 scans")
+    refused(run("complete", "--out", tmp_path / "z", *words), "found none")
+    refused(run("complete", tmp_path / "x" / "..", "--out", tmp_path / "c.ply", *words), "folder")
+
+
+def test_nothing_is_put_before_a_point_beyond_the_range_limits(run: Run, tiny: Path, tmp_path: Path):
+    far = street()
+    lonely = np.array([[0, -300, -60]], np.float32)
+    write(tmp_path / "far.ply", Scan(np.vstack([far.xyz, lonely]), np.append(far.reflectance, np.float32(0.5))))
+    assert run("complete", tmp_path / "far.ply", "--out", tmp_path / "d.ply", "--model", tiny, "--no-picture").code == 0
+    assert measured_in(read(tmp_path / "d.ply"), Scan(lonely, np.float32([0.5])))
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-32e", "os1-64"])
+@pytest.mark.parametrize("named", [True, False])
+def test_upsample_keeps_every_measured_point(run: Run, tiny: Path, tmp_path: Path, sensor: str, named: bool):
+    write(tmp_path / "s.pcd", street(sensor))
+    words = ("--from", sensor) if named else ()
+    out = tmp_path / "dense.ply"
+    answer = run("upsample", tmp_path / "s.pcd", "--out", out, "--model", tiny, "--no-picture", *words)
+    assert (answer.code, answer.err) == (0, "")
+    assert f"points of {sensor} became" in answer.out
+    before, after = read(tmp_path / "s.pcd"), read(out)
+    assert measured_in(after, before)
+    assert len(after) > len(before)
+
+
+def test_upsample_fills_between_the_rings_of_a_thinned_scan(run: Run, tiny: Path, tmp_path: Path):
+    whole = street()
+    assert whole.ring is not None
+    write(tmp_path / "thin.pcd", whole[whole.ring % 8 == 0])
+    answer = run("upsample", tmp_path / "thin.pcd", "--out", tmp_path / "d.npz", "--model", tiny, "--no-picture")
+    assert answer.code == 0, answer.err
+    image = read_image(tmp_path / "d.npz")
+    assert image.mask[1::2].mean() > 0.3, "the rows between measured ones are filled"
+
+
+def test_upsample_takes_a_sensor_file_or_asks_for_one(run: Run, tiny: Path, tmp_path: Path):
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(-20, 20, (3000, 3)).astype(np.float32) * np.float32([1, 1, 0.1])
+    write(tmp_path / "cloud.ply", Scan(cloud, rng.random(3000).astype(np.float32)))
+    words = ("upsample", tmp_path / "cloud.ply", "--out", tmp_path / "d.ply", "--model", tiny, "--no-picture")
+    refused(run(*words), "name the sensor with --from", "found no rings")
+    refused(run(*words, "--from", "vlp-17"), "expected a sensor of hdl-64e", "found 'vlp-17'")
+    refused(run(*words, "--from", tmp_path / "none.toml"), "none.toml")
+    (tmp_path / "own.toml").write_text("beams = 16\ntop = 10\nbottom = -10\n")
+    (tmp_path / "own.json").write_text('{"elevations": [5, 0, -5, -10], "width": 256}')
+    assert "points of own became" in run(*words, "--from", tmp_path / "own.toml").out
+    assert "points of own became" in run(*words, "--from", tmp_path / "own.json").out
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    {
+        "list.json": "[1, 2]",
+        "broken.json": "{",
+        "deep.json": "[" * 100000,
+        "word.json": '{"elevations": ["up", "down"]}',
+        "number.json": '{"elevations": 5}',
+        "rising.toml": "beams = 4\ntop = -10\nbottom = 10\n",
+        "text.toml": 'beams = 4\ntop = "a"\nbottom = -10\n',
+        "width.toml": "beams = 4\ntop = 1\nbottom = -10\nwidth = 'x'\n",
+        "unknown.toml": "beams = 4\ntop = 1\nbottom = -10\nspin = 3\n",
+        "empty.toml": "",
+        "latin.toml": "# \udcff",
+        "suffix.yaml": "beams: 4",
+    }.items(),
+)
+def test_broken_sensor_files_are_one_line(run: Run, scan: Path, tmp_path: Path, name: str, text: str):
+    (tmp_path / name).write_text(text, errors="surrogateescape")
+    refused(run("project", scan, "--sensor", tmp_path / name, "--out", tmp_path / "o.npz"), "expected", "found")
+    assert list(files(tmp_path)) == [name]
+
+
+# project, info, demo
+
+
+def test_project_writes_the_image_of_the_scan(run: Run, scan: Path, tmp_path: Path):
+    answer = run("project", scan, "--out", tmp_path / "image.npz", "--width", 128)
+    assert answer.code == 0 and "hdl-64e-kitti" in answer.out
+    image = read_image(tmp_path / "image.npz")
+    expected = project(read(scan), "hdl-64e-kitti", width=128)
+    np.testing.assert_array_equal(image.range, expected.range)
+    assert (tmp_path / "image.png").stat().st_size > 1000
+
+
+def test_info_knows_scans_models_presets_and_sensors(run: Run, tiny: Path, scan: Path):
+    answers = [run("info", what) for what in (scan, tiny, "r2dm-h", "vlp-16")]
+    assert [a.code for a in answers] == [0] * 4
+    for answer, word in zip(answers, ("hdl-64e-kitti (", "42,", "31,099,650", "16 from +15.00"), strict=True):
+        assert word in answer.out
+
+
+def test_demo_runs_and_lists_what_it_made(run: Run, tiny: Path, tmp_path: Path):
+    out = tmp_path / "demo"
+    answer = run("demo", "--out", out, "--model", tiny)
+    assert (answer.code, answer.err) == (0, "")
+    listed = {line.strip() for line in answer.out.splitlines() if line.startswith("  ") and str(out) in line}
+    assert listed == {str(out / name) for name in files(out)}
+    assert len(listed) >= 14
+
+
+# refusals
+
+
+@pytest.mark.parametrize("verb", ["project", "complete", "upsample", "info"])
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_path: Path, name: str, verb: str):
+    (tmp_path / "in").mkdir()
+    path = BROKEN[name](tmp_path / "in")
+    words = () if verb == "info" else ("--out", tmp_path / "made" / "dense.npz")
+    words += ("--model", tiny) if verb in ("complete", "upsample") else ()
+    refused(run(verb, path, *words), "expected", "found")
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("", "generate, complete"),
+        ("gnerate", "gnerate"),
+        ("generate -n x", "'x'"),
+        ("generate -n 0", "--count of at least 1, found 0"),
+        ("generate -n -3", "-3"),
+        ("generate --steps 0", "--steps of at least 1, found 0"),
+        ("generate --seed -1", "--seed of at least 0, found -1"),
+        ("generate --seed 99999999999999999999999", "--seed"),
+        ("generate --batch-size 0", "--batch-size"),
+        ("generate --sampler euler", "'euler'"),
+        ("generate --format docx", "'docx'"),
+        ("generate --model nothing", "nothing: expected"),
+        ("generate --nope 3", "--nope"),
+        ("generate --model TINY --device quantum", "'quantum'"),
+        ("generate --model TINY --out SCAN", "expected a folder to write to, found a file"),
+        ("complete", "--out"),
+        ("complete SCAN", "--out"),
+        ("complete SCAN --out d.docx", "expected a name that ends in .bin"),
+        ("complete SCAN --out SCAN", "found the same"),
+        ("complete SCAN --out SCAN/d.ply", "a file at"),
+        ("complete SCAN --out d.ply --model TINY --corrupt beams:0", "EVERY"),
+        ("complete SCAN --out d.ply --model TINY --corrupt rain", "'rain'"),
+        ("complete SCAN --out d.ply --model TINY --corrupt points:1", "hides at least one pixel"),
+        ("complete SCAN --out d.ply --model TINY --corrupt region:5:x", "numbers"),
+        ("complete SCAN --out d.ply --model TINY --steps 0", "--steps"),
+        ("complete SCAN --out d.ply --model TINY --resamples 0", "--resamples"),
+        ("complete SCAN --out d.ply --intensity percent", "'percent'"),
+        ("complete none.bin --out d.ply --model TINY", "No such file"),
+        ("complete none --out d --model TINY", "none"),
+        ("upsample SCAN --out d.docx", "expected a name"),
+        ("upsample SCAN --out d.ply --from nothing", "'nothing'"),
+        ("upsample SCAN", "--out"),
+        ("project SCAN --out i.docx", "expected a name"),
+        ("project SCAN --out i.npz --sensor nothing", "'nothing'"),
+        ("project SCAN --out i.npz --sensor vlp-16 --method unfolding", "16 rings"),
+        ("project SCAN --out i.npz --width 0", "--width of at least 4"),
+        ("info nothing", "nothing: expected"),
+        ("info .", "experiment.json"),
+        ("info none.bin", "No such file"),
+        ("info none.toml", "none.toml"),
+        ("data files . ", "CACHE"),
+        ("data files nowhere cache", "nowhere"),
+        ("train nothing --data nowhere --out o", "nothing"),
+    ],
+)
+def test_bad_words_are_one_line_and_leave_nothing(
+    run: Run, tiny: Path, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
+):
+    monkeypatch.chdir(tmp_path)
+    given = [word.replace("TINY", str(tiny)).replace("SCAN", str(scan)) for word in words.split()]
+    refused(run(*given), said)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_in_the_way_is_refused_before_the_work(run: Run, scan: Path, tmp_path: Path):
+    (tmp_path / "d.npz").mkdir()
+    refused(run("project", scan, "--out", tmp_path / "d.npz"), "found a folder")
+    refused(run("upsample", scan, "--out", tmp_path / "d.npz"), "found a folder")
+
+
+def test_a_fault_of_our_own_is_not_hidden(monkeypatch: pytest.MonkeyPatch):
+    def fail(what: str) -> None:
+        raise RuntimeError("a fault") if what == "fault" else RuntimeError("not enough memory: 8 bytes\nmore")
+
+    monkeypatch.setitem(VERBS, "info", fail)
+    with pytest.raises(RuntimeError, match="a fault"):
+        main(["info", "--what", "fault"])
+    with pytest.raises(SystemExit, match="2"):
+        main(["info", "--what", "memory"])
+
+
+# the terminal
+
+
+@pytest.mark.parametrize("verb", [(), *((verb,) for verb in VERBS)])
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_help_reads_on_any_terminal(monkeypatch: pytest.MonkeyPatch, verb: tuple[str, ...], encoding: str):
+    screen = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", screen)
+    with pytest.raises(SystemExit) as end:
+        main([*verb, "--help"])
+    assert not end.value.code
+    screen.flush()
+    text = screen.buffer.getvalue().decode(encoding)
+    assert text.startswith(f"usage: {' '.join(['lidarsynth', *verb])} ")
+    assert "\\u" not in text, "boxes are drawn with what the terminal has"
+
+
+def test_any_file_name_can_be_said_on_any_terminal(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "straße.pcd"
+    path.write_bytes(scan.read_bytes())
+    screen = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", screen)
+    main(["info", str(path)])
+    screen.flush()
+    assert b"stra\\xdfe.pcd" in screen.buffer.getvalue()
+
+
+def test_a_closed_pipe_ends_quietly():
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    process = started("info", "vlp-16", stdout=write_end)
+    os.close(write_end)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (141, "")
+
+
+def test_refusals_of_a_process(tmp_path: Path):
+    process = started("info", tmp_path / "none.bin")
+    out, err = process.communicate(timeout=60)
+    refused(Answer(process.returncode, out, err), "none.bin: expected", "No such file")
