@@ -26,7 +26,9 @@ def test_histograms_equal_the_reference_exactly(fixture_tensors):
         "edge_hist_gate_1_200": bev_histograms(edge, near=1, far=200)[0],
     }
     for name, actual in pairs.items():
-        torch.testing.assert_close(actual, tensors[name].int(), rtol=0, atol=0, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(
+            actual, tensors[name].int(), rtol=0, atol=0, msg=lambda text, name=name: f"{name}: {text}"
+        )
 
 
 def test_jsd_and_mmd_equal_the_reference(fixture_tensors, shared: Path):

@@ -275,6 +275,19 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         CachedImages(tmp_path / "nowhere")
 
 
+def test_the_command_line_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for words, expected in (
+        (["kitti", str(tmp_path)], "expected data kitti ROOT CACHE, found no CACHE"),
+        (["files", str(tmp_path), str(tmp_path / "cache"), "--workers", "-1"], "found none"),
+        (["synthetic", str(tmp_path / "cache"), "--workers", "-1"], "expected --workers of at least 0, found -1"),
+        (["synthetic", str(tmp_path / "cache"), "--width", "0"], "expected --width of at least 4, found 0"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(["data", *words])
+        assert stop.value.code == 2
+        assert expected in capsys.readouterr().err
+
+
 def test_words_are_checked(tmp_path: Path):
     with pytest.raises(ValueError, match=r"expected a source of kitti360, kitti, .* or synthetic, found 'waymo'"):
         list(cache_source("waymo", tmp_path, tmp_path))

@@ -93,7 +93,9 @@ def assert_same(a: Moments, b: Moments) -> None:
 def test_moments_depend_neither_on_batches_nor_on_order_nor_on_who_gathered_them():
     x = draw(101, 7, shift=1000.0)
     whole = moments(x)
-    torch.testing.assert_close(whole.covariance().numpy(), np.cov(x.astype(np.float64), rowvar=False), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        whole.covariance().numpy(), np.cov(x.astype(np.float64), rowvar=False), rtol=1e-9, atol=0
+    )
     assert_same(gathered(split(x, [1] * 101)), whole)
     assert_same(gathered([x[80:], x[:0], x[:3], x[3:80]]), whole)
     halves = [moments(x[:30]), moments(x[30:])]
@@ -150,7 +152,9 @@ def test_gaussian_mmd_equals_its_definition_for_any_block():
     expected = kernel(p, p) + kernel(q, q) - 2 * kernel(p, q)
     for block in (1, 7, 23, 1000):
         assert gaussian_mmd(x, y, block=block) == pytest.approx(expected, rel=1e-4)
-    assert gaussian_mmd(torch.from_numpy(y)[torch.randperm(31)], torch.from_numpy(x)) == pytest.approx(expected, rel=1e-4)
+    assert gaussian_mmd(torch.from_numpy(y)[torch.randperm(31)], torch.from_numpy(x)) == pytest.approx(
+        expected, rel=1e-4
+    )
     assert gaussian_mmd(x, x[::-1]) == pytest.approx(0, abs=1e-7)
 
 

@@ -162,4 +162,4 @@ def test_a_sensor_with_one_beam():
     assert image.mask.mean() > 0.5
 
 
-GOLDEN = [0.8, 2.0, 0.2]
+GOLDEN = [0.8947, 2.3582, 0.2606]  # filled pixels, mean ln range, mean reflectance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import os
 import re
@@ -95,7 +96,8 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
     Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 141 where nobody reads stdout any more.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # any file name can be said on any terminal
+        codecs.register_error("lidarsynth", _sayable)
+        sys.stdout.reconfigure(errors="lidarsynth")
     try:
         _parsed(verbs, argv)()
     except BrokenPipeError:
@@ -110,8 +112,10 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
             if error.filename
             else str(error)
         )
-    except (ValueError, ImportError, FloatingPointError, RecursionError) as error:
+    except (ValueError, ImportError, FloatingPointError) as error:
         _refuse(str(error))
+    except RecursionError:
+        _refuse("expected a file with a few levels of brackets, found too many")
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise  # a fault of ours
@@ -143,6 +147,13 @@ def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
         return partial(verb, *args, **kwargs)
 
     return _with_arguments
+
+
+def _sayable(error: UnicodeError) -> tuple[str, int]:
+    """Stands in for what the terminal's encoding lacks: tyro's bullets, and file names of other languages."""
+    assert isinstance(error, UnicodeEncodeError)
+    lacking = error.object[error.start : error.end].replace("\u2022", "*")
+    return lacking.encode("ascii", "backslashreplace").decode(), error.end
 
 
 def _refuse(reason: str) -> NoReturn:

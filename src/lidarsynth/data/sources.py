@@ -108,7 +108,7 @@ def cache_source(
     split, projection, width = split or own.split, projection or own.projection, own.width if width is None else width
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
-    spec = get_sensor(sensor or own.sensor).resized(width=width)
+    spec = _sensor(sensor or own.sensor, width)
     reader, columns = own.reader(Path(root), split), columns_of(projection, width)
     image = Projected(reader, spec, projection, columns)
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
@@ -129,11 +129,17 @@ def cache_synthetic(
     """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`."""
     from lidarsynth.data.synthetic.reader import SyntheticStreets
 
-    spec = get_sensor(sensor).resized(width=width)
+    spec = _sensor(sensor, width)
     streets = SyntheticStreets(seed=seed, length=count, sensor=spec)
     source = {"name": "synthetic", "seed": seed}
     for done in write_cache(folder, streets.image, count, spec, source, workers=_processes(workers), check=check):
         yield done, count
+
+
+def _sensor(name: str, width: int) -> Sensor:
+    if width < 4:
+        raise ValueError(f"expected --width of at least 4, found {width}")
+    return get_sensor(name).resized(width=width)
 
 
 def _processes(workers: int | None) -> int:
@@ -145,12 +151,13 @@ def _processes(workers: int | None) -> int:
 def summary(folder: str | Path) -> str:
     """What a cache holds, in one line: images, sequences, and what was skipped or is missing."""
     told = report(read_index(folder))
+    sequences, skipped, missing = (len(told[key]) for key in ("sequences", "skipped", "missing"))
     text = f"{told['stored']} images"
-    if told["sequences"]:
-        text += f" of {len(told['sequences'])} sequence{'s' if len(told['sequences']) > 1 else ''}"
+    if sequences:
+        text += f" of {sequences} sequence{'s' if sequences > 1 else ''}"
     text += f" in {folder}/"
-    if told["skipped"]:
-        text += f", {len(told['skipped'])} broken scan{'s' if len(told['skipped']) > 1 else ''} skipped (named in {Path(folder) / REPORT})"
-    if told["missing"]:
-        text += f"; not found: {', '.join(told['missing'][:5])}{', ...' if len(told['missing']) > 5 else ''}"
+    if skipped:
+        text += f", {skipped} broken scan{'s' if skipped > 1 else ''} skipped (named in {Path(folder) / REPORT})"
+    if missing:
+        text += f"; not found: {', '.join(told['missing'][:5])}{', ...' if missing > 5 else ''}"
     return text

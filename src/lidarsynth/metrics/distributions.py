@@ -7,7 +7,6 @@ the Frechet distance needs batch by batch, and two of them merge, so that two ma
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -169,10 +168,10 @@ def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> f
     if not len(first) or not len(second) or first.shape[1] != second.shape[1]:
         raise ValueError(f"expected two sets of histograms of one shape, found {tuple(x.shape)} and {tuple(y.shape)}")
     used = ((first != 0).any(0) | (second != 0).any(0).to(first.device)).nonzero()[:, 0]
+    p, q = (_Blocks(rows, used, block) for rows in (first, second))
     scale = -0.5 / width**2
     # k - 1 keeps the digits that k loses where all histograms are close; the ones cancel in the sum of the means
-    within = _mean_kernel(first, first, used, scale, block) + _mean_kernel(second, second, used, scale, block)
-    return within - 2 * _mean_kernel(first, second, used, scale, block)
+    return _mean_kernel(p, p, scale) + _mean_kernel(q, q, scale) - 2 * _mean_kernel(p, q, scale)
 
 
 def _rows(values: Array) -> Tensor:
@@ -180,27 +179,36 @@ def _rows(values: Array) -> Tensor:
     return tensor.flatten(1)
 
 
-def _normalised(rows: Tensor, used: Tensor, block: int) -> Iterator[Tensor]:
-    """(block, D') float32 rows that sum to 1, of the columns `used` by any row."""
-    for part in rows.split(block):
-        total = part.sum(1, keepdim=True, dtype=torch.float64)
-        if not (total > 0).all() or not torch.isfinite(total).all():
+class _Blocks:
+    """Histograms (N, D) of which `block` at a time become float32 rows of sum 1, with the columns `used` only."""
+
+    def __init__(self, rows: Tensor, used: Tensor, block: int):
+        self.rows, self.used, self.block = rows, used.to(rows.device), block
+        self.total = rows.sum(1, keepdim=True, dtype=torch.float64)
+        if not (self.total > 0).all() or not torch.isfinite(self.total).all():
             raise ValueError("expected counts in every histogram, found one without")
-        yield part[:, used.to(part.device)].div(total).float()
+
+    def __len__(self) -> int:
+        return -(-len(self.rows) // self.block)
+
+    def __getitem__(self, index: int) -> Tensor:
+        part = slice(index * self.block, (index + 1) * self.block)
+        return self.rows[part].index_select(1, self.used).float() / self.total[part].float()
 
 
-def _mean_kernel(x: Tensor, y: Tensor, used: Tensor, scale: float, block: int) -> float:
+def _mean_kernel(x: _Blocks, y: _Blocks, scale: float) -> float:
     """Mean of exp(scale |p - q|^2) - 1 over all pairs; of one set with itself, over its upper triangle twice."""
     total, same = 0.0, x is y
-    for i, p in enumerate(_normalised(x, used, block)):
-        for j, q in enumerate(_normalised(y[i * block :] if same else y, used, block)):
-            q = q.to(p)
+    for i in range(len(x)):
+        p = x[i]
+        for j in range(i if same else 0, len(y)):
+            q = p if same and i == j else y[j].to(p)
             squared = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * (p @ q.T)
-            if same and j == 0:
+            if q is p:
                 squared.fill_diagonal_(0)
             part = float(torch.expm1(scale * squared.clamp(min=0)).sum(dtype=torch.float64))
-            total += 2 * part if same and j else part
-    return total / (len(x) * len(y))
+            total += part * (2 if same and q is not p else 1)
+    return total / (len(x.rows) * len(y.rows))
 
 
 def jensen_shannon_distance(p: Array, q: Array) -> float:
@@ -211,8 +219,8 @@ def jensen_shannon_distance(p: Array, q: Array) -> float:
     """
     counts = [_rows(values[None]).double()[0].cpu() for values in (p, q)]
     if p.shape != q.shape or any(not (c.sum() > 0) or c.min() < 0 for c in counts):
-        totals: Sequence[float] = [float(c.sum()) for c in counts]
-        raise ValueError(f"expected counts of one shape, found {tuple(p.shape)}, {tuple(q.shape)} with sums {totals}")
+        found = [(tuple(v.shape), float(c.sum())) for v, c in zip((p, q), counts, strict=True)]
+        raise ValueError(f"expected counts of one shape, found shapes and sums {found}")
     left, right = (c / c.sum() for c in counts)
     middle = (left + right) / 2
     divergence = sum(torch.special.xlogy(c, c / middle).nan_to_num(0).sum() for c in (left, right)) / 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
@@ -133,12 +132,13 @@ def confusion_matrix(truth: np.ndarray | Tensor, predicted: np.ndarray | Tensor,
 
     Labels of one shape, 0 to classes - 1. Raises ValueError for other shapes or labels.
     """
-    rows, columns = (torch.as_tensor(np.asarray(v).astype(np.int64)).flatten() for v in (truth, predicted))
-    both = torch.cat([rows, columns])
-    if len(rows) != len(columns) or not len(rows) or both.min() < 0 or both.max() >= classes:
+    rows, columns = (v.cpu().numpy() if isinstance(v, Tensor) else np.asarray(v) for v in (truth, predicted))
+    both = np.concatenate([rows.ravel(), columns.ravel()]).astype(np.int64)
+    if rows.shape != columns.shape or not rows.size or both.min() < 0 or both.max() >= classes:
         raise ValueError(f"expected two images of one shape with labels 0-{classes - 1}, "
-                         f"found {tuple(truth.shape)} and {tuple(predicted.shape)}")  # fmt: skip
-    return torch.bincount(rows * classes + columns, minlength=classes**2).view(classes, classes).numpy()
+                         f"found {rows.shape} and {columns.shape}")  # fmt: skip
+    pairs = both[: rows.size] * classes + both[rows.size :]
+    return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
 
 
 def class_iou(confusion: np.ndarray, without: tuple[int, ...] = ()) -> np.ndarray:

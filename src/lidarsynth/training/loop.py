@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.experiment import Experiment, Training
+from lidarsynth.models.conditional import ConditionalUNet
 from lidarsynth.training.examples import Examples, Images, Streets, load_batches
 from lidarsynth.training.machine import accelerator_of, fixed_randomness, workers_of
 from lidarsynth.training.options import Options
@@ -88,10 +89,10 @@ def ema_due(training: Training, step: int) -> bool:
 def ema_decay(training: Training, step: int) -> float:
     """Share of the old average that stays after step `step`, counted from 1 (R2DM, i.e. ema-pytorch).
 
-    0 (copy) up to the first update behind `ema_start`, then min(ema_decay, 1 - (1 + k)^(-2/3)) with k steps since.
+    0 (copy) until `ema_start`, then min(ema_decay, 1 - (1 + k)^(-2/3)) with k steps since.
     """
     k = step - training.ema_start - 1
-    return 0.0 if k <= training.ema_every else min(training.ema_decay, 1 - (1 + k) ** (-2 / 3))
+    return 0.0 if k <= 0 else min(training.ema_decay, 1 - (1 + k) ** (-2 / 3))
 
 
 @torch.no_grad()
@@ -125,7 +126,10 @@ def train(
     batches = load_batches(examples, run.step, parts, workers, pinned)
     run.ema.to(accelerator.device)
     run.network.train()
-    objective, optimizer = accelerator.prepare(Objective(experiment, run.network, options.compile), run.optimizer)
+    if options.compile:
+        # the U-Net only: interpolation of the known pixels has loops that depend on the data
+        (run.network.unet if isinstance(run.network, ConditionalUNet) else run.network).compile()
+    objective, optimizer = accelerator.prepare(Objective(experiment, run.network), run.optimizer)
     while run.step < training.steps:
         began = time.perf_counter()
         with _dropout(experiment, run.step, accelerator.process_index):

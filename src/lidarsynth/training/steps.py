@@ -37,12 +37,11 @@ class Objective(nn.Module):
     (distributed, autocast) holds both calls of the network; noising stays in float32.
     """
 
-    def __init__(self, experiment: Experiment, network: nn.Module, compiled: bool = False):
+    def __init__(self, experiment: Experiment, network: nn.Module):
         super().__init__()
         self.experiment = experiment
         self.network = network
-        called = torch.compile(network) if compiled else network
-        self.denoiser = build_denoiser(experiment, called)  # type: ignore[arg-type]
+        self.denoiser = build_denoiser(experiment, network)
 
     def forward(self, batch: Batch) -> Tensor:
         losses, n = [], batch.generation

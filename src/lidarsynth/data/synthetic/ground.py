@@ -135,19 +135,16 @@ class Ground:
             line |= (np.abs(d - left + 0.25) < width) | (np.abs(d + right - 0.25) < width)
         elif max(road.parking) > 0:
             line |= (np.abs(d - left) < 0.05) | (np.abs(d + right) < 0.05)
-        if line.any():
-            for other in self.roads:  # no lines across a crossing
-                if other is not road:
-                    line &= True if abs(other.half) == 0 else ~self._crosses(other, road, s, d)
-            material[line] = NUMBER["marking"]
+        painted = np.flatnonzero(line)
+        for other in self.roads:  # no lines across a crossing
+            if other is not road and len(painted):
+                x, y, _ = road.at(s[painted], d[painted])
+                painted = painted[np.abs(other.coordinates(x, y)[1]) >= other.half + 1.0]
+        material[painted] = NUMBER["marking"]
         if road.rails:
             for centre in (-1.6, 1.6):
                 rail = np.abs(np.abs(d - np.float32(centre)) - 0.72) < 0.06
                 material[rail] = NUMBER["rail"]
-
-    def _crosses(self, other: Road, road: Road, s: np.ndarray, d: np.ndarray) -> np.ndarray:
-        x, y, _ = road.at(s, np.where(np.isfinite(d), d, 0))
-        return np.abs(other.coordinates(x, y)[1]) < other.half + 1.0
 
 
 def ground_mesh(ground: Ground, reach: tuple[float, float], cell: float) -> np.ndarray:

@@ -36,7 +36,7 @@ MATERIALS: dict[str, Material] = {
     "door":     Material(0.200, 0.110, 0.050, 0.02),
     "wall":     Material(0.310, 0.090, 0.070, 0.02),
     "fence":    Material(0.180, 0.100, 0.080, 0.02),
-    "leaves":   Material(0.290, 0.060, 0.090, 0.00),
+    "leaves":   Material(0.290, 0.060, 0.110, 0.00),
     "bark":     Material(0.200, 0.060, 0.080, 0.02),
     "pole":     Material(0.190, 0.130, 0.100, 0.02),
     "sign":     Material(1.050, 0.150, 0.050, 0.00),

@@ -60,7 +60,7 @@ DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: 
 VANISH = -0.14  # signal at which half of the returns vanish
 VANISH_WIDTH = 0.014
 NOISE = (0.0012, 0.004, 0.014)  # metres: standard deviation per metre, least, most
-ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.05, "stone": 0.02, "bark": 0.02}  # metres along the beam
+ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.08, "stone": 0.02, "bark": 0.02}  # metres along the beam
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,241 @@
+"""The training step: R2DM's schedules, the order of the data, the randomness of a sample, and the loss."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lidarsynth.build import build_denoiser, build_network
+from lidarsynth.data.frames import Name
+from lidarsynth.experiment import Experiment, Training, with_fields
+from lidarsynth.presets import preset
+from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
+from lidarsynth.training.loop import ema_decay, ema_due, learning_rate, start, train, update_ema
+from lidarsynth.training.options import Options
+from lidarsynth.training.steps import Batch, Objective, augment, draw, random_known
+
+TINY = preset("tiny")
+
+
+class Noise:
+    """Images of a seed, without a cache; image `broken` is NaN."""
+
+    def __init__(self, length: int = 10, broken: int | None = None):
+        self.length = length
+        self.broken = broken
+        self.source = {"name": "noise"}
+
+    def __len__(self) -> int:
+        return self.length
+
+    def name(self, i: int) -> Name:
+        return Name("noise", "", str(i))
+
+    def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
+        images = [torch.rand(2, 16, 64, generator=torch.Generator().manual_seed(i)) * 2 - 1 for i in indices]
+        return torch.stack([x * math.nan if i == self.broken else x for i, x in zip(indices, images, strict=True)])
+
+
+@pytest.fixture
+def schedules(shared: Path) -> dict:
+    return json.loads((shared / "fixtures" / "diffusion" / "training_schedules.json").read_text())
+
+
+def network(experiment: Experiment = TINY, seed: int = 0) -> nn.Module:
+    """A network whose last layer is not zero, so that its output depends on all of it."""
+    torch.manual_seed(seed)
+    net = build_network(experiment)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.add_(torch.randn_like(parameter) * 0.02)
+    return net
+
+
+def test_learning_rate_is_r2dm_s(schedules: dict):
+    expected = schedules["lr"]["lr_at_scheduler_step"]
+    assert len(expected) > 10
+    for step, rate in expected.items():
+        assert learning_rate(Training(), int(step)) == pytest.approx(rate, rel=1e-9, abs=1e-18)
+
+
+def test_average_follows_ema_pytorch(schedules: dict):
+    oracle = schedules["ema"]
+    training = Training(
+        ema_decay=oracle["beta"], ema_every=oracle["update_every"], ema_start=oracle["update_after_step"]
+    )
+    rows = {row[0]: row for row in oracle["rows"]}
+    average, weight = nn.Linear(1, 1, bias=False), nn.Linear(1, 1, bias=False)
+    for k in range(1, 1001):
+        nn.init.constant_(weight.weight, math.sin(k / 37))
+        if ema_due(training, k):
+            update_ema(average, weight, ema_decay(training, k))
+        if k in rows:
+            assert float(average.weight.detach()) == pytest.approx(rows[k][2], abs=2e-6), k
+    assert len(rows) > 50
+
+
+def test_average_includes_floating_buffers_and_copies_counters():
+    ours, theirs = nn.BatchNorm1d(2), nn.BatchNorm1d(2)
+    theirs.running_mean, theirs.num_batches_tracked = torch.ones(2), torch.tensor(7)
+    update_ema(ours, theirs, 0.75)
+    torch.testing.assert_close(ours.running_mean, torch.full((2,), 0.25))
+    assert int(ours.num_batches_tracked) == 7
+
+
+def test_every_epoch_visits_every_image_once():
+    training, images = Training(batch_size=4, seed=3), Noise(10)
+    seen = [i for step in range(10) for i in batch_indices(training, step, images)]  # type: ignore[arg-type]
+    epochs = [seen[first : first + 10] for first in range(0, 40, 10)]
+    assert all(sorted(epoch) == list(range(10)) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+
+
+def test_streets_never_repeat_and_a_step_mixes_worlds():
+    pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+    from lidarsynth.data.synthetic.world import POSES
+
+    streets = Streets(0, sensor=None)  # type: ignore[arg-type]
+    steps = [streets.indices(step, 4) for step in range(3 * POSES)]
+    assert len({i for step in steps for i in step}) == 4 * 3 * POSES
+    assert all(len({i // POSES for i in step}) == 4 for step in steps)
+
+
+def test_a_sample_s_randomness_depends_on_seed_step_and_position_only():
+    x_0 = Noise().x_0([0, 1, 2, 3])
+    whole = draw(TINY, x_0, step=5, positions=[0, 1, 2, 3])
+    part = draw(TINY, x_0[1::2], step=5, positions=[1, 3])
+    for name in ("x_0", "t", "eps", "known"):
+        torch.testing.assert_close(getattr(part, name), getattr(whole, name)[1::2], rtol=0, atol=0)
+    assert (whole.generation, part.generation) == (2, 1)
+    others = (draw(TINY, x_0, 6, [0, 1, 2, 3]), draw(with_fields(TINY, {"training.seed": 1}), x_0, 5, [0, 1, 2, 3]))
+    for other in others:
+        assert not torch.equal(other.eps, whole.eps)
+    assert len({float(x[0, 0, 0]) for x in whole.eps}) == 4
+
+
+def test_times_and_noise_have_the_right_distribution():
+    experiment = with_fields(TINY, {"training.generation_share": 0.5, "training.batch_size": 2})
+    x_0 = torch.zeros(2, 2, 4, 8)
+    batches = [draw(experiment, x_0, step, [0, 1]) for step in range(800)]
+    t = torch.stack([b.t for b in batches])
+    assert float(t[:, 0].mean()) == pytest.approx(0.5, abs=0.04)
+    assert float(t[:, 0].std()) == pytest.approx(1 / math.sqrt(12), abs=0.02)
+    assert float((t[:, 1] == 1).float().mean()) == pytest.approx(0.5, abs=0.06)  # where completion begins
+    eps = torch.stack([b.eps for b in batches])
+    assert float(eps.mean()) == pytest.approx(0, abs=0.01) and float(eps.std()) == pytest.approx(1, abs=0.01)
+
+
+def test_augmentation_turns_and_mirrors_whole_columns():
+    x_0 = torch.arange(2 * 3 * 8.0).view(2, 3, 8)
+    rng = torch.Generator().manual_seed(0)
+    turns = range(8)
+    seen = set()
+    for _ in range(200):
+        result = augment(x_0, rng, roll=True, mirror=True)
+        matches = {(s, f) for s in turns for f in (False, True) if torch.equal(_turned(x_0, s, f), result)}
+        assert len(matches) == 1
+        seen |= matches
+    assert len(seen) == 16
+    torch.testing.assert_close(augment(x_0, rng, roll=False, mirror=False), x_0)
+
+
+def _turned(x: Tensor, shift: int, flip: bool) -> Tensor:
+    x = torch.roll(x, shift, dims=-1)
+    return x.flip(-1) if flip else x
+
+
+def test_random_patterns_leave_something_known_and_something_to_do():
+    x_0 = Noise().x_0([0])[0]
+    x_0[:, :, :5] = -1  # nothing measured
+    rng = torch.Generator().manual_seed(0)
+    known = torch.stack([random_known(x_0, rng) for _ in range(300)]).float()
+    share = known.flatten(1).mean(1)
+    assert 0.2 < float(share.mean()) < 0.6 and bool((share < 1).all())
+    assert float((known[:, 1].flatten(1).sum(1) == 0).float().mean()) == pytest.approx(0.1, abs=0.06)
+    hidden = (known[..., :5].flatten(1).sum(1) == 0).float().mean()
+    assert 0.4 < float(hidden) < 0.7  # half of the samples hide drop-outs
+
+
+def test_loss_is_the_mean_over_generation_and_completion():
+    objective = Objective(TINY, network())
+    batch = draw(TINY, Noise().x_0([0, 1, 2, 3]), 0, [0, 1, 2, 3])
+    losses = objective(batch)
+    denoiser = build_denoiser(TINY, objective.network)
+    generation = denoiser.loss(batch.x_0[:2], batch.t[:2], batch.eps[:2], loss="l2", gamma=5.0)
+    known = batch.known[2:].float()
+    given = denoiser.given(batch.x_0[2:], known)
+    completion = given.loss(batch.x_0[2:], batch.t[2:], batch.eps[2:], mask=1 - known, loss="l1", gamma=None)
+    torch.testing.assert_close(losses, torch.cat([generation, completion]))
+
+
+def test_r2dm_s_mean_weight_is_that_of_the_global_batch():
+    experiment = with_fields(preset("r2dm-h"), {"model.base_channels": 8, "model.attn_num_heads": 2, "data.width": 64,
+                                                "data.height": 16, "training.batch_size": 4})  # fmt: skip
+    objective = Objective(experiment, network(experiment))
+    x_0 = Noise().x_0([0, 1, 2, 3])
+    whole = objective(draw(experiment, x_0, 0, [0, 1, 2, 3]))
+    halves = [objective(draw(experiment, x_0[i::2], 0, [i, i + 2])) for i in (0, 1)]
+    torch.testing.assert_close(torch.stack(halves, dim=1).flatten(), whole)
+    # what R2DM's program reports on one device: mean(loss) * mean(weight)
+    batch, denoiser = draw(experiment, x_0, 0, [0, 1, 2, 3]), objective.denoiser
+    reference = denoiser.loss(batch.x_0, batch.t, batch.eps, gamma=5.0, mean_weight=True)
+    torch.testing.assert_close(whole.mean(), reference.mean())
+
+
+def curve(passes: int = 1, workers: int = 0, steps: int = 4, **changes) -> list[float]:
+    experiment = with_fields(TINY, {"training.steps": steps, "diffusion.mean_weight": True, **changes})
+    run = start(experiment, network(experiment))
+    options = Options(accumulate=passes, workers=workers)
+    return [p.losses["loss"] for p in train(experiment, run, Noise(), options)]  # type: ignore[arg-type]
+
+
+def test_accumulated_passes_give_the_curve_of_one():
+    torch.testing.assert_close(curve(passes=4), curve(passes=1), rtol=1e-4, atol=0)
+
+
+def test_workers_do_not_change_a_bit():
+    assert curve(workers=2) == curve(workers=0)
+
+
+def test_dropout_is_reproducible_and_leaves_global_randomness_alone():
+    changes = {"model.dropout": 0.3}
+    first = curve(**changes)
+    torch.manual_seed(99)
+    expected = torch.get_rng_state()
+    experiment = with_fields(TINY, {"training.steps": 1, **changes})
+    run = start(experiment, network(experiment))
+    torch.set_rng_state(expected)
+    list(train(experiment, run, Noise()))  # type: ignore[arg-type]
+    assert torch.equal(torch.get_rng_state(), expected)
+    assert curve(**changes) == first != curve()
+
+
+def test_batches_must_share_equally():
+    with pytest.raises(ValueError, match="that 3 processes x passes share equally, found 4"):
+        Examples(TINY, Noise(), 3)  # type: ignore[arg-type]
+
+
+def test_a_loss_that_is_not_finite_stops_with_step_and_scans():
+    experiment = with_fields(TINY, {"training.steps": 10})
+    images = Noise(20, broken=batch_indices(experiment.training, 2, Noise(20))[1])  # type: ignore[arg-type]
+    run = start(experiment, network())
+    steps = train(experiment, run, images)  # type: ignore[arg-type]
+    assert [next(steps).step, next(steps).step] == [1, 2]
+    with pytest.raises(FloatingPointError, match=rf"step 3: expected a finite loss .* noise/{images.broken}\b"):
+        next(steps)
+    assert all(bool(p.isfinite().all()) for p in run.network.parameters()), "the bad step must not reach the weights"
+
+
+def test_training_lowers_the_loss():
+    losses = curve(steps=20, **{"training.seed": 1})
+    assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+
+
+def test_batches_travel_through_the_loader_in_order():
+    experiment = replace(TINY, training=replace(TINY.training, steps=3))
+    batches = list(load_batches(Examples(experiment, Noise(), 2), 1, range(2)))  # type: ignore[arg-type]
+    assert len(batches) == 4 and all(isinstance(b, Batch) and len(b.x_0) == 2 for b in batches)
