@@ -57,7 +57,7 @@ def default() -> Experiment:
     """The shipped model: one small network that generates and completes, on the true beams of the HDL-64E."""
     return Experiment(
         "default",
-        data=Data(sensor="hdl-64e-kitti", projection="auto", roll=True, mirror=True),
+        data=Data(sensor="hdl-64e-kitti", projection="auto"),
         model=Model(
             network="conditional-unet",
             base_channels=32,

@@ -1,0 +1,245 @@
+"""Runs in a folder: exact continuation after kill -9 and SIGTERM, several processes, checkpoints, fine-tuning."""
+
+import csv
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lidarsynth.build import build_network, load
+from lidarsynth.data.dataset import write_cache
+from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.presets import preset
+from lidarsynth.training.checkpoint import checkpoints
+from lidarsynth.training.finetune import transfer
+from lidarsynth.training.options import Options
+from lidarsynth.training.run import resolve, run
+
+SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
+QUIET = Options(sample_every=0, workers=0)
+STEPS = 60  # of the killed run
+
+
+def noise_image(i: int, sensor: Sensor = SENSOR) -> RangeImage:
+    """Random ranges and reflectances, a tenth of the pixels empty."""
+    rng, shape = np.random.default_rng(i), (sensor.height, sensor.width)
+    mask = rng.random(shape) < 0.9
+    distance = rng.uniform(2, 60, shape).astype(np.float32)
+    return RangeImage(distance * mask, (rng.random(shape) * mask).astype(np.float32), mask, sensor)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("training") / "cache"
+    list(write_cache(folder, noise_image, 24, SENSOR, {"name": "noise"}))
+    return folder
+
+
+def tiny(steps: int, **changes) -> Experiment:
+    return with_fields(preset("tiny"), {"training.steps": steps, **changes})
+
+
+def table(out: Path) -> list[dict[str, str]]:
+    with (out / "losses.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def command(cache: Path, out: Path, *more: str) -> list[str]:
+    words = ["train", "tiny", "--data", str(cache), "--out", str(out), "--sample-every", "0", "--threads", "1"]
+    return [sys.executable, "-m", "lidarsynth", *words, *more]
+
+
+def started(cache: Path, out: Path, rows: int, *more: str) -> subprocess.Popen:
+    """A training process that has done at least `rows` steps."""
+    process = subprocess.Popen(command(cache, out, *more), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 120
+    while not ((out / "losses.csv").exists() and len(table(out)) >= rows):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    return process
+
+
+@pytest.mark.timeout(300)
+def test_killed_and_stopped_a_run_continues_bit_by_bit(cache: Path, tmp_path: Path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    list(run(tiny(STEPS), cache, whole, options=QUIET))
+    more = ("--set", f"training.steps={STEPS}", "--save-every", "5")
+    killed = started(cache, broken, random.randint(6, 20), *more)
+    killed.kill()
+    killed.communicate()
+    (kept, *_), done = reversed(checkpoints(broken)), len(table(broken))
+    assert killed.returncode == -signal.SIGKILL and 5 <= int(kept.name[5:]) <= done < STEPS
+    stopped = started(cache, broken, done + random.randint(1, 12), *more, "--resume")
+    stopped.send_signal(signal.SIGTERM)
+    output, errors = stopped.communicate(timeout=60)
+    assert stopped.returncode == 0, errors
+    assert "stopped after step" in output and f"stopped after step {len(table(broken))};" in output
+    list(run(tiny(STEPS), cache, broken, options=QUIET))
+    assert (broken / "losses.csv").read_bytes() == (whole / "losses.csv").read_bytes()
+    assert (broken / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+    assert not list(broken.rglob(".saving-*"))
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.timeout(300)
+def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
+    experiment = tiny(8, **{"diffusion.mean_weight": True})
+    list(run(experiment, cache, tmp_path / "one", options=QUIET))
+    more = ("--set", "training.steps=8", "diffusion.mean_weight=true", "--workers", "0")
+    shared = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
+    processes = [
+        subprocess.Popen(command(cache, tmp_path / "two", *more), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                         text=True, env={**shared, "RANK": rank, "LOCAL_RANK": rank})
+        for rank in "01"
+    ]  # fmt: skip
+    ends = [process.communicate(timeout=200) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], ends
+    assert "wrote" in ends[0][0] and not ends[1][0], "only the first process speaks"
+    for column in ("loss", "grad_norm"):
+        one, two = ([float(row[column]) for row in table(tmp_path / name)] for name in ("one", "two"))
+        np.testing.assert_allclose(two, one, rtol=1e-4)
+    assert load(tmp_path / "two")[0].card.history == ("8 steps of 4 on 2 x cpu",)
+    ours, theirs = (load_file(tmp_path / name / "model.safetensors") for name in ("one", "two"))
+    torch.testing.assert_close(theirs, ours, rtol=1e-3, atol=1e-4)
+
+
+def test_a_run_s_folder_loads_and_keeps_the_last_checkpoints(cache: Path, tmp_path: Path):
+    options = Options(save_every=2, keep=2, log_every=2, sample_every=4, workers=0)
+    steps = [p.step for p in run(tiny(8), cache, tmp_path, options=options)]
+    assert steps == list(range(9))
+    assert [folder.name for folder in checkpoints(tmp_path)] == ["step-00000006", "step-00000008"]
+    assert (tmp_path / "checkpoints" / "latest").resolve() == checkpoints(tmp_path)[-1].resolve()
+    for folder in (tmp_path, tmp_path / "checkpoints" / "latest"):
+        experiment, network = load(folder)
+        assert experiment.training.steps == 8 and experiment.card.history == ("8 steps of 4 on 1 x cpu",)
+        torch.testing.assert_close(network.state_dict(), load(tmp_path)[1].state_dict())
+    assert len(list((tmp_path / "pictures").glob("sample-00000004-*.png"))) == 2
+    assert list((tmp_path / "tensorboard").iterdir())
+    assert list(run(tiny(8), cache, tmp_path, options=options))[0].step == 8, "a finished run has nothing to do"
+
+
+def test_tensorboard_holds_losses_speed_validation_and_pictures(cache: Path, tmp_path: Path):
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    options = Options(log_every=2, sample_every=4, workers=0)
+    list(run(tiny(4), cache, tmp_path, options=options, validation=cache))
+    board = events.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    curves = set(board.Tags()["scalars"])
+    assert {"train/loss", "train/grad_norm", "speed/samples_per_second", "speed/waiting_share"} <= curves
+    assert {"validation/t_0.1", "validation/t_0.9", "validation/completion"} <= curves
+    assert set(board.Tags()["images"]) == {"sample/0", "sample/1"}
+    rows = [float(row["loss"]) for row in table(tmp_path)]
+    assert [e.step for e in board.Scalars("train/loss")] == [2, 4]
+    assert board.Scalars("train/loss")[1].value == pytest.approx((rows[2] + rows[3]) / 2)
+
+
+def test_a_run_refuses_what_does_not_fit(cache: Path, tmp_path: Path):
+    with pytest.raises(ValueError, match="expected a run to resume, found no checkpoint"):
+        list(run(tiny(2), cache, tmp_path, options=QUIET, resume=True))
+    with pytest.raises(ValueError, match="expected images of 32 x 64, found 16 x 64"):
+        list(run(tiny(2, **{"data.height": 32}), cache, tmp_path, options=QUIET))
+    list(run(tiny(2), cache, tmp_path, options=QUIET))
+    with pytest.raises(ValueError, match=r"with training.steps = 2, found 3"):
+        list(run(tiny(3), cache, tmp_path, options=QUIET))
+    (checkpoints(tmp_path)[-1] / "state.pt").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"state.pt: expected a training state"):
+        list(run(tiny(2), cache, tmp_path, options=QUIET))
+
+
+def test_a_diverging_run_names_its_last_checkpoint(cache: Path, tmp_path: Path):
+    experiment = tiny(60, **{"training.learning_rate": 1e30, "training.warmup": 3})
+    with pytest.raises(
+        FloatingPointError, match=r"step \d+: .* scans noise/\d+.*; last good checkpoint: .*step-00000001"
+    ):
+        list(run(experiment, cache, tmp_path, options=Options(sample_every=0, save_every=1, workers=0)))
+    for folder in checkpoints(tmp_path):
+        assert all(bool(p.isfinite().all()) for p in load(folder)[1].parameters())
+
+
+def test_resolve_takes_the_sensor_of_the_images(cache: Path, tmp_path: Path):
+    assert resolve("tiny", data=cache) == preset("tiny")
+    own = Sensor("mine", tuple(np.linspace(10, -20, 32)), width=128, max_range=60.0)
+    list(write_cache(tmp_path / "own", lambda i: noise_image(i, own), 4, own, {"name": "noise"}))
+    data = resolve("tiny", ("training.steps=5",), data=tmp_path / "own").data
+    assert (data.height, data.width) == (32, 128) and isinstance(data.sensor, dict) and data.sensor["name"] == "mine"
+    with pytest.raises(ValueError, match="expected images of 16 x 64, found 32 x 128"):
+        resolve("tiny", ("data.codec=log",), data=tmp_path / "own")
+    with pytest.raises(ValueError, match="expected group.field=value"):
+        resolve("tiny", ("steps",))
+    with pytest.raises(ValueError, match="no_such"):
+        resolve("tiny", ("training.no_such=1",))
+
+
+def filled(experiment: Experiment, seed: int = 0):
+    torch.manual_seed(seed)
+    network = build_network(experiment)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return network
+
+
+def output(network, shape: tuple[int, int]) -> torch.Tensor:
+    x_t = torch.randn(1, 2, *shape, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        return network(x_t, torch.tensor([0.3]))
+
+
+def test_fine_tuning_may_add_and_drop_the_known_pixels():
+    told = preset("tiny")
+    untold = with_fields(told, {"model.network": "efficient-unet"})
+    for source, target in ((told, told), (told, untold), (untold, told), (untold, untold)):
+        trained, network = filled(source), filled(target, seed=1)
+        transfer(network, target, trained, source, "weights")
+        torch.testing.assert_close(output(network, (16, 64)), output(trained, (16, 64)))
+
+
+def test_fine_tuning_may_change_sensor_and_resolution():
+    source = preset("tiny")
+    target = with_fields(source, {"data.sensor": "hdl-32e", "data.height": 32, "data.width": 128})
+    trained, network = filled(source), filled(target, seed=1)
+    angles = dict(network.named_buffers())["unet.coords"].clone()
+    transfer(network, target, trained, source, "weights")
+    torch.testing.assert_close(dict(network.named_buffers())["unet.coords"], angles)
+    # two new frequencies of the position encoding: the old ones keep their weights, the new ones start at zero
+    old, new = trained.state_dict()["unet.in_conv.weight"], network.state_dict()["unet.in_conv.weight"]
+    assert (old.shape[1], new.shape[1]) == (8 + 2 * (4 + 6), 8 + 2 * (5 + 7))
+    torch.testing.assert_close(new[:, :8], old[:, :8])
+    sines, cosines = [8, 9, 10, 11, 13, 14, 15, 16, 17, 18], [20, 21, 22, 23, 25, 26, 27, 28, 29, 30]
+    torch.testing.assert_close(new[:, sines + cosines], old[:, 8:])
+    assert not new[:, [12, 19, 24, 31]].any()
+    assert output(network, (32, 128)).isfinite().all()
+
+
+def test_fine_tuning_refuses_other_networks_and_meanings():
+    source = preset("tiny")
+    target = with_fields(source, {"model.base_channels": 16, "diffusion.kind": "eps", "data.codec": "metric"})
+    with pytest.raises(ValueError) as refusal:
+        transfer(build_network(target), target, build_network(source), source, "there.safetensors")
+    assert "--set model.base_channels=8 --set data.codec=log --set diffusion.kind=x_0" in str(refusal.value)
+    assert "found model.base_channels=16, data.codec=metric, diffusion.kind=eps" in str(refusal.value)
+
+
+def test_from_weights_starts_there_and_keeps_their_history(cache: Path, tmp_path: Path):
+    list(run(tiny(3), cache, tmp_path / "first", options=QUIET))
+    experiment = tiny(1, **{"training.warmup": 1})  # one step at rate 0
+    list(run(experiment, cache, tmp_path / "second", str(tmp_path / "first"), options=QUIET))
+    found, network = load(tmp_path / "second")
+    torch.testing.assert_close(network.state_dict(), load(tmp_path / "first")[1].state_dict())
+    assert found.card.history == ("3 steps of 4 on 1 x cpu", "from tiny", "1 steps of 4 on 1 x cpu")
