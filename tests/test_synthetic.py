@@ -162,4 +162,4 @@ def test_a_sensor_with_one_beam():
     assert image.mask.mean() > 0.5
 
 
-GOLDEN = [0.8947, 2.3582, 0.2606]  # filled pixels, mean ln range, mean reflectance
+GOLDEN = [0.8925, 2.3618, 0.2591]  # filled pixels, mean ln range, mean reflectance

@@ -28,7 +28,7 @@ from lidarsynth.training.run import resolve, run
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 QUIET = Options(sample_every=0, workers=0)
-STEPS = 60  # of the killed run
+STEPS = 30  # of the killed run
 
 
 def noise_image(i: int, sensor: Sensor = SENSOR) -> RangeImage:
@@ -75,13 +75,13 @@ def started(cache: Path, out: Path, rows: int, *more: str) -> subprocess.Popen:
 def test_killed_and_stopped_a_run_continues_bit_by_bit(cache: Path, tmp_path: Path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     list(run(tiny(STEPS), cache, whole, options=QUIET))
-    more = ("--set", f"training.steps={STEPS}", "--save-every", "5")
-    killed = started(cache, broken, random.randint(6, 20), *more)
+    more = ("--set", f"training.steps={STEPS}", "--save-every", "4")
+    killed = started(cache, broken, random.randint(5, 9), *more)
     killed.kill()
     killed.communicate()
     (kept, *_), done = reversed(checkpoints(broken)), len(table(broken))
-    assert killed.returncode == -signal.SIGKILL and 5 <= int(kept.name[5:]) <= done < STEPS
-    stopped = started(cache, broken, done + random.randint(1, 12), *more, "--resume")
+    assert killed.returncode == -signal.SIGKILL and 4 <= int(kept.name[5:]) <= done < STEPS
+    stopped = started(cache, broken, done + random.randint(1, 5), *more, "--resume")
     stopped.send_signal(signal.SIGTERM)
     output, errors = stopped.communicate(timeout=60)
     assert stopped.returncode == 0, errors
@@ -132,7 +132,7 @@ def test_a_run_s_folder_loads_and_keeps_the_last_checkpoints(cache: Path, tmp_pa
         torch.testing.assert_close(network.state_dict(), load(tmp_path)[1].state_dict())
     assert len(list((tmp_path / "pictures").glob("sample-00000004-*.png"))) == 2
     assert list((tmp_path / "tensorboard").iterdir())
-    assert list(run(tiny(8), cache, tmp_path, options=options))[0].step == 8, "a finished run has nothing to do"
+    assert [p.step for p in run(tiny(8), cache, tmp_path, options=options)] == [8], "a finished run has nothing to do"
 
 
 def test_tensorboard_holds_losses_speed_validation_and_pictures(cache: Path, tmp_path: Path):
@@ -165,7 +165,7 @@ def test_a_run_refuses_what_does_not_fit(cache: Path, tmp_path: Path):
 def test_a_diverging_run_names_its_last_checkpoint(cache: Path, tmp_path: Path):
     experiment = tiny(60, **{"training.learning_rate": 1e30, "training.warmup": 3})
     with pytest.raises(
-        FloatingPointError, match=r"step \d+: .* scans noise/\d+.*; last good checkpoint: .*step-00000001"
+        FloatingPointError, match=r"step 3: .* scans noise/\d+, .*; last good checkpoint: .*step-00000002$"
     ):
         list(run(experiment, cache, tmp_path, options=Options(sample_every=0, save_every=1, workers=0)))
     for folder in checkpoints(tmp_path):
@@ -180,7 +180,7 @@ def test_resolve_takes_the_sensor_of_the_images(cache: Path, tmp_path: Path):
     assert (data.height, data.width) == (32, 128) and isinstance(data.sensor, dict) and data.sensor["name"] == "mine"
     with pytest.raises(ValueError, match="expected images of 16 x 64, found 32 x 128"):
         resolve("tiny", ("data.codec=log",), data=tmp_path / "own")
-    with pytest.raises(ValueError, match="expected group.field=value"):
+    with pytest.raises(ValueError, match=r"expected group\.field=value"):
         resolve("tiny", ("steps",))
     with pytest.raises(ValueError, match="no_such"):
         resolve("tiny", ("training.no_such=1",))

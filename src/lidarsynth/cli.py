@@ -192,11 +192,16 @@ def demo(
     out: Annotated[Path, arg(help="folder to write to.")] = Path("demo"), model: Source = "default", seed: Seed = 0
 ) -> None:
     """Everything once, offline, on a shipped synthetic scan; ends with the list of what it made."""
+    import numpy as np
+
     street = Path(__file__).parent / "shipped" / "street.npz"
     project(street, out / "street.npz")
+    sparse = _read(street, "auto")
+    _write(out / "sixteen_beams.pcd", sparse[np.asarray(sparse.ring) % 4 == 0])
     generate(4, out / "generated", model, seed=seed)
     complete([street], out / "beams.ply", "beams:4", model, seed=seed)
     complete([street], out / "sector.ply", "sector:90", model, seed=seed)
+    upsample(out / "sixteen_beams.pcd", out / "dense.ply", None, model, seed=seed)
     info(model)
     made = sorted(path for path in out.rglob("*") if path.is_file())
     say("\n".join([f"\n{len(made)} files in {out}/, look at the pictures:", *(f"  {path}" for path in made)]))

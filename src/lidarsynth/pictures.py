@@ -17,8 +17,16 @@ EXTENT = 32.0  # metres from the car to the left and right border of a view from
 
 def portrait(image: RangeImage) -> np.ndarray:
     """(H', W', 3) uint8: range and reflectance strips above a perspective view of the points."""
-    rows = [[("range", range_strip(image))], [("reflectance", reflectance_strip(image))]]
-    return panel([*rows, [("points", perspective(image, size=(1024, 576)))]])
+    distance, reflectance = strips(image, image.sensor.max_range)
+    view = perspective(image, size=(STRIP, STRIP * 9 // 16))
+    return panel([[("range", distance)], [("reflectance", reflectance)], [("points", view)]])
+
+
+def strips(image: RangeImage, max_range: float) -> tuple[np.ndarray, np.ndarray]:
+    """Range and reflectance, (H', W', 3) uint8 of about 192 x 1024 for any size of image, colours to max_range m."""
+    rows, columns = max(round(192 / image.shape[0]), 1), max(round(STRIP / image.shape[1]), 1)
+    distance, reflectance = range_strip(image, max_range, rows), reflectance_strip(image, rows)
+    return np.repeat(distance, columns, axis=1), np.repeat(reflectance, columns, axis=1)
 
 
 def before_and_after(images: Mapping[str, RangeImage], points: Mapping[str, Scan]) -> np.ndarray:
@@ -26,25 +34,15 @@ def before_and_after(images: Mapping[str, RangeImage], points: Mapping[str, Scan
 
     points  what to draw in 3-D instead of an image's own pixels, by caption
     """
-    first = next(iter(images.values()))
-    end, rows, columns = (
-        first.sensor.max_range,
-        max(round(192 / first.shape[0]), 1),
-        max(round(STRIP / first.shape[1]), 1),
-    )
-    strips: list[list[Picture]] = []
-    for name, image in images.items():
-        pictures = range_strip(image, end, rows), reflectance_strip(image, rows)
-        wide = [np.repeat(picture, columns, axis=1) for picture in pictures]
-        strips.append([(f"{name}: range", wide[0]), (f"{name}: reflectance", wide[1])])
-    bars = [("", colour_bar("range", STRIP, end)), ("", colour_bar("reflectance", STRIP))]
+    end = next(iter(images.values())).sensor.max_range
+    both = {name: strips(image, end) for name, image in images.items()}
+    rows: list[list[Picture]] = [[(f"{n}: range", d), (f"{n}: reflectance", r)] for n, (d, r) in both.items()]
+    rows.append([("", colour_bar("range", STRIP, end)), ("", colour_bar("reflectance", STRIP))])
     width = (2 * STRIP + GAP - GAP * (len(images) - 1)) // len(images)
     drawn = {name: points.get(name, image) for name, image in images.items()}
-    views = [
-        (f"{name}: {_count(p)} points", perspective(p, size=(width, width * 9 // 16))) for name, p in drawn.items()
-    ]
-    above = [(f"{name}, from above", _ahead(p, width)) for name, p in drawn.items()]
-    return panel([*strips, bars, views, above], width=2 * STRIP + GAP)
+    rows.append([(f"{n}: {_count(p)} points", perspective(p, size=(width, width * 9 // 16))) for n, p in drawn.items()])
+    rows.append([(f"{n}, from above", _ahead(p, width)) for n, p in drawn.items()])
+    return panel(rows, width=2 * STRIP + GAP)
 
 
 def _ahead(points: Scan | RangeImage, width: int) -> np.ndarray:

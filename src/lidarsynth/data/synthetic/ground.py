@@ -131,7 +131,7 @@ class Ground:
         if road.lanes != "none":
             line |= np.abs(d - middle) < width
             if road.lanes == "dashed":
-                line &= np.mod(s + self.phase, 9.0) < 4.0
+                line &= (s + self.phase) / 9 - np.floor((s + self.phase) / 9) < 0.44
             line |= (np.abs(d - left + 0.25) < width) | (np.abs(d + right - 0.25) < width)
         elif max(road.parking) > 0:
             line |= (np.abs(d - left) < 0.05) | (np.abs(d + right) < 0.05)

@@ -172,7 +172,7 @@ def bush(rng: np.random.Generator, height: float, spread: float, count: int, lea
 def hedge(rng: np.random.Generator, height: float, depth: float) -> Mesh:
     """Two metres of cut hedge along x: a core and loose leaves on its faces."""
     core = box((-1.02, 1.02), (-depth / 2 + 0.12, depth / 2 - 0.12), (0, height - 0.12), "leaves", "vegetation")
-    return join(core, shapes.hedge_leaves(rng, 80, (1.05, depth / 2, height / 2), 0.11))
+    return join(core, shapes.hedge_leaves(rng, 64, (1.05, depth / 2, height / 2), 0.12))
 
 
 def wild_hedge(rng: np.random.Generator, height: float, depth: float) -> Mesh:
@@ -185,7 +185,7 @@ def wild_hedge(rng: np.random.Generator, height: float, depth: float) -> Mesh:
         for low in (0, 1):
             core = frustum((width[low], width[low + 1]), (z[low], z[low + 1]), 5, "leaves", "vegetation")
             parts.append(moved(core, x, rng.normal(0, 0.1 * depth)))
-        parts.append(leaves(rng, 26, (x, 0, middle), (0.6, depth * 0.6, middle * 1.05), 0.14, 0.75))
+        parts.append(leaves(rng, 22, (x, 0, middle), (0.6, depth * 0.6, middle * 1.05), 0.15, 0.75))
     return join(*parts)
 
 
@@ -253,12 +253,12 @@ def library() -> dict[str, list[Mesh]]:
         "bicyclist": [rider(rng, "bicyclist", False) for _ in range(3)],
         "motorcyclist": [rider(rng, "motorcyclist", True) for _ in range(2)],
         **{name: [two_wheeler(name, heavy)] for name, heavy in two.items()},
-        "tree": [tree(rng, rng.uniform(6, 10), rng.uniform(1.6, 3.2), rng.uniform(1.4, 2.6), 220) for _ in range(10)],
+        "tree": [tree(rng, rng.uniform(6, 10), rng.uniform(1.6, 3.2), rng.uniform(1.4, 2.6), 170) for _ in range(10)],
         "young tree": [
-            tree(rng, rng.uniform(3, 5), rng.uniform(0.9, 1.8), rng.uniform(0.8, 1.4), 200) for _ in range(6)
+            tree(rng, rng.uniform(3, 5), rng.uniform(0.9, 1.8), rng.uniform(0.8, 1.4), 150) for _ in range(6)
         ],
-        "bush": [bush(rng, rng.uniform(0.8, 2.2), rng.uniform(0.6, 1.4), 220, 0.12) for _ in range(8)],
-        "thicket": [bush(rng, rng.uniform(3, 6), rng.uniform(2, 3.5), 420, 0.28) for _ in range(6)],
+        "bush": [bush(rng, rng.uniform(0.8, 2.2), rng.uniform(0.6, 1.4), 180, 0.13) for _ in range(8)],
+        "thicket": [bush(rng, rng.uniform(3, 6), rng.uniform(2, 3.5), 320, 0.32) for _ in range(6)],
         "hedge": [hedge(rng, h, d) for h, d in ((0.9, 0.6), (1.4, 0.8), (1.9, 0.9), (2.3, 1.1))],
         "wild hedge": [wild_hedge(rng, h, d) for h, d in ((1.6, 1.2), (2.2, 1.6), (2.8, 1.8), (3.4, 2.2), (4.2, 2.6))],
         "fence": [fence(1.1, 14, 0.05), fence(1.3, 9, 0.11), fence(1.8, 18, 0.035), fence(0.8, 0, 0, posts_only=True)],

@@ -93,8 +93,9 @@ class SyntheticStreets:
         start[:, 2] = sensor.mount
         if sensor.offsets:
             start[:, 2] += np.asarray(sensor.offsets, np.float32)
-        seen = ~hdl64e.own_car(sensor).reshape(-1)
-        origins = np.repeat(start @ turn.T + place, sensor.width, axis=0)[seen]
+        visible_rays = ~hdl64e.own_car(sensor)
+        seen = visible_rays.reshape(-1)
+        origins = np.repeat(start @ turn.T + place, visible_rays.sum(axis=1), axis=0)
         directions = rays.reshape(-1, 3)[seen] @ turn.T
         found = sense(world, caster, origins, directions, hdl64e.lasers(sensor), rng, sensor.max_range)
         kept = found.distance >= sensor.min_range
@@ -113,8 +114,9 @@ def _directions(sensor: Sensor) -> np.ndarray:
 
 def _jittered(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
     """(H, W, 3) float32 rays: the sensor's, turned by a third of a column at most, each ring with its own phase."""
-    phase = rng.uniform(-0.25, 0.25, (sensor.height, 1)) + rng.uniform(-0.08, 0.08, (sensor.height, sensor.width))
-    angle = (phase * 2 * np.pi / sensor.width).astype(np.float32)
+    phase = rng.random((sensor.height, 1), np.float32) / 2 - 0.25
+    shake = rng.random((sensor.height, sensor.width), np.float32)
+    angle = (phase + 0.16 * shake - 0.08) * np.float32(2 * np.pi / sensor.width)
     rays = _directions(sensor)
     x = rays[..., 0] - angle * rays[..., 1]
     y = rays[..., 1] + angle * rays[..., 0]

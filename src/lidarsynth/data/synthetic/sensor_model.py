@@ -54,6 +54,7 @@ RESPONSE = (
         0.99,
     ),
 )
+REPORTED = np.round(np.interp(np.arange(801) / 1000, *RESPONSE), 2).astype(np.float32)  # by signal in thousandths
 GRAZING = (0.13, 0.17)  # signal lost per natural logarithm of cos(incidence) below the second number
 FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) where positive
 DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
@@ -99,14 +100,15 @@ def sense(
             mine[through] = theirs
     optics = TABLE[material]
     strength = _signal(optics, tint, cosine, distance, lasers)
-    signal = strength - lasers.dip * np.interp(distance, DIP, (0, 1, 1, 0)).astype(np.float32)
+    near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
+    signal = strength - lasers.dip * np.clip(near, 0, 1)
     doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
     gone = (strength + doubt < VANISH) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
     distance = distance + depth / np.maximum(cosine, 0.12) + noise[0] * _spread(material, distance) + lasers.shift
     gone |= ~(distance < max_range)
     # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
     grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
-    reflectance = np.round(np.interp(signal + grain, *RESPONSE).astype(np.float32) * 100) / np.float32(100)
+    reflectance = REPORTED[np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.int32)]
     zero = np.float32(0)
     return Returns(np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
 

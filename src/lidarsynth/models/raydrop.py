@@ -1,0 +1,61 @@
+"""The measurement model of DUSty: each ray returns with a learnt probability (facts/gans.md section 4)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class GeneratedImages:
+    """What a GAN's generator returns; maps are (B,1,H,W), inverse depth in [-1,1] nominally, -1 = no return."""
+
+    image: Tensor  # with ray-drop, where the network has it
+    image_orig: Tensor  # before ray-drop
+    w: Tensor  # styles (B,D), after truncation
+    raydrop_logit: Tensor | None = None  # sigmoid of it = probability that the pixel is kept
+    raydrop_mask: Tensor | None = None  # 1 = kept, 0 = dropped; its gradient is that of the relaxed sample
+
+
+def relaxed_bernoulli(logit: Tensor, uniform: Tensor, temperature: float = 1.0) -> Tensor:
+    """Samples 0 or 1 with P(1) = sigmoid(logit), differentiable by the straight-through Gumbel-sigmoid estimator.
+
+    `uniform` in [0,1) broadcasts against `logit`: one map for a whole batch gives all its images the same noise.
+    DUSty section III-C.
+    """
+    tiny = torch.finfo(torch.float32).eps
+    p = torch.sigmoid(logit).clamp(tiny, 1 - tiny)
+    u = uniform.clamp(tiny, 1 - tiny)
+    soft = torch.sigmoid((u.log() - (1 - u).log() + p.log() - (1 - p).log()) / temperature)
+    hard = (soft > 0.5).to(soft.dtype)
+    return (hard - soft).detach() + soft
+
+
+class RayDrop(nn.Module):
+    """Sets dropped pixels to `raydrop_const`: image and logit (B,1,H,W), uniform noise -> (image, mask)."""
+
+    raydrop_const: Tensor
+
+    def __init__(self, const: float = -1.0, temperature: float = 1.0):
+        super().__init__()
+        self.temperature = temperature
+        self.register_buffer("raydrop_const", torch.tensor(const))
+
+    def forward(self, image: Tensor, logit: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        mask = relaxed_bernoulli(logit, uniform, self.temperature)
+        return torch.lerp(image, self.raydrop_const.to(image.dtype), 1 - mask), mask
+
+
+def measured(model: RayDrop | None, maps: dict[str, Tensor], uniform: Tensor | None, w: Tensor) -> GeneratedImages:
+    """The generator's maps `image` and `raydrop_logit` through the ray-drop model, or untouched where it is None.
+
+    Raises ValueError if the model needs uniform noise and none was given.
+    """
+    image = maps["image"]
+    if model is None:
+        return GeneratedImages(image, image, w)
+    if uniform is None:
+        raise ValueError("uniform must be a tensor that broadcasts to (B, 1, H, W) for a generator with ray-drop, got None")
+    logit = maps["raydrop_logit"]
+    dropped, mask = model(image, logit, uniform)
+    return GeneratedImages(dropped, image, w, logit, mask)

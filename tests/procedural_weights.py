@@ -1,0 +1,58 @@
+"""Weights that are computed instead of stored: SplitMix64 of the key and the index (fixtures/README_baselines.md)."""
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def procedural_uniform(key: str, seed: int, count: int) -> np.ndarray:
+    """`count` float32 numbers in [0,1), exact in float32."""
+    start = np.uint64(int.from_bytes(hashlib.sha256(f"{seed}:{key}".encode("ascii")).digest()[:8], "little"))
+    x = np.arange(count, dtype=np.uint64)
+    x += start
+    x += np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x ^= x >> np.uint64(shift)
+        x *= np.uint64(factor)
+    x ^= x >> np.uint64(31)
+    x >>= np.uint64(40)
+    return x.astype(np.float32) / np.float32(2**24)
+
+
+def procedural_tensor(key: str, seed: int, shape: torch.Size, low: float, high: float) -> Tensor:
+    u = procedural_uniform(key, seed, shape.numel())
+    u *= np.float32(high) - np.float32(low)
+    u += np.float32(low)
+    return torch.from_numpy(u).view(shape)
+
+
+GAN_RANGES = [  # (which keys, range), the first that fits counts
+    (lambda key: key.endswith("ema_var"), (0.5, 1.5)),
+    (lambda key: key.endswith("phase"), (0.0, 6.28)),
+    (lambda key: key.endswith("w_avg"), (-0.5, 0.5)),
+    (lambda key: key.startswith("mapping_network") and key.endswith("weight"), (-170.0, 170.0)),
+    (lambda key: key.startswith("mapping_network"), (-50.0, 50.0)),
+    (lambda key: key.endswith("bias"), (-0.5, 0.5)),
+    (lambda key: True, (-1.7, 1.7)),
+]
+
+
+def gan_weights(structure: dict[str, Tensor], seed: int, freq_tables: dict[str, Any]) -> dict[str, Tensor]:
+    """The full-size GAN fixtures' weights for a state dict of that structure; filters and constants keep their values."""
+    weights = {}
+    for key, value in structure.items():
+        if key.endswith(("kernel", "raydrop_const")):
+            weights[key] = value
+        elif key.endswith("freqs"):
+            u = procedural_uniform(key, seed, 2 * len(value)).reshape(-1, 2)
+            table = np.array(freq_tables[key]["azimuth_list"], np.float32)
+            elevation = (2 * u[:, 0] - 1) * np.float32(freq_tables[key]["band_h"])
+            azimuth = table[np.floor(u[:, 1] * len(table)).astype(int)]
+            weights[key] = torch.from_numpy(np.stack([elevation, azimuth], 1)).view(value.shape)
+        else:
+            low, high = next(limits for fits, limits in GAN_RANGES if fits(key))
+            weights[key] = procedural_tensor(key, seed, value.shape, low, high)
+    return weights
