@@ -25,6 +25,8 @@ from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.data.synthetic.reader import SyntheticStreets
 from lidarsynth.experiment import Experiment, with_fields
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.metrics.bev import bev_histograms
+from lidarsynth.metrics.distributions import gaussian_mmd, jensen_shannon_distance
 from lidarsynth.model import LidarModel
 from lidarsynth.presets import preset
 from lidarsynth.training.checkpoint import load_run, save_run
@@ -88,40 +90,16 @@ def validation_loss(experiment: Experiment, run: Run, held_out: CachedImages, co
     return float(np.mean(list(fixed_losses(squared, run.ema, x_0).values())))
 
 
-def bev_histogram(image: RangeImage) -> np.ndarray:
-    """(10000,) number of points per cell of 1.6 m in +-80 m, points between 3 and 70 m (R2DM's evaluation)."""
-    points = image.points()[image.mask]
-    distance = np.linalg.norm(points, axis=1)
-    points = points[(distance > 3) & (distance < 70)]
-    return np.histogram2d(points[:, 0], points[:, 1], bins=100, range=[(-80, 80), (-80, 80)])[0].ravel()
-
-
 def bev_distances(samples: list[RangeImage], reference: list[RangeImage]) -> tuple[float, float]:
-    """Jensen-Shannon distance of the pooled histograms (natural log), biased MMD of the histograms (sigma 0.5)."""
-    p, q = (np.stack([bev_histogram(image) for image in images]) for images in (samples, reference))
-    return jensen_shannon(p.sum(0), q.sum(0)), mmd(_shares(p), _shares(q))
+    """Jensen-Shannon distance of the pooled BEV histograms, squared MMD of the scans' (R2DM's evaluation)."""
+    ours, theirs = (torch.cat([_histogram(image) for image in images]) for images in (samples, reference))
+    seen = ours[ours.flatten(1).sum(1) > 0]  # a sample of a bad model may hold no point at all
+    mmd = gaussian_mmd(seen, theirs) if len(seen) else float("nan")
+    return jensen_shannon_distance(ours.sum(0), theirs.sum(0)) if len(seen) else float("nan"), mmd
 
 
-def _shares(counts: np.ndarray) -> np.ndarray:
-    return counts / np.maximum(counts.sum(-1, keepdims=True), 1)
-
-
-def jensen_shannon(p: np.ndarray, q: np.ndarray) -> float:
-    """The distance, i.e. the root of the divergence, of two histograms (n,)."""
-    p, q = _shares(p), _shares(q)
-    middle = (p + q) / 2
-    parts = [x[x > 0] * np.log(x[x > 0] / middle[x > 0]) for x in (p, q)]
-    return float(np.sqrt(sum(part.sum() for part in parts) / 2))
-
-
-def mmd(p: np.ndarray, q: np.ndarray, sigma: float = 0.5) -> float:
-    """Squared maximum mean discrepancy of rows (n, d) and (m, d), Gaussian kernel, diagonals included."""
-
-    def kernel(a: np.ndarray, b: np.ndarray) -> float:
-        squared = (a**2).sum(1)[:, None] + (b**2).sum(1)[None] - 2 * a @ b.T
-        return float(np.exp(-np.maximum(squared, 0) / (2 * sigma**2)).mean())
-
-    return kernel(p, p) + kernel(q, q) - 2 * kernel(p, q)
+def _histogram(image: RangeImage) -> torch.Tensor:
+    return bev_histograms(torch.from_numpy(image.points() * image.mask[..., None]).flatten(0, 1)[None])
 
 
 def describe(experiment: Experiment) -> str:

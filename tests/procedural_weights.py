@@ -10,16 +10,17 @@ from torch import Tensor
 
 def procedural_uniform(key: str, seed: int, count: int) -> np.ndarray:
     """`count` float32 numbers in [0,1), exact in float32."""
-    start = np.uint64(int.from_bytes(hashlib.sha256(f"{seed}:{key}".encode("ascii")).digest()[:8], "little"))
-    x = np.arange(count, dtype=np.uint64)
-    x += start
-    x += np.uint64(0x9E3779B97F4A7C15)
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        x ^= x >> np.uint64(shift)
-        x *= np.uint64(factor)
-    x ^= x >> np.uint64(31)
-    x >>= np.uint64(40)
-    return x.astype(np.float32) / np.float32(2**24)
+    start = int.from_bytes(hashlib.sha256(f"{seed}:{key}".encode("ascii")).digest()[:8], "little")
+    out, chunk = np.empty(count, np.float32), 1 << 16  # a chunk stays in the cache
+    for first in range(0, count, chunk):
+        x = np.arange(first, min(first + chunk, count), dtype=np.uint64)
+        x += np.uint64((start + 0x9E3779B97F4A7C15) % 2**64)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            x ^= x >> np.uint64(shift)
+            x *= np.uint64(factor)
+        x ^= x >> np.uint64(31)
+        out[first : first + len(x)] = (x >> np.uint64(40)) * np.float32(2**-24)
+    return out
 
 
 def procedural_tensor(key: str, seed: int, shape: torch.Size, low: float, high: float) -> Tensor:

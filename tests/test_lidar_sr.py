@@ -26,10 +26,9 @@ def official(tensors: dict[str, Tensor], name: str = "lsr") -> dict:
 def assert_output_and_stages(network: LidarSR, expected: dict[str, Tensor]) -> None:
     stages = {}
     for name in STAGES:
-        hook = lambda _module, inputs, output, name=name: stages.update({name: output})  # noqa: E731
-        network.get_submodule(name).register_forward_hook(hook)
-    # `downup` is read from its last part, as forward goes through its parts one by one
-    network.get_submodule("downup.2").register_forward_hook(lambda _m, _i, output: stages.update(downup=output))
+        # forward goes through `downup` part by part: the last one has its output
+        module = network.get_submodule("downup.2" if name == "downup" else name)
+        module.register_forward_hook(lambda _module, _inputs, output, name=name: stages.update({name: output}))
     torch.testing.assert_close(network(expected["input"]), expected["output"], atol=1e-5, rtol=0)
     for name in STAGES:
         torch.testing.assert_close(stages[name][:1, :4], expected[f"inter.{name}"], atol=1e-5, rtol=1e-5)

@@ -232,7 +232,7 @@ def test_fine_tuning_refuses_other_networks_and_meanings():
     target = with_fields(source, {"model.base_channels": 16, "diffusion.kind": "eps", "data.codec": "metric"})
     with pytest.raises(ValueError) as refusal:
         transfer(build_network(target), target, build_network(source), source, "there.safetensors")
-    assert "--set model.base_channels=8 --set data.codec=log --set diffusion.kind=x_0" in str(refusal.value)
+    assert "--set model.base_channels=8 data.codec=log diffusion.kind=x_0" in str(refusal.value)
     assert "found model.base_channels=16, data.codec=metric, diffusion.kind=eps" in str(refusal.value)
 
 

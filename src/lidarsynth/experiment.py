@@ -47,6 +47,7 @@ class Diffusion:
     clip: bool = True  # clamp x_0_hat to [-1, 1]
     loss: str = "l2"  # l1 | l2 | huber
     gamma: float | None = 5.0  # min-SNR; None = unweighted
+    floor: float = 0.0  # least min-SNR weight of a sample
     mean_weight: bool = True  # every sample gets the batch's mean weight, as in R2DM's program
 
 

@@ -65,9 +65,15 @@ def default() -> Experiment:
             num_residual_blocks=(1, 1, 2, 2),
             stem=(2, 4),
         ),
-        diffusion=Diffusion(kind="x_0", mean_weight=False),
+        diffusion=Diffusion(kind="x_0", floor=1.0, mean_weight=False),
         training=Training(
-            steps=6_500, batch_size=4, learning_rate=5e-4, warmup=200, ema_start=500, generation_share=0.5
+            steps=5_000,
+            batch_size=4,
+            learning_rate=5e-4,
+            warmup=200,
+            ema_decay=0.98,  # a short run: average over 500 steps
+            ema_start=500,
+            generation_share=0.5,
         ),
     )
 

@@ -113,6 +113,7 @@ class Denoiser:
         loss: str = "l2",  # a key of LOSSES
         gamma: float | None = 5.0,  # min-SNR; inf = R2DM's unweighted option; None = no weight at all
         mean_weight: bool = False,  # give every sample the batch's mean weight, see below
+        floor: float = 0.0,  # least weight of a sample; x_0 prediction has weights of almost 0 where noise is high
     ) -> Tensor:
         """Weighted loss per sample (B,); minimise its mean.
 
@@ -128,5 +129,5 @@ class Denoiser:
         per_sample = masked_mean(error, mask)
         if gamma is None:
             return per_sample
-        weight = min_snr_weight(self.kind, log_snr, alpha, sigma, gamma).flatten()
+        weight = min_snr_weight(self.kind, log_snr, alpha, sigma, gamma).flatten().clamp(min=floor)
         return per_sample * (weight.mean() if mean_weight else weight)

@@ -138,7 +138,7 @@ def save_png(path: str | Path, rgb: np.ndarray) -> Path:
     handle, temporary = tempfile.mkstemp(suffix=".png", prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
-            Image.fromarray(rgb).save(file, format="PNG", optimize=True)
+            Image.fromarray(rgb).save(file, format="PNG", compress_level=6)
         os.chmod(temporary, 0o644)  # mkstemp's 0600 would hide the picture from the user's group
         os.replace(temporary, path)
     except BaseException:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 def tensors_of(part: object, expected: str, prefix: str = "") -> dict[str, Tensor]:
-    """`part` as tensors by name, without the prefix of the names. `expected` begins the error if it is anything else."""
+    """`part` as tensors by name, without the prefix; `expected` begins the error if it is anything else."""
     if not isinstance(part, dict):
         raise ValueError(f"{expected} with tensors by name, found a {type(part).__name__}")
     for key, value in part.items():

@@ -4,15 +4,87 @@ Losses, latent steps and learning rates of the DUSty v2 demonstration (facts/gan
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.models.gan_layers import BINOMIAL_3, Pad
+from lidarsynth.models.inverse_depth import to_depth
 
 _TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One step of an inversion, before the update that its loss leads to."""
+
+    step: int
+    latents: Tensor  # (B,...), a copy
+    inverse: Tensor  # min_depth / depth in [0,1], (B,1,H,W), before ray-drop
+    loss: Tensor  # (B,)
+
+
+def invert(
+    render: Callable[[Tensor], Tensor],  # latents (B,...) -> images before ray-drop in [-1,1], (B,1,H,W)
+    latents: Tensor,  # where to start: the mean style of many latents, or latents themselves
+    reference: Tensor,  # min_depth / depth in [0,1], (B,1,H,W); 0 where nothing was measured
+    mask: Tensor,  # (B,1,H,W), 1 where the reference counts and is positive: the known pixels of a completion
+    limits: tuple[float, float],  # min_depth and max_depth, metres
+    steps: int = 500,
+    learning_rate: float = 0.05,
+    project: Callable[[Tensor], Tensor] | None = None,  # after each step, `unit_rms` for latents z
+) -> Iterator[Fit]:
+    """Yields `steps` + 1 fits, better and better, of images to measured pixels: stage 1 of DUSty v2's inversion.
+
+    The last fit is rendered from the final latents. The network behind `render` is not changed.
+    """
+    latents = latents.detach().clone().requires_grad_()
+    optimizer = torch.optim.Adam([latents], lr=learning_rate)
+    for step in range(steps + 1):
+        inverse, loss = reconstruction(render(latents), reference, mask, limits)
+        yield Fit(step, latents.detach().clone(), inverse.detach(), loss.detach())
+        if step == steps:
+            return
+        optimizer.param_groups[0]["lr"] = learning_rate * learning_rate_factor(step / steps)
+        (latents.grad,) = torch.autograd.grad(loss.sum(), latents)
+        optimizer.step()
+        if project is not None:
+            with torch.no_grad():
+                latents.copy_(project(latents))
+
+
+def tune(
+    network: nn.Module,  # changed in place: give a copy
+    render: Callable[[Tensor], Tensor],  # through that network, as in `invert`
+    latents: Tensor,
+    reference: Tensor,
+    mask: Tensor,
+    limits: tuple[float, float],
+    steps: int = 500,
+    learning_rate: float = 5e-4,
+) -> Iterator[Fit]:
+    """Stage 2, pivotal tuning: latents stay, all weights of the network follow the same loss; yields as `invert`."""
+    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    for step in range(steps + 1):
+        inverse, loss = reconstruction(render(latents), reference, mask, limits)
+        yield Fit(step, latents.detach().clone(), inverse.detach(), loss.detach())
+        if step == steps:
+            return
+        optimizer.zero_grad()
+        loss.sum().backward()
+        optimizer.step()
+
+
+def reconstruction(
+    image: Tensor, reference: Tensor, mask: Tensor, limits: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """Images in [-1,1] -> (inverse depth in [0,1], (B,1,H,W); distance to the reference in depth and its inverse, (B,))."""
+    inverse = ((image + 1) / 2).clamp(0, 1)
+    depth, true_depth = (to_depth(x, *limits) for x in (inverse, reference))
+    return inverse, multiscale_loss(depth, true_depth, mask) + multiscale_loss(inverse, reference, mask)
 
 
 def relative_distance(generated: Tensor, reference: Tensor) -> Tensor:
@@ -66,7 +138,7 @@ def window(mask: Tensor) -> Tensor:
 def geocross(w: Tensor) -> Tensor:
     """How far the styles of W+ (B,num_styles,D) lie apart on the sphere: (B,).
 
-    Mean of D^3/8 over all ordered pairs, a style with itself included, D their angle. PULSE, equation 5.
+    Mean of D^3/8 over all ordered pairs, a style with itself included, D their angle. PULSE (Menon et al. 2020).
     """
     x, y = w[:, :, None], w[:, None]
     angle = 2 * torch.atan2(_length(x - y), _length(x + y))

@@ -26,7 +26,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     """
     different = differences(experiment, source)
     if different:
-        wanted = " ".join(f"--set {field}={_word(theirs)}" for field, _, theirs in different)
+        wanted = "--set " + " ".join(f"{field}={_word(theirs)}" for field, _, theirs in different)
         found = ", ".join(f"{field}={_word(ours)}" for field, ours, _ in different)
         raise ValueError(f"{name}: expected an experiment like that of the weights ({wanted}), found {found}")
     own, theirs = network.state_dict(), _bare(weights.state_dict())

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def accelerator_of(options: Options) -> Accelerator:
-    """What accelerate found: devices, processes, precision.
+    """What accelerate found: devices, processes, precision; also sets torch's number of threads, if told.
 
     Raises ImportError naming the extra when accelerate is missing, ValueError when the device has no such precision.
     """
@@ -26,6 +26,8 @@ def accelerator_of(options: Options) -> Accelerator:
         from accelerate import Accelerator
     except ImportError:
         raise ImportError("training needs accelerate: pip install 'lidarsynth[train]'") from None
+    if options.threads:
+        torch.set_num_threads(options.threads)
     return Accelerator(
         mixed_precision="no" if options.precision == "fp32" else options.precision,
         gradient_accumulation_steps=options.accumulate,

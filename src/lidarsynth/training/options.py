@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Options:
-    """Settings that may change from one continuation of a run to the next."""
+    """Settings that may change from one continuation of a run to the next. Raises ValueError for counts too small."""
 
     # of the network; default: as `accelerate config` or `accelerate launch` says, else fp32
     precision: Literal["fp32", "bf16", "fp16"] | None = None
@@ -22,3 +22,12 @@ class Options:
     keep: int = 3  # how many of the last checkpoints stay
     sample_every: int = 5000  # steps between sample pictures and validation losses; 0 = never
     wandb: str | None = None  # log to this project of Weights & Biases too
+
+    def __post_init__(self):
+        least = {"accumulate": 1, "log_every": 1, "save_every": 1, "keep": 1, "sample_every": 0, "threads": 0}
+        for name, smallest in least.items():
+            value = getattr(self, name)
+            if value < smallest:
+                raise ValueError(f"expected {name} of at least {smallest}, found {value}")
+        if self.workers is not None and self.workers < 0:
+            raise ValueError(f"expected workers of at least 0, found {self.workers}")

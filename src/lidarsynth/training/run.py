@@ -80,8 +80,6 @@ def run(
     weights or folder do not fit; FloatingPointError, naming step, scans and last checkpoint, when it is not finite.
     """
     options = options or Options()
-    if options.threads:
-        torch.set_num_threads(options.threads)
     out, accelerator = Path(out), accelerator_of(options)
     images = open_images(data, experiment)
     experiment, state = _begin(experiment, images, out, weights, resume, accelerator)
@@ -89,20 +87,17 @@ def run(
         yield Progress(state.step, {}, 0.0, 0.0)
     watch = Watch(experiment, data, validation)
     with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
-        try:
-            for progress in train(experiment, state, images, options, accelerator):
-                stop = any_process(accelerator, bool(received))
-                if journal:
-                    journal.step(progress)
-                    if stop or _due(progress.step, options.save_every, experiment):
-                        save_checkpoint(out, _with_history(experiment, state.step, accelerator), state, options.keep)
-                    if not stop and _due(progress.step, options.sample_every, experiment):
-                        watch.look(state.ema, state.step, journal)
-                    yield progress
-                if stop:
-                    break
-        except FloatingPointError as error:
-            raise FloatingPointError(f"{error}; last good checkpoint: {(checkpoints(out) or ['none'])[-1]}") from None
+        for progress in _named(train(experiment, state, images, options, accelerator), out):
+            stop = any_process(accelerator, bool(received))
+            if journal:
+                journal.step(progress)
+                if stop or _due(progress.step, options.save_every, experiment):
+                    save_checkpoint(out, _with_history(experiment, state.step, accelerator), state, options.keep)
+                if not stop and options.sample_every and _due(progress.step, options.sample_every, experiment):
+                    watch.look(state.ema, state.step, journal)
+                yield progress
+            if stop:
+                break
     accelerator.end_training()
 
 
@@ -160,7 +155,15 @@ def _with_history(experiment: Experiment, step: int, accelerator: Accelerator) -
 
 
 def _due(step: int, every: int, experiment: Experiment) -> bool:
-    return every > 0 and (step % every == 0 or step == experiment.training.steps)
+    return step % every == 0 or step == experiment.training.steps
+
+
+def _named(steps: Iterator[Progress], out: Path) -> Iterator[Progress]:
+    """The same steps; a loss that is not finite also names the last good checkpoint."""
+    try:
+        yield from steps
+    except FloatingPointError as error:
+        raise FloatingPointError(f"{error}; last good checkpoint: {(checkpoints(out) or ['none'])[-1]}") from None
 
 
 @contextmanager

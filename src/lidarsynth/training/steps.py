@@ -64,11 +64,12 @@ def generation_loss(
     """
     diffusion = experiment.diffusion
     gamma = None if diffusion.mean_weight else diffusion.gamma
-    losses = denoiser.loss(x_0, t, eps, loss=diffusion.loss, gamma=gamma)
+    losses = denoiser.loss(x_0, t, eps, loss=diffusion.loss, gamma=gamma, floor=diffusion.floor)
     if diffusion.gamma is None or not diffusion.mean_weight:
         return losses
     log_snr, alpha, sigma = denoiser.schedule.at(times, times)
-    return losses * min_snr_weight(denoiser.kind, log_snr, alpha, sigma, diffusion.gamma).mean()
+    weight = min_snr_weight(denoiser.kind, log_snr, alpha, sigma, diffusion.gamma)
+    return losses * weight.clamp(min=diffusion.floor).mean()
 
 
 def completion_loss(denoiser: Denoiser, x_0: Tensor, t: Tensor, eps: Tensor, known: Tensor) -> Tensor:

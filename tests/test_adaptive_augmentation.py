@@ -1,0 +1,91 @@
+"""Adaptive augmentation: given matrices, the controller of its probability, and what its draws may be."""
+
+import math
+
+import pytest
+import torch
+from test_gan import check_structure
+from torch.testing import assert_close
+
+from lidarsynth.models.adaptive_augmentation import (
+    SYM2,
+    SYM6,
+    AdaptiveAugmentation,
+    octave_filters,
+    random_affine,
+    random_colour,
+    transform_colour,
+    transform_geometry,
+)
+
+
+def test_given_matrices_transform_as_the_reference(fixture_tensors):
+    expected = fixture_tensors("gan_ada")
+    moved = transform_geometry(expected["input"], expected["affine_G"])
+    assert_close(transform_colour(moved, expected["color_C"]), expected["output"], atol=1e-5, rtol=0)
+    still = transform_geometry(expected["input"][:1], torch.eye(3)[None])
+    assert_close(still, expected["output_identity"], atol=1e-5, rtol=0)
+
+
+def test_probability_moves_as_the_reference(fixture_tensors):
+    expected = fixture_tensors("gan_ada")
+    augmentation = AdaptiveAugmentation(p=0.2)
+    for _ in range(8):
+        augmentation.observe(expected["p_update.y_real"])
+    assert_close(augmentation.adapt(), expected["p_update.rt"])
+    assert_close(augmentation.p[None], expected["p_update.p_after"], atol=1e-7, rtol=0)
+    with pytest.raises(ValueError, match="got none"):
+        augmentation.adapt()
+    augmentation.observe(torch.full((10_000_000, 1), 2.0))
+    augmentation.adapt()
+    assert augmentation.p.item() == pytest.approx(0.9)
+
+
+def test_buffers_are_the_official_ones(shared):
+    check_structure(shared, "dusty_v2", {"A": AdaptiveAugmentation()}, {"A": 0})
+
+
+def test_wavelets_are_orthonormal_and_bands_add_up():
+    for taps in (SYM2, SYM6):
+        wavelet = torch.tensor(taps, dtype=torch.float64)
+        assert wavelet.sum().item() == pytest.approx(math.sqrt(2))
+        overlaps = [float(wavelet[k:] @ wavelet[: len(wavelet) - k]) for k in range(0, len(wavelet), 2)]
+        assert overlaps == pytest.approx([1] + [0] * (len(overlaps) - 1), abs=1e-9)
+    identity = torch.zeros(43)
+    identity[21] = 1
+    assert_close(octave_filters().sum(0), identity, atol=1e-6, rtol=0)
+
+
+def test_nothing_changes_at_probability_zero_and_seeds_decide_above():
+    images = torch.randn(4, 1, 32, 64)
+    zero, generator = torch.tensor(0.0), torch.Generator()
+    assert torch.equal(random_affine(images, zero, generator), torch.eye(3).expand(4, 3, 3))
+    assert torch.equal(random_colour(images, zero, generator), torch.eye(4).expand(4, 4, 4))
+    augmentation = AdaptiveAugmentation(p=0.8)
+    first, second = (augmentation(images, generator.manual_seed(seed)) for seed in (1, 1))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, augmentation(images, generator.manual_seed(2)))
+
+
+def test_shifts_run_around_the_ring_and_flips_mirror():
+    images = torch.randn(1, 1, 32, 64)
+    shift = torch.eye(3)[None].clone()
+    shift[0, 0, 2] = 5
+    assert_close(transform_geometry(images, shift), images.roll(5, 3), atol=5e-4, rtol=0)
+    flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))[None]
+    smooth = torch.sin(torch.arange(64) * math.pi / 16).expand(1, 1, 32, 64)
+    assert_close(transform_geometry(smooth, flip), smooth.flip(3), atol=0.02, rtol=0)  # the wavelet is not symmetric
+
+
+def test_draws_follow_their_distributions():
+    images = torch.zeros(20_000, 1, 32, 64)
+    affine = random_affine(images, torch.tensor(1.0), torch.Generator().manual_seed(0))
+    assert_close(affine[:, 0, 0].mean(), torch.tensor(0.0), atol=0.03, rtol=0)  # flips in half of the cases
+    assert bool((affine[:, 0, 0].abs() == 1).all()), "scaling is vertical only"
+    assert_close(affine[:, 1, 1].abs().log2().std(), torch.tensor(0.2), atol=0.01, rtol=0)
+    assert_close(affine[:, 0, 2].std(), torch.tensor(64 * math.sqrt(0.125**2 + 0.125**2 / 3)), atol=0.2, rtol=0)
+    colour = random_colour(images, torch.tensor(1.0), torch.Generator().manual_seed(0))[:, :3].mean(1)
+    contrast, offset = colour[:, :3].sum(1), colour[:, 3]
+    assert_close(contrast.abs().log2().std(), torch.tensor(0.5), atol=0.02, rtol=0)
+    assert_close((contrast > 0).float().mean(), torch.tensor(0.5), atol=0.02, rtol=0)
+    assert_close((offset / contrast).std(), torch.tensor(0.2), atol=0.01, rtol=0)
