@@ -112,7 +112,9 @@ def test_a_training_step_averages_the_styles(shared, fixture_tensors, name):
     assert_close(net.w_avg, expected["train.w_avg_after"], **TOLERANCE)
 
 
-@pytest.mark.parametrize(("model", "raydrop", "count"), [("vanilla", False, 36_308_929), ("dusty_v1", True, 36_309_954)])
+@pytest.mark.parametrize(
+    ("model", "raydrop", "count"), [("vanilla", False, 36_308_929), ("dusty_v1", True, 36_309_954)]
+)
 def test_names_shapes_and_counts_are_the_official_ones(shared, model, raydrop, count):
     with torch.device("meta"):
         nets = {"G": Generator(raydrop=raydrop), "D": Discriminator()}
@@ -123,7 +125,10 @@ def check_structure(shared, model: str, nets: dict[str, torch.nn.Module], counts
     """Names, shapes and parameter counts of G, D and A against the official ones; A is the same for all models."""
     table = json.loads((shared / "facts" / "gans_state_dict_shapes.json").read_text())
     for letter, net in nets.items():
-        official = {key: tuple(entry["shape"]) for key, entry in table["wacv23/A" if letter == "A" else f"wacv23/{model}.{letter}"].items()}
+        official = {
+            key: tuple(entry["shape"])
+            for key, entry in table["wacv23/A" if letter == "A" else f"wacv23/{model}.{letter}"].items()
+        }
         assert {key: tuple(value.shape) for key, value in net.state_dict().items()} == official
         assert sum(parameter.numel() for parameter in net.parameters()) == counts[letter]
 

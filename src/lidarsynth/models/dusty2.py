@@ -44,7 +44,9 @@ class SynthesisNetwork(nn.Module):
 
     def forward(self, w: Tensor, angles: Tensor, shift: Tensor | None = None) -> dict[str, Tensor]:
         if shift is not None:
-            angles = torch.stack([angles[:, 0].expand(len(w), -1, -1), angles[:, 1] + 2 * math.pi * shift[:, None, None]], 1)
+            angles = torch.stack(
+                [angles[:, 0].expand(len(w), -1, -1), angles[:, 1] + 2 * math.pi * shift[:, None, None]], 1
+            )
         h, maps = None, {}
         for i, (block, level) in enumerate(zip(self.layers, self.pyramid(angles), strict=True)):
             # a head shares its style with the first convolution of the next block

@@ -21,7 +21,9 @@ class _Heads(nn.Module):
 
     def __init__(self, channels: int, names: Sequence[str]):
         super().__init__()
-        self.heads = nn.ModuleDict({name: nn.Sequential(Pad(1, "reflect"), _double(channels, 1, True)) for name in names})
+        self.heads = nn.ModuleDict(
+            {name: nn.Sequential(Pad(1, "reflect"), _double(channels, 1, True)) for name in names}
+        )
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         return {name: head(x) for name, head in self.heads.items()}

@@ -113,7 +113,10 @@ def multiscale_loss(
         raise ValueError(f"generated, reference and mask must have one shape (B, 1, H, W), got {shapes}")
     total = _masked_mean(distance(generated, reference), mask)
     for _ in range(levels - 1):
-        generated, reference, mask = *(masked_halve(x, mask) for x in (generated, reference)), window(mask).gt(0).to(mask)
+        generated, reference, mask = (
+            *(masked_halve(x, mask) for x in (generated, reference)),
+            window(mask).gt(0).to(mask),
+        )
         total = total + _masked_mean(distance(generated, reference), mask)
     return total
 

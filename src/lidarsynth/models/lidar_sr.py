@@ -1,7 +1,7 @@
 """LiDAR-SR (Shan et al. 2020): a U-Net for more beams, with Monte-Carlo dropout that tells where it is unsure.
 
 There are two programs of it. The original is Keras; the one in ILN's repository is PyTorch, and the candidate for
-R2DM's table. They have the same layers and differ in arithmetic, so that weights belong to one of them: see `LidarSR.keras`.
+R2DM's table. They have the same layers and differ in arithmetic, so that weights belong to one of them, see `LidarSR`.
 """
 
 import math

@@ -55,7 +55,9 @@ def measured(model: RayDrop | None, maps: dict[str, Tensor], uniform: Tensor | N
     if model is None:
         return GeneratedImages(image, image, w)
     if uniform is None:
-        raise ValueError("uniform must be a tensor that broadcasts to (B, 1, H, W) for a generator with ray-drop, got None")
+        raise ValueError(
+            "uniform must be a tensor that broadcasts to (B, 1, H, W) for a generator with ray-drop, got None"
+        )
     logit = maps["raydrop_logit"]
     dropped, mask = model(image, logit, uniform)
     return GeneratedImages(dropped, image, w, logit, mask)
