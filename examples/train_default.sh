@@ -5,10 +5,11 @@ set -euo pipefail
 out=$1
 cache=$out/streets
 if [ "${2:-}" = "--cpu" ]; then
-  images=4096 device=(--cpu)
+  export ACCELERATE_USE_CPU=true
+  images=4096 options=(--save-every 250)
   budget=()
 else
-  images=32768 device=(--precision bf16)
+  images=32768 options=(--precision bf16)
   budget=(--set training.steps=60000 training.batch_size=64 training.warmup=1000 training.ema_decay=0.995)
 fi
 lidarsynth data synthetic "$cache" -n "$images" --seed 4
@@ -16,7 +17,7 @@ lidarsynth data synthetic "$out/validation" -n 64 --seed 777
 while true; do
   # SIGTERM saves and exits 0; a run that has reached its last step ends at once
   timeout 580 lidarsynth train default --data "$cache" --validation "$out/validation" --out "$out" \
-    "${device[@]}" "${budget[@]}" | tee "$out/last.log"
+    "${options[@]}" "${budget[@]}" | tee "$out/last.log"
   grep -q "stopped after step" "$out/last.log" || break
 done
 lidarsynth info "$out"

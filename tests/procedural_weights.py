@@ -42,7 +42,7 @@ GAN_RANGES = [  # (which keys, range), the first that fits counts
 
 
 def gan_weights(structure: dict[str, Tensor], seed: int, freq_tables: dict[str, Any]) -> dict[str, Tensor]:
-    """The full-size GAN fixtures' weights for a state dict of that structure; filters and constants keep their values."""
+    """Weights of the full-size GAN fixtures for a state dict of that structure; filters and constants stay."""
     weights = {}
     for key, value in structure.items():
         if key.endswith(("kernel", "raydrop_const")):

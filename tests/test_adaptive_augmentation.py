@@ -17,6 +17,9 @@ from lidarsynth.models.adaptive_augmentation import (
     transform_colour,
     transform_geometry,
 )
+from lidarsynth.models.adversarial import r1_penalty
+from lidarsynth.models.dusty2 import Discriminator
+from lidarsynth.models.grid_sampling import sample_bilinear
 
 
 def test_given_matrices_transform_as_the_reference(fixture_tensors):
@@ -89,3 +92,23 @@ def test_draws_follow_their_distributions():
     assert_close(contrast.abs().log2().std(), torch.tensor(0.5), atol=0.02, rtol=0)
     assert_close((contrast > 0).float().mean(), torch.tensor(0.5), atol=0.02, rtol=0)
     assert_close((offset / contrast).std(), torch.tensor(0.2), atol=0.01, rtol=0)
+
+
+def test_sampling_has_the_second_derivative_that_r1_needs():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 1, 4, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    grid = torch.rand(2, 3, 4, 2, generator=generator, dtype=torch.float64) * 2.4 - 1.2
+    square = lambda x: sample_bilinear(x, grid).square()  # noqa: E731
+    assert torch.autograd.gradcheck(square, x)
+    assert torch.autograd.gradgradcheck(square, x)
+
+
+def test_r1_through_the_augmentation_reaches_the_weights():
+    net = Discriminator((32, 64), 2, 4)
+    images = torch.randn(4, 1, 32, 64, requires_grad=True)
+    augmented = AdaptiveAugmentation(p=0.9)(images, torch.Generator().manual_seed(0))
+    penalty = r1_penalty(net(augmented), images)
+    penalty.backward()
+    assert penalty > 0
+    weights = {name: value for name, value in net.named_parameters() if name.endswith("weight")}
+    assert all(value.grad is not None and bool(value.grad.abs().sum() > 0) for value in weights.values())

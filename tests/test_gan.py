@@ -178,7 +178,7 @@ def test_minibatch_deviation_is_of_every_second_image_in_a_batch_of_eight():
     out = MinibatchStdDev(4)(x)
     expected = torch.stack([x[i::2].std(0, correction=0).mean() for i in (0, 1)]).repeat(4)
     assert_close(out[:, 2], expected[:, None, None].expand(8, 3, 4))
-    with pytest.raises(ValueError, match="batch must be a multiple of 4 .* got 6"):
+    with pytest.raises(ValueError, match=r"batch must be a multiple of 4 .* got 6"):
         MinibatchStdDev(4)(torch.randn(6, 2, 3, 4))
 
 

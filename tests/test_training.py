@@ -168,8 +168,14 @@ def test_loss_is_the_mean_over_generation_and_completion():
     denoiser = build_denoiser(TINY, objective.network)
     generation = denoiser.loss(batch.x_0[:2], batch.t[:2], batch.eps[:2], loss="l2", gamma=5.0)
     known = batch.known[2:].float()
-    given = denoiser.given(batch.x_0[2:], known)
-    completion = given.loss(batch.x_0[2:], batch.t[2:], batch.eps[2:], mask=1 - known, loss="l1", gamma=None)
+    x_0 = batch.x_0[2:]
+    given = replace(denoiser, clip=False).given(x_0, known)
+    code = given.loss(x_0, batch.t[2:], batch.eps[2:], mask=1 - known, loss="l1", gamma=None)
+    _, alpha, sigma = denoiser.schedule.at(batch.t[2:], x_0)
+    x_0_hat = given(alpha * x_0 + sigma * batch.eps[2:], batch.t[2:]).clamp(-1, 1)
+    metres = (81 ** ((x_0_hat[:, 0] + 1) / 2) - 81 ** ((x_0[:, 0] + 1) / 2)).abs() / 20  # log code up to 80 m
+    hidden = 1 - known
+    completion = code + (metres * hidden[:, 0]).sum((1, 2)) / hidden.sum((1, 2, 3))
     torch.testing.assert_close(losses, torch.cat([generation, completion]))
 
 

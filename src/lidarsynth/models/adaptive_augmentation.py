@@ -10,7 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# Daubechies' least asymmetric wavelets with 2 and 6 vanishing moments, sum sqrt(2) (Ten Lectures on Wavelets, table 6.3).
+from lidarsynth.models.grid_sampling import sample_bilinear
+
+# Daubechies' least asymmetric wavelets with 2 and 6 vanishing moments; either sums to sqrt(2).
 SYM2 = (-0.12940952255092145, 0.22414386804185735, 0.836516303737469, 0.48296291314469025)
 SYM6 = (
     *(0.015404109327027373, 0.0034907120842174702, -0.11799011114819057, -0.048311742585633),
@@ -103,7 +105,7 @@ def transform_geometry(images: Tensor, affine: Tensor) -> Tensor:
     size = [*images.shape[:2], 2 * (height + 2 * _MARGIN), 2 * (width + 2 * _MARGIN)]
     to_grid = _scaling(2 / images.shape[3], 2 / images.shape[2], inverse)
     grid = F.affine_grid((to_grid @ inverse @ _scaling(size[3] / 2, size[2] / 2, inverse))[:, :2], size, False)
-    return _halve(F.grid_sample(images, grid, mode="bilinear", padding_mode="zeros", align_corners=False))
+    return _halve(sample_bilinear(images, grid))
 
 
 def _margins(inverse: Tensor, height: int, width: int) -> list[int]:
@@ -149,7 +151,10 @@ def _scaling(x: float, y: float, like: Tensor) -> Tensor:
 
 
 def transform_colour(images: Tensor, colour: Tensor) -> Tensor:
-    """One-channel images (B,1,H,W) taken as grey, times colour matrices (B,4,4), back to grey: x * sum(c[:3]) + c[3]."""
+    """Images (B,1,H,W) taken as grey, times colour matrices (B,4,4), back to grey.
+
+    That is x * sum(c[:3]) + c[3], c the mean of the first three rows. Raises ValueError for more than one channel.
+    """
     if images.shape[1] != 1:
         raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
     row = colour[:, :3].mean(1)

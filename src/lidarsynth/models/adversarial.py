@@ -28,7 +28,7 @@ def r1_penalty(logits_real: Tensor, images: Tensor) -> Tensor:
 
 
 def path_lengths(images: Tensor, w: Tensor, noise: Tensor) -> Tensor:
-    """Lengths |J^T noise| / sqrt(H W), differentiable: images and noise (B,C,H,W), styles w (...,D) -> (...). StyleGAN2.
+    """Lengths |J^T noise| / sqrt(H W), differentiable: images, noise (B,C,H,W), styles w (...,D) -> (...). StyleGAN2.
 
     `noise` ~ N(0,I). The published runs leave this term out (weight 0).
     """

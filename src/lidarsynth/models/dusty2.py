@@ -4,6 +4,8 @@ Parameter names are those of the official checkpoints (facts/gans.md section 5).
 """
 
 import math
+from itertools import pairwise
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +22,7 @@ from lidarsynth.models.gan_layers import (
     PixelNorm,
     Resample,
 )
+from lidarsynth.models.grid_sampling import sample_bilinear
 from lidarsynth.models.modulated import SynthesisBlock
 from lidarsynth.models.raydrop import GeneratedImages, RayDrop, measured
 
@@ -59,19 +62,19 @@ class SynthesisNetwork(nn.Module):
     def pyramid(self, angles: Tensor) -> list[Tensor]:
         """The angle map of every block, coarsest first: (B,2,H/16,W/16), ..., (B,2,H,W), radians."""
         levels = [angles]
-        for block in reversed(self.layers[1:]):
-            levels.append(block.coarser(levels[-1]))
+        for block in list(self.layers)[:0:-1]:
+            levels.append(cast(SynthesisBlock, block).coarser(levels[-1]))
         return levels[::-1]
 
 
 def unshift(x: Tensor, shift: Tensor) -> Tensor:
-    """Turns maps (B,C,H,W) by `shift` (B,) of a turn towards smaller columns, bilinear, as DUSty v2 does in training."""
+    """Turns maps (B,C,H,W) by `shift` (B,) of a turn towards smaller columns, bilinear; DUSty v2 in training."""
     width = x.shape[3]
     theta = torch.eye(2, 3, dtype=x.dtype, device=x.device).repeat(len(x), 1, 1)
     theta[:, 0, 2] = shift
     doubled = torch.cat([x, x], dim=3)
     grid = F.affine_grid(theta, list(doubled.shape), align_corners=False)
-    return F.grid_sample(doubled, grid, mode="bilinear", padding_mode="zeros", align_corners=False)[..., :width]
+    return sample_bilinear(doubled, grid)[..., :width]
 
 
 def _mapping_layer(in_channels: int, out_channels: int) -> nn.Sequential:
@@ -161,7 +164,7 @@ class Discriminator(nn.Module):
         _check_multiple(resolution)
         widths = [min(base_channels << i, max_channels) for i in range(_LEVELS + 1)]
         first = nn.Sequential(EqualLR(nn.Conv2d(2, widths[0], 1, bias=False)))
-        blocks = [ResidualBlock(before, after) for before, after in zip(widths[:-1], widths[1:], strict=True)]
+        blocks = [ResidualBlock(before, after) for before, after in pairwise(widths)]
         self.layers = nn.Sequential(BlurVH(), first, FusedLeakyReLU(widths[0]), *blocks)
         top = widths[-1]
         pixels = (resolution[0] >> _LEVELS) * (resolution[1] >> _LEVELS)

@@ -5,6 +5,7 @@ those of the official checkpoints (facts/gans.md section 3). Range only: images 
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -19,14 +20,18 @@ _LEVELS = 4  # the image is 2^4 times as large as the coarsest map
 class _Heads(nn.Module):
     """One transposed convolution per output map: (B,C,H,W) -> {name: (B,1,2H,2W)}."""
 
-    def __init__(self, channels: int, names: Sequence[str]):
+    def __init__(self, channels: int, names: Sequence[str], bounded: bool):
         super().__init__()
+        self.bounded = bounded
         self.heads = nn.ModuleDict(
             {name: nn.Sequential(Pad(1, "reflect"), _double(channels, 1, True)) for name in names}
         )
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
-        return {name: head(x) for name, head in self.heads.items()}
+        maps = {name: head(x) for name, head in self.heads.items()}
+        if self.bounded:
+            maps["image"] = maps["image"].tanh()
+        return maps
 
 
 def _double(in_channels: int, out_channels: int, bias: bool) -> EqualLR:
@@ -57,16 +62,17 @@ class Generator(nn.Module):
         base_channels: int = 64,
         max_channels: int = 512,
         raydrop: bool = False,
+        bounded: bool = False,  # tanh on the image: the IROS 2021 release
     ):
         super().__init__()
         kernel = _coarsest(resolution)
         widths = [min(base_channels << i, max_channels) for i in reversed(range(_LEVELS))]
         first = EqualLR(nn.ConvTranspose2d(latent_channels, widths[0], kernel, bias=False))
         blocks = [nn.Sequential(nn.Identity(), first, FusedLeakyReLU(widths[0]))]
-        for before, after in zip(widths[:-1], widths[1:], strict=True):
+        for before, after in pairwise(widths):
             blocks.append(nn.Sequential(Pad(1, "reflect"), _double(before, after, False), FusedLeakyReLU(after)))
         heads = ("image", "raydrop_logit") if raydrop else ("image",)
-        self.synthesis_network = nn.Sequential(*blocks, _Heads(widths[-1], heads))
+        self.synthesis_network = nn.Sequential(*blocks, _Heads(widths[-1], heads, bounded))
         self.measurement_model = RayDrop() if raydrop else None
         self.register_buffer("w_avg", torch.zeros(1, latent_channels))
 
@@ -96,6 +102,7 @@ class Discriminator(nn.Sequential):
         resolution: tuple[int, int] = (64, 512),
         base_channels: int = 64,
         max_channels: int = 512,
+        vertical: str = "replicate",  # padding of the first blur, "reflect": the IROS 2021 release
     ):
         kernel = _coarsest(resolution)
         widths = [2, *(min(base_channels << i, max_channels) for i in range(_LEVELS))]
@@ -105,6 +112,6 @@ class Discriminator(nn.Sequential):
                 EqualLR(nn.Conv2d(before, after, 4, stride=2, bias=False)),
                 FusedLeakyReLU(after),
             )
-            for before, after in zip(widths[:-1], widths[1:], strict=True)
+            for before, after in pairwise(widths)
         ]
-        super().__init__(BlurVH(), *blocks, EqualLR(nn.Conv2d(widths[-1], 1, kernel)))
+        super().__init__(BlurVH(vertical), *blocks, EqualLR(nn.Conv2d(widths[-1], 1, kernel)))

@@ -81,7 +81,7 @@ def tune(
 def reconstruction(
     image: Tensor, reference: Tensor, mask: Tensor, limits: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """Images in [-1,1] -> (inverse depth in [0,1], (B,1,H,W); distance to the reference in depth and its inverse, (B,))."""
+    """Images in [-1,1] -> inverse depth in [0,1], (B,1,H,W), and the distance to the reference in both depths, (B,)."""
     inverse = ((image + 1) / 2).clamp(0, 1)
     depth, true_depth = (to_depth(x, *limits) for x in (inverse, reference))
     return inverse, multiscale_loss(depth, true_depth, mask) + multiscale_loss(inverse, reference, mask)

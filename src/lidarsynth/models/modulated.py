@@ -124,12 +124,12 @@ class SynthesisBlock(nn.Module):
         self, h: Tensor | None, maps: Mapping[str, Tensor], angles: Tensor, styles: Sequence[Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         features = self.pe(angles).expand(len(styles[0]), -1, -1, -1)
-        h = features if h is None else torch.cat([self.resample(h), features.to(h.dtype)], dim=1)
-        h = self.bias_act1(self.conv1(h, styles[0]))
+        x = features if h is None else torch.cat([self.resample(h), features.to(h.dtype)], dim=1)
+        x = self.bias_act1(self.conv1(x, styles[0]))
         if not self.first:
-            h = self.bias_act2(self.conv2(h, styles[1]))
-        new = self.head(h, styles[-1])
-        return h, {name: value + self.resample(maps[name]) if name in maps else value for name, value in new.items()}
+            x = self.bias_act2(self.conv2(x, styles[1]))
+        new = self.head(x, styles[-1])
+        return x, {name: value + self.resample(maps[name]) if name in maps else value for name, value in new.items()}
 
     def coarser(self, angles: Tensor) -> Tensor:
         """Angles at half the resolution, averaged on the circle: (B,2,H,W) -> (B,2,H/2,W/2), radians."""

@@ -23,8 +23,8 @@ def relaxed_bernoulli(logit: Tensor, uniform: Tensor, temperature: float = 1.0) 
     `uniform` in [0,1) broadcasts against `logit`: one map for a whole batch gives all its images the same noise.
     DUSty section III-C.
     """
-    tiny = torch.finfo(torch.float32).eps
-    p = torch.sigmoid(logit).clamp(tiny, 1 - tiny)
+    tiny = torch.finfo(torch.float32).eps  # in half precision 1 - tiny would be 1
+    p = torch.sigmoid(logit.float()).clamp(tiny, 1 - tiny)
     u = uniform.clamp(tiny, 1 - tiny)
     soft = torch.sigmoid((u.log() - (1 - u).log() + p.log() - (1 - p).log()) / temperature)
     hard = (soft > 0.5).to(soft.dtype)
@@ -42,7 +42,7 @@ class RayDrop(nn.Module):
         self.register_buffer("raydrop_const", torch.tensor(const))
 
     def forward(self, image: Tensor, logit: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        mask = relaxed_bernoulli(logit, uniform, self.temperature)
+        mask = relaxed_bernoulli(logit, uniform, self.temperature).to(image.dtype)
         return torch.lerp(image, self.raydrop_const.to(image.dtype), 1 - mask), mask
 
 

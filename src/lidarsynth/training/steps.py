@@ -7,15 +7,18 @@ depend on how many processes, workers or passes share a batch, and a resumed run
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.build import build_denoiser
-from lidarsynth.diffusion.denoiser import Denoiser, min_snr_weight
+from lidarsynth.build import build_denoiser, build_sensor
+from lidarsynth.diffusion.denoiser import Denoiser, masked_mean, min_snr_weight
 from lidarsynth.experiment import Data, Experiment, Training
+from lidarsynth.lidar.depth import CODECS
+from lidarsynth.lidar.sensor import Sensor
 
 
 class Batch(NamedTuple):
@@ -50,7 +53,7 @@ class Objective(nn.Module):
             losses.append(generation_loss(self.experiment, self.denoiser, x_0, t, eps, batch.times))
         if n < len(batch.x_0):
             x_0, t, eps, known = (part[n:] for part in (batch.x_0, batch.t, batch.eps, batch.known))
-            losses.append(completion_loss(self.denoiser, x_0, t, eps, known))
+            losses.append(completion_loss(self.experiment, self.denoiser, x_0, t, eps, known))
         return torch.cat(losses)
 
 
@@ -72,13 +75,26 @@ def generation_loss(
     return losses * weight.clamp(min=diffusion.floor).mean()
 
 
-def completion_loss(denoiser: Denoiser, x_0: Tensor, t: Tensor, eps: Tensor, known: Tensor) -> Tensor:
-    """Mean absolute error (b,) of the pixels that are not `known` (b, 2, H, W).
+def completion_loss(
+    experiment: Experiment, denoiser: Denoiser, x_0: Tensor, t: Tensor, eps: Tensor, known: Tensor
+) -> Tensor:
+    """Mean absolute error (b,) of the pixels that are not `known` (b, 2, H, W), in code and, of range, in metres too.
 
-    The absolute error has the median as its optimum, which is the same in metres and in any depth code.
+    The absolute error has the median as its optimum, which is the same in metres and in any depth code; in code the
+    near pixels weigh most, in metres, here per 20 m, the far ones.
     """
     mask = known.to(x_0)
-    return denoiser.given(x_0, mask).loss(x_0, t, eps, mask=1 - mask, loss="l1", gamma=None)
+    _, alpha, sigma = denoiser.schedule.at(t, x_0)
+    x_0_hat = replace(denoiser, clip=False).given(x_0, mask)(alpha * x_0 + sigma * eps, t)
+    error = (x_0_hat - x_0).abs()
+    sensor, codec = build_sensor(experiment), experiment.data.codec
+    metres = (_metres(x_0_hat[:, :1], sensor, codec) - _metres(x_0[:, :1], sensor, codec)).abs()
+    return masked_mean(error + torch.cat([metres / 20, torch.zeros_like(metres)], dim=1), 1 - mask)
+
+
+def _metres(code: Tensor, sensor: Sensor, codec: str) -> Tensor:
+    """Range code in [-1, 1] -> metres up to the sensor's limit, without the gap below its least range."""
+    return CODECS[codec].inverse((code.clamp(-1, 1) + 1) / 2, sensor).clamp(max=sensor.max_range)
 
 
 def generation_count(training: Training) -> int:
