@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-EXTRAS := synthetic,train,data,metrics,viz,test
+EXTRAS := synthetic,train,data,metrics,viz,hub,test
 
 .PHONY: install demo test quick check format bench clean
 
@@ -19,10 +19,10 @@ demo: $(STAMP)
 	$(BIN)/lidarsynth demo --out demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 quick: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

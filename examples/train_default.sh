@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # From nothing to the default weights, in chunks of under ten minutes; run again, it goes on where it was.
-# Usage: train_default.sh OUT [--cpu]. With a GPU: 60,000 steps of 64; --cpu: the 5,000 steps of 4 of the shipped weights.
+# Usage: train_default.sh OUT [--cpu]. With a GPU: 60,000 steps of 64; --cpu: the 5,250 steps of 4 of the shipped weights.
 set -euo pipefail
 out=$1
 cache=$out/streets

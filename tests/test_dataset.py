@@ -363,3 +363,52 @@ def test_a_narrow_cache_keeps_the_ray_drop(shared: Path):
     turn = project(scan, sensor, "unfolding", 2048)
     assert abs(thinned.mask.mean() - turn.mask.mean()) < 0.01
     assert project(scan, sensor, "unfolding").mask.mean() > turn.mask.mean() + 0.05
+
+
+def without_intensity(path: Path, sensor: Sensor) -> None:
+    """An ascii `.pcd` of x, y, z and ring: 20 m in every direction."""
+    distance = np.full((sensor.height, sensor.width), 20, np.float32)
+    scan = RangeImage(distance, 0 * distance, distance > 0, sensor).to_scan()
+    assert scan.ring is not None
+    rows = [" ".join(map(str, [*xyz, ring])) for xyz, ring in zip(scan.xyz, scan.ring, strict=True)]
+    head = "VERSION 0.7\nFIELDS x y z ring\nSIZE 4 4 4 2\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    size = f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA ascii\n"
+    path.write_text(head + size + "\n".join(rows) + "\n")
+
+
+def test_files_without_intensity_are_read_when_told_so(tmp_path: Path):
+    (tmp_path / "scans").mkdir()
+    without_intensity(tmp_path / "scans/0.pcd", SENSORS["vlp-16"].resized(width=32))
+    words = ("files", tmp_path / "scans", tmp_path / "cache")
+    with pytest.raises(ValueError, match="expected an intensity field"):
+        list(cache_source(*words, sensor="vlp-16", width=32))
+    list(cache_source(*words, sensor="vlp-16", width=32, intensity="none"))  # nothing was stored: the folder serves
+    image = CachedImages(tmp_path / "cache")[0]
+    assert image.mask.mean() > 0.9 and not image.reflectance.any()
+    with pytest.raises(ValueError, match=r"expected --intensity with files.* found it with kitti"):
+        list(cache_source("kitti", tmp_path, tmp_path / "c", intensity="none"))
+
+
+def test_the_sensor_of_files_is_recognised_or_asked_for(tmp_path: Path):
+    (tmp_path / "known").mkdir()
+    (tmp_path / "known/0.pcd").write_text("not a scan")  # skipped, like any broken one
+    without_intensity(tmp_path / "known/1.pcd", SENSORS["vlp-16"].resized(width=64))
+    list(cache_source("files", tmp_path / "known", tmp_path / "cache", width=64, intensity="none"))
+    assert CachedImages(tmp_path / "cache").sensor == SENSORS["vlp-16"].resized(width=64)
+    (tmp_path / "own").mkdir()
+    own = Sensor("own", tuple(np.linspace(20, -31, 24)), 64)
+    without_intensity(tmp_path / "own/0.pcd", own)
+    with pytest.raises(ValueError, match=r"0.pcd: expected the beams of .* name the sensor with --sensor"):
+        list(cache_source("files", tmp_path / "own", tmp_path / "none", width=64, intensity="none"))
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_width_is_the_given_one_else_that_of_one_s_own_sensor(tmp_path: Path):
+    (tmp_path / "own.toml").write_text("beams = 16\ntop = 15\nbottom = -15\nwidth = 48\n")
+    (tmp_path / "scans").mkdir()
+    without_intensity(tmp_path / "scans/0.pcd", SENSORS["vlp-16"].resized(width=64))
+    for sensor, given, expected in (("own.toml", None, 48), ("own.toml", 32, 32), ("vlp-16", None, 1024)):
+        word = str(tmp_path / sensor) if sensor == "own.toml" else sensor
+        folder = tmp_path / f"cache-{expected}"
+        list(cache_source("files", tmp_path / "scans", folder, sensor=word, width=given, intensity="none"))
+        assert CachedImages(folder).sensor.width == expected

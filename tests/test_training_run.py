@@ -179,11 +179,23 @@ def test_resolve_takes_the_sensor_of_the_images(cache: Path, tmp_path: Path):
     data = resolve("tiny", ("training.steps=5",), data=tmp_path / "own").data
     assert (data.height, data.width) == (32, 128) and isinstance(data.sensor, dict) and data.sensor["name"] == "mine"
     with pytest.raises(ValueError, match="expected images of 16 x 64, found 32 x 128"):
-        resolve("tiny", ("data.codec=log",), data=tmp_path / "own")
+        resolve("tiny", ("data.height=16",), data=tmp_path / "own")
+    turned = resolve("tiny", ("data.roll=true",), data=tmp_path / "own").data
+    assert turned.roll and turned.height == 32, "an augmentation is no choice of a sensor"
     with pytest.raises(ValueError, match=r"expected group\.field=value"):
         resolve("tiny", ("steps",))
     with pytest.raises(ValueError, match="no_such"):
         resolve("tiny", ("training.no_such=1",))
+
+
+@pytest.mark.parametrize(
+    ("preset_word", "drawn", "expected"),
+    [("tiny", "spherical", "spherical"), ("tiny", "unfolding", "auto"), ("r2dm-h", "auto", "auto")],
+)
+def test_resolve_takes_the_projection_of_the_images(tmp_path: Path, preset_word: str, drawn: str, expected: str):
+    list(write_cache(tmp_path, noise_image, 2, SENSOR, {"name": "noise", "projection": drawn}))
+    assert resolve(preset_word, data=tmp_path).data.projection == expected
+    assert resolve(preset_word, ("data.projection=unfolding",), data=tmp_path).data.projection == "unfolding"
 
 
 def filled(experiment: Experiment, seed: int = 0):
@@ -243,3 +255,14 @@ def test_from_weights_starts_there_and_keeps_their_history(cache: Path, tmp_path
     found, network = load(tmp_path / "second")
     torch.testing.assert_close(network.state_dict(), load(tmp_path / "first")[1].state_dict())
     assert found.card.history == ("3 steps of 4 on 1 x cpu", "from tiny", "1 steps of 4 on 1 x cpu")
+    assert found.card.data == "24 images of noise; 24 images of noise"
+
+
+def test_the_licence_is_the_user_s_else_that_of_the_weights(cache: Path, tmp_path: Path):
+    licensed = resolve("tiny", ("training.steps=1", "card.licence=CC BY 4.0"), data=cache)
+    list(run(licensed, cache, tmp_path / "first", options=QUIET))
+    assert load(tmp_path / "first")[0].card.licence == "CC BY 4.0"
+    for chosen, expected in (("", "CC BY 4.0"), ("ours alone", "ours alone")):
+        experiment = tiny(1, **{"card.licence": chosen})
+        list(run(experiment, cache, tmp_path / expected, str(tmp_path / "first"), options=QUIET))
+        assert load(tmp_path / expected)[0].card.licence == expected

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lidarsynth.data.files import read, read_image, write
+    from lidarsynth.evaluation import evaluate
     from lidarsynth.lidar.corruption import corrupt
     from lidarsynth.lidar.projection import project
     from lidarsynth.lidar.scan import RangeImage, Scan
@@ -20,6 +21,7 @@ _HOME = {
     "read": "lidarsynth.data.files",
     "read_image": "lidarsynth.data.files",
     "write": "lidarsynth.data.files",
+    "evaluate": "lidarsynth.evaluation",
     "corrupt": "lidarsynth.lidar.corruption",
     "project": "lidarsynth.lidar.projection",
     "RangeImage": "lidarsynth.lidar.scan",
@@ -39,6 +41,7 @@ __all__ = [
     "Scan",
     "Sensor",
     "corrupt",
+    "evaluate",
     "get_sensor",
     "load",
     "project",

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as serialized
 from torch import Tensor, nn
 
 from lidarsynth.diffusion.denoiser import Denoiser
@@ -98,7 +99,7 @@ def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: b
     exact = {name for name, _ in network.named_buffers()}
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()}
     with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
-        save_file(weights, Path(scratch) / WEIGHTS)
+        (Path(scratch) / WEIGHTS).write_bytes(serialized(weights))  # save_file would hide it from other users
         (Path(scratch) / RECORD).write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
         for name in (WEIGHTS, RECORD):
             os.replace(Path(scratch) / name, folder / name)

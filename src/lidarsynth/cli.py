@@ -219,6 +219,7 @@ def data(
     count: Count = 1000,
     check: bool = False,
     seed: int = 0,
+    intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
 ) -> None:
     """Prepare a cache of range images for training; killed at any moment, the same command goes on.
 
@@ -227,17 +228,20 @@ def data(
         root: where the files are; the cache itself for synthetic streets.
         cache: folder to write.
         split: train, val, test or all; of nuscenes mini, trainval or test.
-        sensor: whose images: hdl-64e, ... or a .toml/.json file. This, projection and width have defaults by source.
+        sensor: whose images: hdl-64e, ... or a .toml/.json file. This, projection and width have defaults by source;
+            the sensor of files is recognised from the first.
         projection: how points become rows.
         width: columns; below 1024 they are chosen from 1024, or 2048 when unfolding, as in R2DM.
         workers: processes, one per processor core if not given.
         count: synthetic scans.
         check: also compare the checksums of what is there already, and make anew what is damaged.
         seed: of the synthetic streets.
+        intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
     """
     from lidarsynth.data.sources import prepare, summary
 
-    for _ in counted(prepare(source, root, cache, split, sensor, projection, width, workers, count, check, seed)):
+    more = (workers, count, check, seed, intensity)
+    for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass
     say(f"wrote {summary(cache or root)}")
 
@@ -272,6 +276,36 @@ def train(
         )
 
 
+def evaluate(
+    samples: Annotated[Positional[list[Path]], arg(metavar="SAMPLES", help="folder, cache, or .safetensors parts.")],
+    reference: Annotated[Path | None, arg(metavar="CACHE|STATS|FOLDER", help="what to compare with.")] = None,
+    protocol: Annotated[str, arg(help="r2dm-2024, lidargen-2022, dusty-2023, r2dm-upsampling-2024, bev-1.")] = "bev-1",
+    out: Annotated[Path, arg(help=".json, with .md beside it; of a part .safetensors.")] = Path("report.json"),
+    part: Annotated[str | None, arg(metavar="I/N", help="only gather the statistics of this part, to merge.")] = None,
+    sensor: Annotated[str | None, arg(help="of samples that are points; default: the reference's.")] = None,
+    batch_size: Annotated[int, arg(help="images at once; makes no difference to the result.")] = 4,
+    seed: Annotated[int, arg(help="of the subsets of the squared MMDs.")] = 0,
+    device: Device = "cpu",
+) -> None:
+    """Judge samples against a reference under a named protocol; killed at any moment, the same command goes on."""
+    from lidarsynth import evaluation
+    from lidarsynth.terminal import image_bar
+
+    at_least(1, {"batch-size": batch_size})
+    at_least(0, {"seed": seed})
+    with image_bar() as on_images:
+        if part is not None:
+            evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, device, on_images)
+        elif reference is not None:
+            evaluation.check_out(out)
+            report = evaluation.evaluate(samples, reference, protocol, sensor, seed, batch_size, device, on_images)
+            say(str(report))
+            evaluation.write_report(report, out)
+        else:
+            raise ValueError("expected --reference CACHE, STATS or FOLDER, found none")
+    say(f"wrote {out}" if part else f"wrote {out} and {out.with_suffix('.md')}")
+
+
 def _read(path: Path, intensity: str) -> Scan:
     from lidarsynth.data.files import read_with_report
 
@@ -304,6 +338,7 @@ VERBS = {
     "project": project,
     "data": data,
     "train": train,
+    "evaluate": evaluate,
     "info": info,
 }
 

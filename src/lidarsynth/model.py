@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,9 @@ from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.repaint import evaluations, repaint
 from lidarsynth.diffusion.samplers import STEPS, State, generators, sample, starting_noise
 from lidarsynth.experiment import Experiment
+from lidarsynth.hub import push
 from lidarsynth.lidar.depth import from_x_0, to_x_0
+from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
@@ -88,7 +89,7 @@ class LidarModel:
             rng = generators(seed, count, offset=start)
             x_1 = starting_noise(self.denoiser, self._blank(count), rng)
             for x in _last(sample(self.denoiser, x_1, _step(sampler), steps, rng), on_step):
-                yield from_x_0(x, self.sensor, self.experiment.data.codec)
+                yield self._image(x)
 
     def complete(
         self,
@@ -126,7 +127,7 @@ class LidarModel:
             states = sample(self.denoiser.given(x_0, mask), x_1, _step(sampler), steps, rng)
         else:
             states = repaint(self.denoiser, x_1, x_0, mask, rng, _step("ddpm"), steps, resamples)
-        filled = from_x_0(_last(states, on_step)[0], self.sensor, self.experiment.data.codec)
+        filled = self._image(_last(states, on_step)[0])
         return _with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
 
     def upsample(
@@ -153,6 +154,16 @@ class LidarModel:
         image, known = sparse_image(scan, sensor_in, self.sensor)
         return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
 
+    def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
+        """Upload the model, with a card filled in from its experiment, to `owner/name` of the Hugging Face hub.
+
+        half  weights in float16, at half the size
+
+        Returns the address; `load("owner/name")` then gives the model anywhere. Needs the extra `hub` and a token.
+        Raises ValueError in one line when the hub refuses or cannot be reached.
+        """
+        return push(self.experiment, self.network, repo_id, private, half)
+
     def image_of(self, scan: Scan | RangeImage) -> RangeImage:
         """The scan in this model's image. Raises ValueError for an image of another size."""
         if isinstance(scan, Scan):
@@ -174,6 +185,11 @@ class LidarModel:
             raise ValueError(f"{self.experiment.name}: expected method repaint, since this network cannot be told the "
                              f"known pixels, found conditional")  # fmt: skip
         return method if method != "auto" else "conditional" if self.conditional else "repaint"
+
+    def _image(self, x_0: Tensor) -> RangeImage:
+        """x_0 (2, H, W) as an image; mixed pixels are mended for our own kind of network, R2DM's stay as published."""
+        image = from_x_0(x_0, self.sensor, self.experiment.data.codec)
+        return without_mixed_pixels(image) if self.conditional else image
 
     @property
     def _device(self) -> torch.device:
@@ -202,8 +218,10 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
     # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.
     beams = np.flatnonzero((gap.min(axis=1) < 0.5) & (own.mask.mean(axis=1) > 0.02))
     known = image.mask.copy()
+    # A beam of fewer returns a turn than columns leaves gaps: empty is what has no return within two columns.
+    answered = np.any([np.roll(own.mask, shift, axis=1) for shift in range(-2, 3)], axis=0)
     for beam in beams:
-        known[gap[beam].argmin()] |= ~own.mask[beam]
+        known[gap[beam].argmin()] |= ~answered[beam]
     return image, known
 
 
@@ -216,7 +234,7 @@ def _step(name: str):
 def _last(states: Iterator[State], on_step: OnStep) -> Tensor:
     """Run the sampler to its end; (B, 2, H, W)."""
     state = None
-    for state in states:
+    for state in states:  # noqa: B007, the last one counts
         if on_step is not None:
             on_step()
     assert state is not None
@@ -241,7 +259,8 @@ def _with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_r
 def load(source: str | Path = "default", ema: bool = True, device: str | torch.device = "cpu") -> LidarModel:
     """A trained model.
 
-    source  `default`: the shipped weights; the name of an official release; one of our folders; an official `.pth`
+    source  `default`: the shipped weights; the name of an official release; one of our folders; an official `.pth`;
+            `owner/name` of the Hugging Face hub
     ema     official files hold two sets of weights: their moving average (True), or the raw ones
 
     Raises ValueError, or OSError, with one line that says what was expected and what was found.

@@ -67,7 +67,7 @@ def default() -> Experiment:
         ),
         diffusion=Diffusion(kind="x_0", floor=1.0, mean_weight=False),
         training=Training(
-            steps=5_000,
+            steps=5_250,
             batch_size=4,
             learning_rate=5e-4,
             warmup=200,

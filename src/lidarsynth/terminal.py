@@ -42,6 +42,21 @@ def step_bar(title: str, steps: int) -> Iterator[Callable[[], object]]:
         yield bar.update
 
 
+@contextmanager
+def image_bar() -> Iterator[Callable[[str, int, int], object]]:
+    """A progress bar for work over two seconds; gives what to call with (what, images done, images in all)."""
+    from tqdm import tqdm
+
+    with tqdm(unit="image", delay=2, leave=False) as bar:
+
+        def on_images(what: str, done: int, total: int) -> None:
+            bar.total = total
+            bar.set_description(what, refresh=False)
+            bar.update(done - bar.n)
+
+        yield on_images
+
+
 def counted(stored: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
     """Pass (images done, images in all) on, under a progress bar."""
     from tqdm import tqdm

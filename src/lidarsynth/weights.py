@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from lidarsynth.build import RECORD, WEIGHTS, build_network, build_sensor, load, load_weights
 from lidarsynth.experiment import Card, Data, Experiment, with_fields
+from lidarsynth.hub import fetch, is_repository
 from lidarsynth.presets import PRESETS
 
 BASE_URL = "https://github.com/kazuto1011/r2dm/releases/download/weights"
@@ -82,7 +83,8 @@ def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = 
     """The experiment and the network, in evaluation mode, of trained weights.
 
     source    in this order: a shipped word (`default`); the name of an official release (`r2dm-h-kitti360`), which is
-              downloaded once; a folder that `build.save` wrote; an official `.pth` file. `./default` is always a path
+              downloaded once; a folder that `build.save` wrote; an official `.pth` file; a repository `owner/name` of
+              the Hugging Face hub, `owner/name@revision` for one of its versions. `./default` is always a path
     ema       of an official file, the moving average (True) or the raw weights
     on_bytes  called while a release downloads
 
@@ -100,6 +102,8 @@ def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = 
         return load(path)
     if path.is_file():
         return read_official(path, ema)
+    if isinstance(source, str) and is_repository(source):
+        return load(fetch(source))
     raise ValueError(_unknown(str(source)))
 
 
@@ -128,7 +132,7 @@ def cache_folder() -> Path:
 def _unknown(source: str) -> str:
     expected = f"expected shipped weights ({', '.join(shipped()) or 'none here'}), a release ({', '.join(RELEASES)})"
     found = "a preset, which has no trained weights" if source in PRESETS else "no file or folder of that name"
-    return f"{source}: {expected}, a model folder or an official .pth file, found {found}"
+    return f"{source}: {expected}, a model folder, an official .pth file or owner/name of a hub, found {found}"
 
 
 def read_official(path: str | Path, ema: bool = True) -> tuple[Experiment, nn.Module]:

@@ -15,20 +15,24 @@ from lidarsynth.data.index import REPORT, read_index, report
 from lidarsynth.data.kitti import kitti
 from lidarsynth.data.kitti360 import kitti360
 from lidarsynth.data.nuscenes import nuscenes
+from lidarsynth.data.recognise import recognise
 from lidarsynth.lidar.projection import PROJECTIONS, project, thin
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
 __all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "prepare", "scan_files", "summary"]
 
 
 @dataclass(frozen=True)
 class Source:
-    """A data set: its reader (root, split) -> Reader, and what its images are unless said otherwise."""
+    """A data set: its reader (root, split) -> Reader, and what its images are unless said otherwise.
+
+    sensor  None = recognised from the first scan
+    """
 
     reader: Callable[[Path, str], Reader]
     split: str
-    sensor: str
+    sensor: str | None
     projection: str
     width: int
 
@@ -38,7 +42,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "kitti": Source(kitti, "train", "hdl-64e-kitti", "unfolding", 512),
     "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
     "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
-    "files": Source(lambda root, split: scan_folder(root), "all", "hdl-64e-kitti", "auto", 1024),
+    "files": Source(lambda root, split: scan_folder(root), "all", None, "auto", 1024),
 }
 
 SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
@@ -75,14 +79,15 @@ def prepare(
     count: int = 1000,
     check: bool = False,
     seed: int = 0,
+    intensity: str = "auto",
 ) -> Iterator[tuple[int, int]]:
     """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others."""
     if name == "synthetic":
         spec = SYNTHETIC if sensor is None else sensor
-        return cache_synthetic(folder or root, count, spec, 1024 if width is None else width, seed, workers, check)
+        return cache_synthetic(folder or root, count, spec, _width(width, spec, 1024), seed, workers, check)
     if folder is None:
         raise ValueError(f"expected data {name} ROOT CACHE, found no CACHE")
-    return cache_source(name, root, folder, split, sensor, projection, width, workers, check)
+    return cache_source(name, root, folder, split, sensor, projection, width, workers, check, intensity)
 
 
 def cache_source(
@@ -95,23 +100,26 @@ def cache_source(
     width: int | None = None,
     workers: int | None = 0,
     check: bool = False,
+    intensity: str = "auto",
 ) -> Iterator[tuple[int, int]]:
     """Project a data set into a cache; yields (scans done, scans in all). What is None is the source's own.
 
     name     a word of SOURCES; `root` is where the data set lies, `folder` the cache; `split` a word of its reader
     workers, check  as in `write_cache`; None = as many as there are processors
+    intensity       scale of the source `files`, as in `files.read`
     Raises ValueError for unknown words, a root without scans, or a cache of something else; OSError for a full disk.
     """
     if name not in SOURCES:
         raise ValueError(f"expected a source of {', '.join(SOURCES)} or synthetic, found {name!r}")
     own = SOURCES[name]
-    split, projection, width = split or own.split, projection or own.projection, own.width if width is None else width
+    split, projection, width = split or own.split, projection or own.projection, _width(width, sensor, own.width)
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
-    spec = _sensor(sensor or own.sensor, width)
-    reader, columns = own.reader(Path(root), split), columns_of(projection, width)
+    reader, columns = _reader(name, Path(root), split, intensity), columns_of(projection, width)
+    spec = _sensor(sensor or own.sensor or _recognised(reader), width)
     image = Projected(reader, spec, projection, columns)
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
+    source |= {} if intensity == "auto" else {"intensity": intensity}
     source |= {"root": str(Path(root).resolve()), "missing": list(reader.missing)}
     for done in write_cache(folder, image, len(reader), spec, source, reader.name, _processes(workers), check):
         yield done, len(reader)
@@ -134,6 +142,35 @@ def cache_synthetic(
     source = {"name": "synthetic", "seed": seed}
     for done in write_cache(folder, streets.image, count, spec, source, workers=_processes(workers), check=check):
         yield done, count
+
+
+def _width(given: int | None, sensor: str | None, source: int) -> int:
+    """The given width, else that of a sensor of the user's own, else the source's."""
+    if given is not None:
+        return given
+    return source if sensor is None or sensor in SENSORS else get_sensor(sensor).width
+
+
+def _reader(name: str, root: Path, split: str, intensity: str) -> Reader:
+    if intensity == "auto":
+        return SOURCES[name].reader(root, split)
+    if name != "files":
+        raise ValueError(f"expected --intensity with files, whose scale is not known, found it with {name}")
+    return scan_folder(root, intensity)
+
+
+def _recognised(reader: Reader) -> str:
+    """The sensor's word, by the first scan that can be read. Raises ValueError that asks for --sensor."""
+    for i in range(len(reader)):
+        try:
+            scan = reader[i]
+        except ValueError:
+            continue  # it will be skipped, and named in the report
+        word, reason = recognise(scan, "/".join(reader.name(i)[1:]))
+        if word is None:
+            raise ValueError(reason)
+        return word
+    return "hdl-64e-kitti"  # no scan can be read: whatever the sensor, the cache says so
 
 
 def _sensor(name: str, width: int) -> Sensor:

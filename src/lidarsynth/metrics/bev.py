@@ -96,6 +96,19 @@ class BevCounts:
             raise ValueError(f"expected counts with bins, extent, near, far {own}, found {its}")
         self._add(other.count, other.pooled, other.scans)
 
+    def state(self) -> dict[str, Tensor]:
+        """Tensors by name, for a file or another process; the inverse of `load_state`."""
+        return {"count": torch.tensor(self.count), "pooled": self.pooled, "scans": self.scans}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Take in, with a grid and gate like its own, what `state` of another gave. Raises ValueError for others."""
+        found = {name: tuple(value.shape) for name, value in state.items()}
+        kept = len(state["scans"]) if "scans" in state else 0
+        expected = {"count": (), "pooled": (self.bins, self.bins), "scans": (kept, self.bins, self.bins)}
+        if found != expected:
+            raise ValueError(f"expected {expected}, found {found}")
+        self._add(int(state["count"]), state["pooled"], state["scans"].int())
+
     def _add(self, count: int, pooled: Tensor, scans: Tensor) -> None:
         free = len(scans) if self.keep is None else self.keep - sum(map(len, self._kept))
         if free > 0 and len(scans):

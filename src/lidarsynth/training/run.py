@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lidarsynth.build import build_network, build_sensor, read_experiment
+from lidarsynth.data.index import PLACE
 from lidarsynth.experiment import Card, Experiment, with_fields
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.presets import preset
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
-from lidarsynth.training.examples import Images, open_images
+from lidarsynth.training.examples import Images, Streets, open_images
 from lidarsynth.training.finetune import transfer
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str | Path | None = None) -> Experiment:
     """A preset with `group.field=value` changes, values in JSON or bare words, for the images of cache `data`.
 
-    The sensor and the resolution are the cache's, unless `changes` name them. Raises ValueError by the field's name.
+    Sensor, resolution and projection are the cache's, unless `changes` name them. Raises ValueError by name.
     """
     chosen: dict[str, Any] = {"training.seed": seed}
     for change in changes:
@@ -44,16 +45,21 @@ def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str |
         except json.JSONDecodeError:
             chosen[path] = text
     experiment = with_fields(preset(name), chosen)
-    return experiment if data is None else _for_images(experiment, data, any(key.startswith("data.") for key in chosen))
+    return experiment if data is None else _for_images(experiment, data, set(chosen))
 
 
-def _for_images(experiment: Experiment, data: str | Path, chosen: bool) -> Experiment:
-    """The experiment with the sensor of the images, unless the user chose fields of `data`."""
-    found, expected = open_images(data, experiment).sensor, build_sensor(experiment)
+def _for_images(experiment: Experiment, data: str | Path, chosen: set[str]) -> Experiment:
+    """The experiment with the projection and the sensor of the images, unless the user chose those fields."""
+    images = open_images(data, experiment)
+    projection, drawn = experiment.data.projection, images.source.get("projection", experiment.data.projection)
+    if "data.projection" not in chosen and (projection, drawn) != ("auto", "unfolding"):  # auto unfolds what it can
+        experiment = with_fields(experiment, {"data.projection": drawn})
+    found, expected = images.sensor, build_sensor(experiment)
     shape, (height, width) = (found.height, found.width), (expected.height, expected.width)
-    if chosen and shape != (height, width):
+    own = bool(chosen & {"data.sensor", "data.height", "data.width"})
+    if own and shape != (height, width):
         raise ValueError(f"{data}: expected images of {height} x {width}, found {shape[0]} x {shape[1]}")
-    if chosen or found == expected:
+    if own or found == expected:
         return experiment
     words = [w for w, s in SENSORS.items() if s.height % found.height == 0 and s.resized(*shape) == found]
     sensor = words[0] if words else found.to_dict()
@@ -111,7 +117,7 @@ def _begin(
                          f"found {found.height} x {found.width}")  # fmt: skip
     with fixed_randomness(experiment.training.seed):
         network = build_network(experiment)
-    card = Card(data=json.dumps(images.source))
+    card = replace(experiment.card, data=_learned_from(images))
     saved = checkpoints(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
@@ -119,17 +125,26 @@ def _begin(
         source, trained = load_parts(weights)
         transfer(network, experiment, trained, source, weights)
         learned = "; ".join(filter(None, (source.card.data, card.data)))
-        card = Card(source.card.licence, learned, (*source.card.history, f"from {source.name}"))
+        licence = card.licence or source.card.licence
+        card = Card(licence, learned, (*source.card.history, f"from {source.name}"))
     state = start(experiment, network, accelerator.scaler)
     if saved:
         card = _same_experiment(saved[-1], experiment).card
-        card = replace(card, history=card.history[:-1])  # the last line is this run's, written anew at each checkpoint
+        # The history's last line is this run's, written anew at each checkpoint.
+        card = replace(card, history=card.history[:-1], licence=experiment.card.licence or card.licence)
         load_run(saved[-1] / STATE, state)
     elif accelerator.is_main_process:
         out.mkdir(parents=True, exist_ok=True)
         sweep(out)
     accelerator.wait_for_everyone()
     return replace(experiment, card=card), state
+
+
+def _learned_from(images: Images) -> str:
+    """What a card says of the images: how many of what, and not where they lie on this disk."""
+    count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
+    details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
+    return ", ".join([f"{count} images of {images.source['name']}", *details])
 
 
 def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:

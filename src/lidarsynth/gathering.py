@@ -1,0 +1,131 @@
+"""Images -> statistics of a protocol: which networks are here, which images count, and going on after a stop."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from torch import nn
+
+from lidarsynth.data.cache import sha256
+from lidarsynth.image_sets import ImageSet
+from lidarsynth.metrics.pointnet import read_pointnet
+from lidarsynth.metrics.protocols import Network, Protocol
+from lidarsynth.metrics.rangenet import read_rangenet
+from lidarsynth.metrics.statistics import Statistics, load_statistics, save_statistics
+from lidarsynth.weights import cache_folder
+
+SAVE_EVERY = 60.0  # seconds between two writings of unfinished statistics: what a kill can cost
+OnImages: TypeAlias = Callable[[str, int, int], object] | None  # (what, images done, images in all), for progress bars
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A protocol's networks that are here, the SHA-256 of their files, and why the others are not."""
+
+    networks: dict[str, nn.Module] = field(default_factory=dict)
+    weights: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+
+
+def load_networks(protocol: Protocol, width: int, device: str = "cpu") -> Loaded:
+    """The networks whose official files are in the cache folder. Raises ValueError for a damaged or another file."""
+    loaded = Loaded()
+    for network in protocol.networks:
+        name = network.file(width)
+        if name is None:
+            widths = ", ".join(str(w) for w, _ in network.files)
+            loaded.missing[network.kind] = f"no official {network.kind} for {width} columns, only for {widths}"
+        elif not (path := cache_folder() / name).is_file():
+            loaded.missing[network.kind] = f"put {name} at {path}"
+        else:
+            loaded.networks[network.kind] = _read_network(network, path).to(device)
+            loaded.weights[network.kind] = sha256(path)
+    return loaded
+
+
+def _read_network(network: Network, path: Path) -> nn.Module:
+    if network.kind == "pointnet":
+        return read_pointnet(path)
+    rangenet = read_rangenet(path)
+    if rangenet.layers != network.layers:
+        raise ValueError(f"{path}: expected RangeNet-{network.layers}, found RangeNet-{rangenet.layers}")
+    return rangenet
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Numbers of the images that count for features, and for the bird's eye view."""
+
+    features: frozenset[int]
+    bev: frozenset[int]
+
+    def numbers(self) -> list[int]:
+        return sorted(self.features | self.bev)
+
+
+def select(protocol: Protocol, role: Literal["samples", "real"], names: Sequence[str], samples: int = 0) -> Selection:
+    """Which images of a set the protocol takes; `samples` is how many there are to judge.
+
+    Raises ValueError when the protocol takes only some sequences, the names tell sequences, and none is theirs.
+    """
+    if role == "samples":
+        limits = (protocol.samples, protocol.samples_bev)
+        return Selection(*(frozenset(range(len(names))[:limit]) for limit in limits))
+    chosen = []
+    for sequences, limit in ((protocol.sequences, protocol.real), (protocol.sequences_bev, protocol.real_bev)):
+        of_protocol = [i for i, name in enumerate(names) if any(part in name for part in sequences)]
+        numbers = of_protocol or list(range(len(names)))
+        if limit is not None:
+            random.Random(0).shuffle(numbers)  # as R2DM and LiDARGen order their real scans
+            numbers = numbers[: samples if limit == 0 else limit]
+        chosen.append(frozenset(numbers))
+    return Selection(*chosen)
+
+
+def gather(
+    images: ImageSet,
+    numbers: Sequence[int],
+    chosen: Selection,
+    empty: Statistics,
+    projection: str,
+    unfinished: Path | None = None,
+    batch_size: int = 4,
+    on_images: OnImages = None,
+) -> Statistics:
+    """Statistics of the images `numbers`, added to `empty`; killed at any moment, the next call goes on.
+
+    unfinished  where to keep what is gathered so far, or None; its name must tell images, protocol and weights apart.
+                The file stays until the caller takes it away
+    """
+    statistics, done = empty, 0
+    if unfinished and unfinished.is_file():
+        statistics, metadata = load_statistics(unfinished, empty.protocol)
+        statistics.networks, statistics.weights = empty.networks, empty.weights
+        done = int(metadata["done"])
+    saved = time.monotonic()
+    for start in range(done, len(numbers), batch_size):
+        batch = numbers[start : start + batch_size]
+        arrays = [images.image(i, empty.sensor, projection, resize=empty.role == "real") for i in batch]
+        statistics.update(arrays, [i in chosen.features for i in batch], [i in chosen.bev for i in batch])
+        if on_images:
+            on_images(empty.role, start + len(batch), len(numbers))
+        if unfinished and time.monotonic() - saved > SAVE_EVERY:
+            save_statistics(unfinished, statistics, {"done": str(start + len(batch))})
+            saved = time.monotonic()
+    return statistics
+
+
+def part_of(numbers: list[int], part: str | None) -> list[int]:
+    """Part `i/n` of a list, i from 1; all of it for None. Raises ValueError."""
+    if part is None:
+        return numbers
+    words = part.split("/")
+    if len(words) != 2 or not all(w.isdecimal() for w in words) or not 1 <= int(words[0]) <= int(words[1]):
+        raise ValueError(f"expected a part such as 1/2, found {part!r}")
+    i, n = map(int, words)
+    return numbers[len(numbers) * (i - 1) // n : len(numbers) * i // n]

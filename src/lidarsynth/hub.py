@@ -1,0 +1,151 @@
+"""Models on the Hugging Face hub: a repository holds our two files and a model card that is filled in from them."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from torch import nn
+
+from lidarsynth.build import RECORD, WEIGHTS, build_sensor, save
+from lidarsynth.experiment import Card, Experiment
+
+REPOSITORY = re.compile(r"(?P<id>[\w-][\w.-]*/[\w-][\w.-]*)(@(?P<revision>[\w./-]+))?", re.ASCII)
+HUB = "https://huggingface.co"
+LICENCES = {  # how a card's licence begins -> the hub's word for it
+    "MIT": "mit",
+    "Apache-2.0": "apache-2.0",
+    "CC BY-NC-SA 3.0": "cc-by-nc-sa-3.0",
+    "CC BY-NC-SA 4.0": "cc-by-nc-sa-4.0",
+    "CC BY 4.0": "cc-by-4.0",
+    "CC0": "cc0-1.0",
+}
+
+
+def is_repository(source: str) -> bool:
+    """Whether a word could name a repository: `owner/name` or `owner/name@revision`, and no file."""
+    return REPOSITORY.fullmatch(source) is not None and not source.endswith((".pth", ".safetensors"))
+
+
+def fetch(source: str) -> Path:
+    """The folder, in the hub's own cache, of the model of a repository `owner/name` or `owner/name@revision`.
+
+    It is downloaded once; without network the copy of the last time serves. Raises ValueError in one line when there is
+    no such repository or no network, ImportError naming the extra `hub`.
+    """
+    match = REPOSITORY.fullmatch(source)
+    if match is None:
+        raise ValueError(f"expected a repository owner/name or owner/name@revision, found {source!r}")
+    hub = _huggingface_hub()
+    with _in_one_line(f"{source}: expected a model folder here, or a repository of {HUB}"):
+        folder = Path(hub.snapshot_download(match["id"], revision=match["revision"], allow_patterns=[WEIGHTS, RECORD]))
+    if not (folder / RECORD).is_file():
+        raise ValueError(f"{HUB}/{source}: expected {WEIGHTS} and {RECORD}, found no {RECORD}")
+    return folder
+
+
+def push(experiment: Experiment, network: nn.Module, repo_id: str, private: bool = False, half: bool = False) -> str:
+    """Upload weights (float16 if `half`), record and model card to `owner/name` in one commit; returns its address.
+
+    The repository is made where there is none. Needs a token, from `hf auth login` or HF_TOKEN. Raises ValueError in
+    one line when the hub refuses or there is no network, ImportError naming the extra `hub`.
+    """
+    match = REPOSITORY.fullmatch(repo_id)
+    if match is None or match["revision"]:
+        raise ValueError(f"expected a repository owner/name, found {repo_id!r}")
+    hub = _huggingface_hub()
+    with tempfile.TemporaryDirectory() as scratch:
+        save(scratch, experiment, network, half)
+        (Path(scratch) / "README.md").write_text(card_text(experiment, repo_id), encoding="utf-8")
+        with _in_one_line(f"{repo_id}: expected to write to {HUB}"):
+            hub.create_repo(repo_id, private=private, exist_ok=True)
+            hub.upload_folder(repo_id=repo_id, folder_path=scratch, commit_message=f"lidarsynth: {experiment.name}")
+    return f"{HUB}/{repo_id}"
+
+
+def card_text(experiment: Experiment, repo_id: str = "owner/name") -> str:
+    """The model card of a repository, Markdown under the hub's metadata: what it is, where it learned, its licence.
+
+    Everything in it comes from the experiment and its card. Raises ValueError when the experiment has no valid sensor.
+    """
+    sections = [_metadata(experiment.card.licence), _title(experiment), _usage(repo_id), _table(experiment)]
+    sections += _story(experiment.card)
+    return "\n\n".join(sections) + "\n"
+
+
+def _metadata(licence: str) -> str:
+    lines = ["library_name: lidarsynth", "tags: [lidar, point-cloud, range-image, diffusion]"]
+    if licence:
+        word = next((word for start, word in LICENCES.items() if licence.startswith(start)), "other")
+        lines.append(f"license: {word}")
+        lines += [f"license_name: {json.dumps(licence)}"] if word == "other" else []
+    return "\n".join(["---", *lines, "---"])
+
+
+def _title(experiment: Experiment) -> str:
+    what = "generates and completes" if experiment.model.network == "conditional-unet" else "generates"
+    return (
+        f"# {experiment.name}, {build_sensor(experiment).name}\n\nA diffusion model that {what} LiDAR scans, made with "
+        "lidarsynth after R2DM ([arXiv 2309.09256](https://arxiv.org/abs/2309.09256))."
+    )
+
+
+def _usage(repo_id: str) -> str:
+    return f"""```python
+import lidarsynth as ls  # pip install 'lidarsynth[hub]'
+
+model = ls.load("{repo_id}")
+images = model.generate(4, steps=32, seed=0)
+dense = model.complete(ls.read("scan.pcd"))
+```"""
+
+
+def _table(experiment: Experiment) -> str:
+    data, model, diffusion, training = experiment.data, experiment.model, experiment.diffusion, experiment.training
+    sensor, weighted = build_sensor(experiment), "none" if diffusion.gamma is None else f"min-SNR {diffusion.gamma:g}"
+    rows = {
+        "sensor": f"{sensor.name}, {sensor.height} beams from {sensor.elevations[0]:+.2f} to "
+        f"{sensor.elevations[-1]:+.2f} degrees, {sensor.min_range:g} to {sensor.max_range:g} m",
+        "images": f"{data.height} x {data.width}, {data.projection} projection, {data.codec} range, reflectance 0 to 1",
+        "network": f"{model.network}, base {model.base_channels} x {list(model.channel_multipliers)}, blocks "
+        f"{list(model.num_residual_blocks)}, stem {model.stem[0]}x{model.stem[1]}, {model.coords_encoding}",
+        "diffusion": f"{diffusion.schedule} schedule, predicts {diffusion.kind}, {diffusion.loss} loss, "
+        f"weighting {weighted}",
+        "training": f"{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}, "
+        f"seed {training.seed}",
+        "augmentation": ", ".join(w for w, on in (("roll", data.roll), ("mirror", data.mirror)) if on) or "none",
+    }
+    return "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows.items())])
+
+
+def _story(card: Card) -> list[str]:
+    """The sections of what the card holds; what it does not say is said to be unknown, not left out."""
+    sections = [f"## Learned from\n\n{card.data or 'Not recorded.'}"]
+    sections.append(f"## Licence\n\n{card.licence or 'Not stated: ask the owner before use.'}")
+    for title, lines in (("History", card.history), ("Results", card.results)):
+        if lines:
+            sections.append("\n".join([f"## {title}", "", *(f"- {line}" for line in lines)]))
+    return sections
+
+
+def _huggingface_hub():
+    try:
+        import huggingface_hub
+    except ImportError:
+        raise ImportError("models of the Hugging Face hub need huggingface_hub: "
+                          "pip install 'lidarsynth[hub]'") from None  # fmt: skip
+    return huggingface_hub
+
+
+@contextmanager
+def _in_one_line(expected: str) -> Iterator[None]:
+    """Turns whatever huggingface_hub raises, its own errors and those of its network library, into one line."""
+    try:
+        yield
+    except Exception as error:  # the network library, and with it the errors, differs from version to version
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{expected}, found: {reason:.300}") from None

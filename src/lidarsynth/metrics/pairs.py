@@ -1,0 +1,85 @@
+"""Protocols that compare image i with image i: errors of range and reflectance, agreement of classes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from hashlib import blake2b
+
+import numpy as np
+import torch
+from torch import nn
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.metrics.evaluate import Report, Result
+from lidarsynth.metrics.protocols import Protocol
+from lidarsynth.metrics.rangenet import RangeNet
+from lidarsynth.metrics.reconstruction import (
+    Errors,
+    confusion_matrix,
+    mean_errors,
+    mean_iou,
+    reconstruction_errors,
+    weighted_iou,
+)
+
+
+class Pairs:
+    """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None."""
+
+    def __init__(self, protocol: Protocol, classes: RangeNet | None = None):
+        self.protocol, self.classes = protocol, classes
+        self.errors: list[Errors] = []
+        self.confusion = np.zeros((20, 20), np.int64)
+        self.lit = False
+        self._digests = [blake2b(digest_size=16), blake2b(digest_size=16)]
+
+    def update(self, results: Sequence[RangeImage], truths: Sequence[RangeImage]) -> None:
+        """Take in a batch of images and their truths, all pixels of both. Raises ValueError for different sizes."""
+        for result, truth in zip(results, truths, strict=True):
+            self.errors.append(reconstruction_errors(result, truth))
+            self.lit |= bool(result.reflectance.any())
+            for digest, image in zip(self._digests, (result, truth), strict=True):
+                digest.update(np.ascontiguousarray(np.stack([image.range, image.reflectance])).tobytes())
+        if self.classes and results:
+            labels = [self._labels(images) for images in (truths, results)]
+            self.confusion += confusion_matrix(*labels)
+
+    @torch.no_grad()
+    def _labels(self, images: Sequence[RangeImage]) -> np.ndarray:
+        """(B, H, W) class of every pixel, also of those without a return, as LiDARGen judges."""
+        assert self.classes
+        device = self.classes.means.device
+        pixels = np.stack([np.stack([i.range, *np.moveaxis(i.points(), -1, 0), i.reflectance]) for i in images])
+        masks = torch.from_numpy(np.stack([image.mask for image in images])).to(device)
+        inputs = self.classes.network_input(torch.from_numpy(pixels.astype(np.float32)).to(device), masks)
+        return self.classes(inputs).argmax(1).cpu().numpy()
+
+    def report(self, missing: Mapping[str, str] | None = None, weights: Mapping[str, str] | None = None) -> Report:
+        """The protocol's rows so far. Raises ValueError for no pair."""
+        mean, results = mean_errors(self.errors), []
+        for row in self.protocol.rows:
+            reason = ""
+            if row.network and not self.classes:
+                reason = (missing or {}).get(row.network, f"no {row.network} is here")
+            elif (row.network or row.measure == "reflectance-mae") and not self.lit:
+                reason = "the samples have no reflectance"
+            value = None if reason else MEASURES[row.measure](mean, self.confusion) * row.scale
+            results.append(Result(row.name, value, row.unit, row.digits, reason))
+        counts = {"samples": len(self.errors), "reference": len(self.errors)}
+        names = ("samples", "reference")
+        hashes = {name: digest.hexdigest() for name, digest in zip(names, self._digests, strict=True)}
+        return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {})
+
+
+MEASURES: dict[str, Callable[[Errors, np.ndarray], float]] = {
+    "range-mae": lambda errors, confusion: errors.range_mae,
+    "reflectance-mae": lambda errors, confusion: errors.reflectance_mae,
+    "iou": lambda errors, confusion: mean_iou(confusion),
+    "iou-weighted": lambda errors, confusion: weighted_iou(confusion),
+}
+
+
+def classes_of(networks: Mapping[str, nn.Module]) -> RangeNet | None:
+    """The segmenter among a protocol's networks, or None."""
+    network = networks.get("rangenet")
+    return network if isinstance(network, RangeNet) else None

@@ -1,0 +1,234 @@
+"""Protocols: what exactly a number in a table means. A frozen record each, with a name and a version; pure Python.
+
+The same generator is reported with a JSD of 0.0305, 0.0578, 0.168 and 0.32 in four papers, because every program gates,
+bins, pools and roots differently. A number is compared with another of the same protocol and version only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Side = Literal["samples", "real", "bev"]
+
+
+@dataclass(frozen=True)
+class Network:
+    """A feature network with published weights, and which of its values are the features."""
+
+    kind: Literal["rangenet", "pointnet"]
+    files: tuple[tuple[int, str], ...]  # image width -> official file; width 0: any
+    layer: str  # in words
+    features: int  # numbers per image
+    layers: int = 0  # of a RangeNet, 21 or 53
+
+    def file(self, width: int) -> str | None:
+        """The official file for images of this width, or None where there is none."""
+        return dict(self.files).get(width, dict(self.files).get(0))
+
+
+@dataclass(frozen=True)
+class Bev:
+    """Bird's-eye-view histograms: gate near < |xyz| < far in metres, strict; bins x bins cells over +-extent metres."""
+
+    bins: int = 100
+    extent: float = 80.0
+    near: float = 3.0
+    far: float = 70.0
+    width: float = 0.5  # of the Gaussian kernel between histograms of sum 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of the table."""
+
+    name: str
+    measure: str  # a word of `evaluate.MEASURES` or, where images are compared in pairs, of `pairs.MEASURES`
+    formula: str  # what is squared or rooted, in words
+    network: Literal["rangenet", "pointnet"] | None = None  # whose features it needs
+    scale: float = 1.0  # the table shows value * scale
+    unit: str = ""
+    digits: int = 3
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How samples are judged against a reference. Raises nothing: its fields are plain.
+
+    sensor, height, width  the images; scans without an image are projected into these
+    near, far              metres, strict: pixels outside count as empty, on the sides `gated`
+    resizing               how larger reference images come to the samples' size
+    samples, samples_bev   the first so many, sorted by name, are judged by features and by BEV; None = all
+    real, real_bev         so many, after `Random(0).shuffle`; None = all, 0 = as many as samples
+    sequences, sequences_bev  parts of the names of the reference's sequences; () = all
+    reproject              samples are turned into points and drawn again for image features (LiDARGen's quirk)
+    subsets, subset_size   of the polynomial MMD, k(x, y) = (x.y / D + 1)^3
+    keep                   features of at most so many images stay for that MMD; they are those of the BEV
+    pairs                  sample i is compared with reference i
+    absent                 rows of the published table that nobody here can compute -> why
+    """
+
+    name: str
+    version: int
+    source: str
+    rows: tuple[Row, ...]
+    networks: tuple[Network, ...] = ()
+    bev: Bev | None = None
+    sensor: str = "hdl-64e"
+    height: int = 64
+    width: int = 1024
+    projection: str = "spherical"
+    near: float = 0.5
+    far: float = 63.0
+    gated: tuple[Side, ...] = ("samples", "real", "bev")
+    resizing: str = "nearest-exact"
+    samples: int | None = 10_000
+    samples_bev: int | None = 10_000
+    real: int | None = None
+    real_bev: int | None = 10_000
+    sequences: tuple[str, ...] = ()
+    sequences_bev: tuple[str, ...] = ()
+    reproject: bool = False
+    subsets: int = 100
+    subset_size: int = 1000
+    keep: int = 10_000
+    beam_step: float = 0.5  # metres, bins of the range histogram per beam
+    pairs: bool = False
+    absent: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        return f"{self.name} v{self.version}"
+
+    def network(self, kind: str | None) -> Network | None:
+        """The protocol's network of this kind, or None."""
+        return next((network for network in self.networks if network.kind == kind), None)
+
+
+RANGENET_53 = Network(
+    "rangenet",
+    ((2048, "darknet53.tar.gz"), (1024, "darknet53-1024.tar.gz"), (512, "darknet53-512.tar.gz")),
+    "decoder output before dropout and head, 4096 positions random.Random(0).sample(range(32 H W), 4096), C-major",
+    4096,
+    layers=53,
+)
+POINTNET = Network(
+    "pointnet",
+    ((0, "cls_model_39.pth"),),
+    "maximum over points (1024), hidden layers (512, 256), logits (16) of points / 80 m, removed ones at the origin",
+    1808,
+)
+
+FRECHET = "|mu - mu'|^2 + tr(S + S' - 2 sqrt(S S')), covariances by n - 1, no epsilon, not rooted"
+KERNEL = "unbiased squared MMD, (x.y / D + 1)^3, mean over subsets, not rooted"
+JSD = "Jensen-Shannon distance: root of the divergence, natural logarithm, histograms pooled over scans"
+MMD = "biased squared MMD, exp(-|p - q|^2 / (2 0.5^2)), diagonals included, not rooted, histogram per scan"
+
+_FRD = Row("FRD", "frechet", FRECHET, "rangenet", digits=1)
+_FPD = Row("FPD", "frechet", FRECHET, "pointnet")
+_BEV_ROWS = (Row("MMD x1e4", "bev-mmd", MMD, scale=1e4), Row("JSD x1e2", "bev-jsd", JSD, scale=1e2))
+_BEAMS = (
+    Row("no return, per beam", "drop-rate", "mean over beams of |share without return - reference's|", None, 100, "%"),
+    Row("range, per beam", "beam-range", "mean over beams of the Wasserstein-1 distance of ranges", None, 1, "m"),
+)
+
+R2DM = Protocol(
+    "r2dm-2024",
+    1,
+    "Nakashima & Kurazume, ICRA 2024, table II and the official evaluation program",
+    (
+        _FRD,
+        _FPD,
+        *_BEV_ROWS,
+        Row("FRD squared MMD", "kernel", KERNEL, "rangenet"),
+        Row("FPD squared MMD", "kernel", KERNEL, "pointnet"),
+    ),
+    (RANGENET_53, POINTNET),
+    Bev(),
+    notes=(
+        "all real images for FRD and FPD; BEV takes 10,000 of them after Random(0).shuffle",
+        "the squared MMDs are drawn from a seeded generator, the official one is not seeded; and, so that memory stays "
+        "bounded, from the features of the BEV's 10,000",
+    ),
+)
+
+LIDARGEN = Protocol(
+    "lidargen-2022",
+    1,
+    "Zyrianov et al., ECCV 2022, and the official evaluation programs",
+    (_FRD, *_BEV_ROWS),
+    (RANGENET_53,),
+    Bev(),
+    gated=("samples",),
+    samples=1100,
+    samples_bev=None,
+    real=0,
+    real_bev=None,
+    sequences=("0000_sync", "0001_sync"),
+    sequences_bev=("0000_sync", "0002_sync"),
+    reproject=True,
+    notes=(
+        "for the FRD samples are gated, turned into points and drawn again, and their first point is lost; the real "
+        "scan's first point is not known in an image and stays",
+        "no epsilon on the covariance: the official program adds 1e-6 only where its root is not finite",
+    ),
+)
+
+_EMD = "needs the earth mover's distance between all pairs of 2,048 sets of 2,048 points, which is not here"
+DUSTY = Protocol(
+    "dusty-2023",
+    1,
+    "Nakashima et al., WACV 2023, test script",
+    (_FPD, Row("KPD", "kernel", KERNEL, "pointnet")),
+    (POINTNET,),
+    sensor="hdl-64e-kitti",
+    width=512,
+    projection="unfolding",
+    near=1.45,
+    far=80.0,
+    samples=50_000,
+    absent=(
+        ("SWD", "sliced Wasserstein distance of Laplacian pyramids is not here"),
+        ("JSD", "needs 2,048 farthest points of every scan, which is not here"),
+        *((name, _EMD) for name in ("COV", "MMD", "1-NNA")),
+    ),
+    notes=("the reference is the training set", "KPD takes its subsets from at most 10,000 images per side"),
+)
+
+R2DM_UPSAMPLING = Protocol(
+    "r2dm-upsampling-2024",
+    1,
+    "Nakashima & Kurazume, ICRA 2024, table III (4x beams); no program was published, so pixels are LiDARGen's",
+    (
+        Row("range MAE", "range-mae", "mean over all pixels, empty ones as 0 m", unit="m"),
+        Row("reflectance MAE", "reflectance-mae", "mean over all pixels, empty ones as 0", digits=4),
+        Row("IoU", "iou", "mean over 19 classes, pixels of class 0 left out (RangeNet)", "rangenet", 100, "%", 2),
+        Row("IoU weighted", "iou-weighted", "by pixels, class 0 counts too (LiDARGen)", "rangenet", 100, "%", 2),
+    ),
+    (replace(RANGENET_53, layer="argmax of the logits, of the result and of the truth; no kNN"),),
+    near=0.0,
+    far=float("inf"),
+    gated=(),
+    samples=None,
+    pairs=True,
+    notes=("which of the two IoUs the paper has is not known",),
+)
+
+BEV_1 = Protocol(
+    "bev-1",
+    1,
+    "lidarsynth: needs no weights; r2dm-2024's gates, grid and kernel, and a report per beam",
+    (*_BEV_ROWS, *_BEAMS),
+    (),
+    Bev(),
+)
+
+PROTOCOLS: dict[str, Protocol] = {p.name: p for p in (R2DM, LIDARGEN, DUSTY, R2DM_UPSAMPLING, BEV_1)}
+
+
+def get_protocol(name: str) -> Protocol:
+    """A protocol by its name. Raises ValueError that lists the names."""
+    if name not in PROTOCOLS:
+        raise ValueError(f"expected a protocol of {', '.join(PROTOCOLS)}, found {name!r}")
+    return PROTOCOLS[name]

@@ -1,0 +1,307 @@
+"""Evaluation as a user meets it: every form of samples, kept and merged statistics, the verb, and how it refuses."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lidarsynth as ls
+from lidarsynth import evaluation, gathering
+from lidarsynth.cli import main
+from lidarsynth.data.dataset import write_cache
+from lidarsynth.data.files import write
+from lidarsynth.image_sets import image_set
+from lidarsynth.lidar.projection import thin
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.metrics.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING
+from lidarsynth.metrics.statistics import load_statistics
+
+SENSOR = SENSORS["hdl-64e"].resized(width=64)
+
+
+def street(seed: int, sensor: Sensor = SENSOR) -> RangeImage:
+    """A road between walls at some distance, with ray-drop."""
+    rng = np.random.default_rng(seed)
+    rays = sensor.directions()
+    with np.errstate(divide="ignore"):
+        wall = rng.uniform(5, 12) / np.abs(rays[..., 1])
+        distance = np.minimum(np.where(rays[..., 2] < 0, -1.7 / rays[..., 2], np.inf), wall)
+    mask = (distance < 60) & (distance > 2) & (rng.random(distance.shape) < 0.9)
+    reflectance = rng.random(distance.shape).astype(np.float32) * mask
+    return RangeImage(np.where(mask, distance, 0).astype(np.float32), reflectance, mask, sensor)
+
+
+STREETS = [street(i) for i in range(6)]
+REAL = [street(i) for i in range(100, 108)]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def saved(folder: Path, images: list[RangeImage], form: str = "npz") -> Path:
+    """A folder of the images as `.npz`, `.ply`, or official samples of R2DM or LiDARGen."""
+    folder.mkdir(parents=True)
+    for i, image in enumerate(images):
+        if form == "r2dm":
+            xyz = np.moveaxis(image.points(), -1, 0)
+            torch.save(torch.from_numpy(np.stack([image.range, *xyz, image.reflectance])), folder / f"{i:010d}.pth")
+        elif form == "lidargen":
+            code = torch.from_numpy(np.log2(image.range + 1) / 6)
+            torch.save(torch.stack([code, torch.from_numpy(image.reflectance)]), folder / f"{i}.pth")
+        else:
+            write(folder / f"{i}.{form}", image)
+    return folder
+
+
+@pytest.fixture
+def real(tmp_path: Path) -> Path:
+    return saved(tmp_path / "real", REAL)
+
+
+def test_a_list_of_images_is_judged_in_memory():
+    report = ls.evaluate(STREETS, REAL, protocol="bev-1")
+    assert report.counts["samples"] == 6 and report.counts["reference"] == 8
+    assert 0 < report.values["JSD x1e2"] < 50
+    assert report.beams is not None and len(report.beams.drop_rate) == 64
+    same = ls.evaluate(STREETS, STREETS, protocol="bev-1")
+    assert same.values == pytest.approx(dict.fromkeys(same.values, 0), abs=1e-4)
+
+
+@pytest.mark.parametrize(("form", "exact"), [("npz", True), ("r2dm", True), ("lidargen", False)])
+def test_every_form_of_the_same_samples_scores_the_same(form, exact, tmp_path: Path, real: Path):
+    expected = ls.evaluate(STREETS, REAL)
+    report = ls.evaluate(saved(tmp_path / form, STREETS, form), real)
+    # LiDARGen's code is a logarithm in float32: a point may pass a cell's edge
+    assert report.values == pytest.approx(expected.values, rel=1e-6 if exact else 0.02)
+    assert (report.hashes["samples"] == expected.hashes["samples"]) == exact
+
+
+def test_points_are_drawn_into_the_images_of_the_reference(tmp_path: Path, real: Path):
+    sensor = SENSORS["hdl-64e-kitti"].resized(width=64)
+    truth = [street(i, sensor) for i in range(100, 104)]
+    points = saved(tmp_path / "ply", [street(i, sensor) for i in range(4)], "ply")
+    report = ls.evaluate(points, saved(tmp_path / "truth", truth))
+    expected = ls.evaluate([street(i, sensor) for i in range(4)], truth)
+    assert report.values == pytest.approx(expected.values, rel=1e-4)
+
+
+def test_a_cache_is_a_reference_and_larger_images_are_thinned(tmp_path: Path):
+    wide = SENSORS["hdl-64e"].resized(width=128)
+    large = [street(i, wide) for i in range(5)]
+    for _ in write_cache(tmp_path / "large", large.__getitem__, len(large), wide, {"name": "streets"}):
+        pass
+    report = ls.evaluate(STREETS, tmp_path / "large")
+    expected = ls.evaluate(STREETS, [thin(image, 64, 64) for image in large])
+    assert report.values == pytest.approx(expected.values, rel=0.02), "a cache rounds to 2 mm"
+    with pytest.raises(ValueError, match="expected a reference of the samples' 64 x 128 pixels or a multiple"):
+        ls.evaluate(large, STREETS)
+
+
+def test_statistics_of_the_reference_are_kept_shared_and_verified(tmp_path: Path, real: Path, cache: Path):
+    calls: list[tuple[str, int, int]] = []
+    first = evaluation.evaluate(STREETS, real, on_images=lambda *told: calls.append(told))
+    assert calls[-1] == ("real", 8, 8)
+    calls.clear()
+    again = evaluation.evaluate(STREETS, real, on_images=lambda *told: calls.append(told))
+    assert {what for what, _, _ in calls} == {"samples"}, "the reference is not read twice"
+    assert again.values == first.values
+    (kept,) = (cache / "statistics").iterdir()
+    assert first.sources["reference statistics"] == str(kept)
+    shared = tmp_path / "given.safetensors"
+    shared.write_bytes(kept.read_bytes())
+    assert ls.evaluate(STREETS, shared).values == first.values
+    content = bytearray(kept.read_bytes())
+    content[-1] ^= 1
+    shared.write_bytes(content)
+    with pytest.raises(ValueError, match=r"given.safetensors: expected the content of SHA-256"):
+        ls.evaluate(STREETS, shared)
+    write(real / "8.npz", street(200))
+    assert ls.evaluate(STREETS, real).counts["reference"] == 9, "a changed folder is read anew"
+
+
+def test_two_machines_share_the_samples(tmp_path: Path, real: Path):
+    samples = saved(tmp_path / "samples", STREETS)
+    parts = [tmp_path / f"{i}.safetensors" for i in (1, 2)]
+    for i, part in enumerate(parts, 1):
+        evaluation.gather_part(samples, f"{i}/2", part, "bev-1")
+    report, whole = ls.evaluate(parts, real), ls.evaluate(samples, real)
+    assert report.values == pytest.approx(whole.values, rel=1e-5)
+    assert report.hashes["samples"] == whole.hashes["samples"]
+    with pytest.raises(ValueError, match="expected a part of its own"):
+        ls.evaluate([parts[0], parts[0]], real)
+    with pytest.raises(ValueError, match="expected only files of statistics"):
+        ls.evaluate([parts[0], samples], real)
+    with pytest.raises(ValueError, match="expected a part such as 1/2, found '3/2'"):
+        evaluation.gather_part(samples, "3/2", parts[0], "bev-1")
+
+
+def test_a_stopped_evaluation_goes_on(tmp_path: Path, real: Path, cache: Path, monkeypatch: pytest.MonkeyPatch):
+    samples = saved(tmp_path / "samples", STREETS)
+    expected = ls.evaluate(STREETS, real)
+    monkeypatch.setattr(gathering, "SAVE_EVERY", 0.0)
+    seen: list[int] = []
+
+    def stop(what: str, done: int, total: int) -> None:
+        seen.append(done)
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluation.evaluate(samples, real, batch_size=1, on_images=stop)
+    assert seen == [1, 2, 3, 4]
+    seen.clear()
+    report = evaluation.evaluate(samples, real, batch_size=1, on_images=lambda what, done, total: seen.append(done))
+    assert seen[0] == 4, "three images were kept"
+    assert report.values == pytest.approx(expected.values, rel=1e-6)
+    assert report.hashes["samples"] == expected.hashes["samples"]
+    assert not list((cache / "statistics").glob("unfinished-*"))
+
+
+def test_networks_that_are_not_here_make_rows_na(tmp_path: Path, real: Path, cache: Path, shared: Path):
+    report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
+    assert report.values["FPD"] is None and report.values["JSD x1e2"] is not None
+    assert f"put cls_model_39.pth at {cache / 'cls_model_39.pth'}" in str(report)
+    assert "no official rangenet for 64 columns, only for 2048, 1024, 512" in str(report)
+    (cache / "cls_model_39.pth").write_bytes((shared / "fixtures/pointnet/cls_model_39.pth").read_bytes())
+    report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
+    assert report.values["FPD"] is not None and report.values["FPD squared MMD"] is not None
+    assert len(report.hashes["pointnet"]) == 64
+    assert any("singular covariance of 1808" in warning for warning in report.warnings)
+    (cache / "cls_model_39.pth").write_bytes(b"")
+    with pytest.raises(ValueError, match="cls_model_39.pth: expected weights"):
+        ls.evaluate(STREETS, real, protocol="r2dm-2024")
+
+
+def test_another_rangenet_than_the_protocols_is_refused(cache: Path, shared: Path):
+    cache.mkdir()
+    (cache / "darknet53-1024.tar.gz").symlink_to(shared / "fixtures/rangenet/darknet21.tar.gz")
+    with pytest.raises(ValueError, match="expected RangeNet-53, found RangeNet-21"):
+        gathering.load_networks(R2DM, 1024)
+
+
+def test_protocols_choose_the_images_that_their_programs_choose():
+    r2dm = gathering.select(R2DM, "real", [str(i) for i in range(10_037)])
+    assert len(r2dm.features) == 10_037 and len(r2dm.bev) == 10_000
+    few = gathering.select(replace(R2DM, real_bev=5), "real", [str(i) for i in range(37)])
+    assert few.bev == {0, 19, 14, 21, 22}, "Random(0).shuffle of 37, metrics/values.json"
+    names = [f"2013_05_28_drive_{s:04d}_sync/{i}" for s in range(4) for i in range(10)]
+    chosen = gathering.select(LIDARGEN, "real", names, samples=7)
+    assert len(chosen.features) == 7 and chosen.features < set(range(20))
+    assert chosen.bev == {*range(10), *range(20, 30)}
+    samples = gathering.select(LIDARGEN, "samples", [str(i) for i in range(2000)])
+    assert samples.features == set(range(1100)) and len(samples.bev) == 2000
+
+
+def test_upsampling_compares_images_one_by_one():
+    report = ls.evaluate(STREETS[:2], REAL[:2], protocol="r2dm-upsampling-2024")
+    errors = [np.abs(a.range - b.range).mean() for a, b in zip(STREETS, REAL[:2], strict=False)]
+    assert report.values["range MAE"] == pytest.approx(np.mean(errors), rel=1e-5)
+    assert report.values["IoU"] is None and "only for 2048" in str(report)
+    with pytest.raises(ValueError, match=r"as many of both, found 6 and 8"):
+        ls.evaluate(STREETS, REAL, protocol=R2DM_UPSAMPLING.name)
+
+
+def test_rows_that_nobody_here_computes_say_why():
+    report = evaluation.evaluate(STREETS, REAL, DUSTY)
+    assert report.values["COV"] is None and "earth mover's distance" in str(report)
+    assert json.loads(report.json())["values"]["1-NNA"]["reason"].startswith("needs the earth mover")
+
+
+def broken_sample(folder: Path, values: torch.Tensor) -> Path:
+    folder.mkdir()
+    torch.save(values, folder / "0.pth")
+    return folder
+
+
+def test_errors_name_the_sample_and_say_both_sides(tmp_path: Path, real: Path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"empty: expected a cache, or samples \(.bin, .* found none"):
+        ls.evaluate(tmp_path / "empty", real)
+    with pytest.raises(ValueError, match="found no such file or folder"):
+        ls.evaluate(STREETS, tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="found an empty list"):
+        ls.evaluate([], real)
+    nan = broken_sample(tmp_path / "nan", torch.full((5, 64, 64), float("nan")))
+    with pytest.raises(ValueError, match=r"0.pth: expected finite values, found 20480 of NaN"):
+        ls.evaluate(nan, real)
+    shape = broken_sample(tmp_path / "shape", torch.zeros(3, 64, 64))
+    with pytest.raises(ValueError, match=r"expected a tensor \(5, H, W\) or \(2, H, W\).*found \(3, 64, 64\)"):
+        ls.evaluate(shape, real)
+    mixed = saved(tmp_path / "mixed", [*STREETS[:2], street(0, SENSORS["hdl-64e"].resized(width=128))])
+    with pytest.raises(ValueError, match=r"2.npz: expected images of one size, 64 x 64, found one of 64 x 128"):
+        ls.evaluate(mixed, real)
+    (tmp_path / "code").mkdir()
+    torch.save({"f": print}, tmp_path / "code/0.pth")
+    with pytest.raises(ValueError, match="damaged or unsafe file"):
+        ls.evaluate(tmp_path / "code", real)
+
+
+def test_other_beams_have_no_report_per_beam():
+    other = [street(i, SENSORS["hdl-64e-kitti"].resized(width=64)) for i in range(3)]
+    report = ls.evaluate(STREETS, other)
+    assert report.beams is None and report.values["no return, per beam"] is None
+    assert report.values["JSD x1e2"] is not None
+    assert any("other beams" in warning for warning in report.warnings)
+
+
+def test_an_image_set_tells_where_it_comes_from(tmp_path: Path, real: Path):
+    images = image_set(real)
+    assert len(images) == 8 and images.source == str(real)
+    assert images.stamp == image_set(str(real)).stamp != image_set(saved(tmp_path / "b", REAL[:2])).stamp
+    assert image_set(real / "3.npz").image(0, SENSOR, "spherical").shape == (64, 64)
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*words: object) -> tuple[int, str, str]:
+        code = 0
+        try:
+            main([str(word) for word in words])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_the_verb_prints_a_table_and_writes_json_and_markdown(tmp_path: Path, real: Path, run: Run):
+    samples, out = saved(tmp_path / "samples", STREETS), tmp_path / "out/report.json"
+    code, text, _ = run("evaluate", samples, "--reference", real, "--protocol", "bev-1", "--out", out, "--seed", 3)
+    assert code == 0
+    assert "bev-1 v1: 6 samples against 8" in text and f"wrote {out} and {out.with_suffix('.md')}" in text
+    told, page = json.loads(out.read_text()), out.with_suffix(".md").read_text()
+    assert told["counts"]["samples"] == 6 and told["seeds"] == {"subsets": 3} and told["seconds"] > 0
+    assert set(told["hashes"]) == {"samples", "reference", "reference statistics"}
+    statistics = Path(told["sources"]["reference statistics"])
+    assert load_statistics(statistics)[0].protocol is BEV_1
+    expected = ls.evaluate(samples, real)
+    assert {name: row["value"] for name, row in told["values"].items()} == expected.values
+    assert "| JSD x1e2 |" in page and "wall time" in page and told["hashes"]["samples"] in page
+
+
+def test_the_verb_gathers_parts_and_refuses_in_one_line(tmp_path: Path, real: Path, run: Run):
+    samples = saved(tmp_path / "samples", STREETS)
+    parts = [tmp_path / "a.safetensors", tmp_path / "b.safetensors"]
+    for i, part in enumerate(parts, 1):
+        assert run("evaluate", samples, "--part", f"{i}/2", "--out", part)[:2] == (0, f"wrote {part}\n")
+    code, text, _ = run("evaluate", *parts, "--reference", real, "--out", tmp_path / "r.json")
+    assert code == 0 and "6 samples against 8" in text
+    for words, reason in (
+        ((samples,), "expected --reference CACHE, STATS or FOLDER, found none"),
+        ((samples, "--reference", real, "--protocol", "fid"), "expected a protocol of r2dm-2024"),
+        ((samples, "--reference", real, "--out", "r.txt"), "expected a name that ends in .json"),
+        ((tmp_path / "no", "--reference", real), "found no such file or folder"),
+    ):
+        code, _, error = run("evaluate", *words)
+        assert code == 2 and reason in error and error.count("\n") == 1
