@@ -149,6 +149,7 @@ def test_killed_in_the_middle_the_same_command_goes_on(run: Run, tiny: Path, tmp
 
 
 def test_ctrl_c_is_one_line(tiny: Path, tmp_path: Path):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit "ignored"
     process = started("generate", "-n", 100000, "--model", tiny, "--steps", 2, "--out", tmp_path, "--no-picture")
     while process.poll() is None and not (tmp_path / "000002.ply").exists():
         time.sleep(0.01)

@@ -176,7 +176,7 @@ def test_networks_that_are_not_here_make_rows_na(tmp_path: Path, real: Path, cac
     assert len(report.hashes["pointnet"]) == 64
     assert any("singular covariance of 1808" in warning for warning in report.warnings)
     (cache / "cls_model_39.pth").write_bytes(b"")
-    with pytest.raises(ValueError, match="cls_model_39.pth: expected weights"):
+    with pytest.raises(ValueError, match=r"cls_model_39\.pth: expected weights"):
         ls.evaluate(STREETS, real, protocol="r2dm-2024")
 
 

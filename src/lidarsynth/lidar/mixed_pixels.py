@@ -20,11 +20,8 @@ def without_mixed_pixels(image: RangeImage) -> RangeImage:
     window's median range. Columns are circular, rows end. Measured on held-out synthetic streets, every fourth beam
     known: range MAE 1.29 m; 1.35 m with mixed pixels left as they are, 1.41 m with them emptied.
     """
-    rows, columns = WINDOW
-    above, aside = ((rows // 2, rows // 2), (0, 0)), ((0, 0), (columns // 2, columns // 2))
-    ranges = np.where(image.mask, image.range, np.float32(np.nan))
-    ranges = np.pad(np.pad(ranges, above, constant_values=np.nan), aside, mode="wrap")
-    filled = np.pad(np.pad(image.mask, above, constant_values=True), aside, mode="wrap")
+    ranges = _framed(np.where(image.mask, image.range, np.float32(np.nan)), np.nan)
+    filled = _framed(image.mask, True)
     beside_empty = ~sliding_window_view(filled, WINDOW).all(axis=(2, 3))
     place = np.nonzero(image.mask & beside_empty)
     if not len(place[0]):
@@ -33,3 +30,11 @@ def without_mixed_pixels(image: RangeImage) -> RangeImage:
     mended = image.range.copy()
     mended[place] = np.where(image.range[place] < NEARER * middle, middle, image.range[place])
     return replace(image, range=mended)
+
+
+def _framed(values: np.ndarray, outside: float) -> np.ndarray:
+    """(H, W) with half a window more on each side: `outside` above and below, the turn's other end left and right."""
+    rows, columns = WINDOW[0] // 2, WINDOW[1] // 2
+    border = np.full((rows, values.shape[1]), outside, values.dtype)
+    tall = np.vstack([border, values, border])
+    return np.hstack([tall[:, -columns:], tall, tall[:, :columns]])

@@ -41,7 +41,7 @@ class Scan:
 
     def __getitem__(self, index: np.ndarray | slice) -> Scan:
         """The scan of the chosen points: a boolean mask (N,), integer indices or a slice."""
-        return Scan(*[None if (v := getattr(self, f.name)) is None else v[index] for f in fields(self)])
+        return Scan(*[None if (v := getattr(self, f.name)) is None else v[index] for f in fields(self)])  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

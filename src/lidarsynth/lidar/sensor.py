@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-try:
+if sys.version_info >= (3, 11):
     import tomllib
-except ModuleNotFoundError:  # Python 3.10
-    import tomli as tomllib
+else:
+    import tomli as tomllib  # type: ignore[import-not-found]
 
 
 @dataclass(frozen=True)
@@ -119,8 +120,8 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
     if {"beams", "top", "bottom"} <= values.keys():
         if not (isinstance(values["beams"], int) and 1 <= values["beams"] <= 1024):
             raise ValueError(f"{source}: expected beams of 1 to 1024, found {values['beams']!r}")
-        ends = _numbers([values.pop("top"), values.pop("bottom")], source)
-        spaced = np.linspace(*ends, values.pop("beams"))
+        top, bottom = _numbers([values.pop("top"), values.pop("bottom")], source)
+        spaced = np.linspace(top, bottom, values.pop("beams"))
         values.setdefault("elevations", spaced.tolist())
     known = set(Sensor.__dataclass_fields__)
     if unknown := values.keys() - known:

@@ -42,7 +42,7 @@ class Pairs:
                 digest.update(np.ascontiguousarray(np.stack([image.range, image.reflectance])).tobytes())
         if self.classes and results:
             labels = [self._labels(images) for images in (truths, results)]
-            self.confusion += confusion_matrix(*labels)
+            self.confusion += confusion_matrix(labels[0], labels[1])
 
     @torch.no_grad()
     def _labels(self, images: Sequence[RangeImage]) -> np.ndarray:

@@ -52,7 +52,8 @@ class Statistics:
         networks: Networks | None = None,
         weights: Mapping[str, str] | None = None,
     ):
-        self.protocol, self.sensor, self.role = protocol, sensor, role
+        self.protocol, self.sensor = protocol, sensor
+        self.role: Side = role
         self.networks, self.weights = dict(networks or {}), dict(weights or {})
         self.count = self.lit = self._digest = 0
         self.moments: dict[str, Moments] = {}
