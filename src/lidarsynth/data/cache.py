@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.index import open_index, whole, write_index
+from lidarsynth.data.index import close_index, open_index, whole, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
@@ -80,7 +80,7 @@ def write_cache(
             yield done
     finally:
         entries.close()
-        write_index(folder, index)
+        close_index(folder, index)
 
 
 @dataclass(frozen=True)

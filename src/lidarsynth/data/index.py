@@ -45,9 +45,20 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int)
                              "name another folder")  # fmt: skip
         if expected != found:  # nothing of the other kind is stored: no scan could be read
             return head
-    for stale in folder.glob(".*.part"):  # of a call that was killed
-        stale.unlink(missing_ok=True)
+    sweep(folder)
     return index | {"source": head["source"], "count": max(count, index["count"])}
+
+
+def sweep(folder: Path) -> None:
+    """Remove what killed calls left unfinished; nobody may be writing."""
+    for stale in folder.glob(".*.part"):
+        stale.unlink(missing_ok=True)
+
+
+def close_index(folder: Path, index: dict[str, Any]) -> None:
+    """Write the index when all shards are; a killed call's worker may have outlived the sweep of `open_index`."""
+    sweep(folder)
+    write_index(folder, index)
 
 
 def write_index(folder: Path, index: dict[str, Any]) -> None:
