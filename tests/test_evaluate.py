@@ -200,6 +200,13 @@ def test_protocols_choose_the_images_that_their_programs_choose():
     assert samples.features == set(range(1100)) and len(samples.bev) == 2000
 
 
+def test_a_reference_without_the_protocols_sequences_is_told():
+    report = evaluation.evaluate(STREETS, REAL, LIDARGEN)
+    assert report.counts["reference"] == 6, "as many as samples"
+    assert any("the reference has none, all were taken" in warning for warning in report.warnings)
+    assert report.values["FRD"] is None and report.values["JSD x1e2"] is not None
+
+
 def test_upsampling_compares_images_one_by_one():
     report = ls.evaluate(STREETS[:2], REAL[:2], protocol="r2dm-upsampling-2024")
     errors = [np.abs(a.range - b.range).mean() for a, b in zip(STREETS, REAL[:2], strict=False)]

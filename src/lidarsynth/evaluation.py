@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from lidarsynth.data.cache import sha256 as sha256_of_file
-from lidarsynth.gathering import Loaded, OnImages, gather, load_networks, part_of, select
+from lidarsynth.gathering import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
 from lidarsynth.image_sets import ImageSet, image_set, resized, sensor_of
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.metrics.evaluate import Report, report_of
 from lidarsynth.metrics.pairs import Pairs, classes_of
-from lidarsynth.metrics.protocols import Protocol, get_protocol
+from lidarsynth.metrics.protocols import EvaluationProtocol, get_protocol
 from lidarsynth.metrics.statistics import Statistics, definition, load_statistics, save_statistics
 from lidarsynth.weights import cache_folder
 
@@ -27,7 +27,7 @@ Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
 def evaluate(
     samples: Samples,
     reference: str | Path | Sequence[RangeImage],
-    protocol: str | Protocol = "bev-1",
+    protocol: str | EvaluationProtocol = "bev-1",
     sensor: str | None = None,
     seed: int = 0,
     batch_size: int = 4,
@@ -57,7 +57,7 @@ def evaluate(
 class _Run:
     """What all steps of one evaluation share."""
 
-    protocol: Protocol
+    protocol: EvaluationProtocol
     sensor: str | None
     batch_size: int
     device: str
@@ -124,7 +124,8 @@ def _judge_sets(run: _Run, samples: Samples, reference: str | Path | Sequence[Ra
     if real_file:
         told["reference statistics"] = str(real_file)
         hashes["reference statistics"] = sha256_of_file(real_file)
-    return replace(report, sources=told, hashes=hashes)
+    warnings = report.warnings + (unlike_names(run.protocol, truth.names) if truth else ())
+    return replace(report, sources=told, hashes=hashes, warnings=warnings)
 
 
 def _judge_pairs(run: _Run, samples: Samples, reference: str | Path | Sequence[RangeImage], seed: int) -> Report:
@@ -151,7 +152,7 @@ def gather_part(
     samples: Samples,
     part: str,
     out: str | Path,
-    protocol: str | Protocol = "bev-1",
+    protocol: str | EvaluationProtocol = "bev-1",
     sensor: str | None = None,
     batch_size: int = 4,
     device: str = "cpu",
@@ -172,7 +173,7 @@ def gather_part(
     return save_statistics(out, statistics, {"source": images.source, "part": part})
 
 
-def merged(files: Sequence[Path], protocol: Protocol) -> Statistics:
+def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> Statistics:
     """One set of statistics of several files. Raises ValueError where two hold the same images."""
     loaded = [load_statistics(file, protocol)[0] for file in files]
     for i, statistics in enumerate(loaded):

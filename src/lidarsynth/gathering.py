@@ -14,7 +14,7 @@ from torch import nn
 from lidarsynth.data.cache import sha256
 from lidarsynth.image_sets import ImageSet
 from lidarsynth.metrics.pointnet import read_pointnet
-from lidarsynth.metrics.protocols import Network, Protocol
+from lidarsynth.metrics.protocols import EvaluationProtocol, Network
 from lidarsynth.metrics.rangenet import read_rangenet
 from lidarsynth.metrics.statistics import Statistics, load_statistics, save_statistics
 from lidarsynth.weights import cache_folder
@@ -32,7 +32,7 @@ class Loaded:
     missing: dict[str, str] = field(default_factory=dict)
 
 
-def load_networks(protocol: Protocol, width: int, device: str = "cpu") -> Loaded:
+def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu") -> Loaded:
     """The networks whose official files are in the cache folder. Raises ValueError for a damaged or another file."""
     loaded = Loaded()
     for network in protocol.networks:
@@ -68,10 +68,12 @@ class Selection:
         return sorted(self.features | self.bev)
 
 
-def select(protocol: Protocol, role: Literal["samples", "real"], names: Sequence[str], samples: int = 0) -> Selection:
+def select(
+    protocol: EvaluationProtocol, role: Literal["samples", "real"], names: Sequence[str], samples: int = 0
+) -> Selection:
     """Which images of a set the protocol takes; `samples` is how many there are to judge.
 
-    Raises ValueError when the protocol takes only some sequences, the names tell sequences, and none is theirs.
+    Where no name is of the protocol's sequences all are taken; `unlike_names` tells.
     """
     if role == "samples":
         limits = (protocol.samples, protocol.samples_bev)
@@ -85,6 +87,16 @@ def select(protocol: Protocol, role: Literal["samples", "real"], names: Sequence
             numbers = numbers[: samples if limit == 0 else limit]
         chosen.append(frozenset(numbers))
     return Selection(*chosen)
+
+
+def unlike_names(protocol: EvaluationProtocol, names: Sequence[str]) -> tuple[str, ...]:
+    """Warnings where the protocol takes some sequences of the reference only, and none of the names is theirs."""
+    wanted = sorted({*protocol.sequences, *protocol.sequences_bev})
+    if not wanted or any(part in name for name in names for part in wanted):
+        return ()
+    return (
+        f"{protocol.title} compares with the sequences {', '.join(wanted)}; the reference has none, all were taken",
+    )
 
 
 def gather(

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from lidarsynth.metrics.distributions import frechet_distance, gaussian_mmd, jensen_shannon_distance, kernel_distance
-from lidarsynth.metrics.protocols import Protocol, Row
+from lidarsynth.metrics.protocols import EvaluationProtocol, Row
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 from lidarsynth.metrics.statistics import Statistics, definition
 
@@ -160,7 +160,7 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
 class Report:
     """The outcome of an evaluation; `str()` is its table."""
 
-    protocol: Protocol
+    protocol: EvaluationProtocol
     results: tuple[Result, ...]
     counts: Mapping[str, int]  # samples, reference, and those in the bird's eye view
     hashes: Mapping[str, str]  # of images, statistics and weights
@@ -212,7 +212,12 @@ class Report:
         lines += [f"| {r.name} | {r} | {r.reason} |" for r in self.results]
         lines += ["", *(f"- {text}" for text in self.warnings)] if self.warnings else []
         lines += ["", "## Made with", ""]
-        for title, table in (("", self.counts), ("seed of ", self.seeds), ("from ", self.sources), ("", self.hashes)):
+        for title, table in (
+            ("", self.counts),
+            ("seed of ", self.seeds),
+            ("from ", self.sources),
+            ("hash of ", self.hashes),
+        ):
             lines += [f"- {title}{name}: {value}" for name, value in table.items()]
         lines += [f"- definition: {definition(p)}", f"- wall time: {self.seconds:.1f} s", "", "## Definitions", ""]
         lines += [f"- {row.name}: {row.formula}" for row in p.rows]

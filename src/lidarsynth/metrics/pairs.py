@@ -11,7 +11,7 @@ from torch import nn
 
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.evaluate import Report, Result
-from lidarsynth.metrics.protocols import Protocol
+from lidarsynth.metrics.protocols import EvaluationProtocol
 from lidarsynth.metrics.rangenet import RangeNet
 from lidarsynth.metrics.reconstruction import (
     Errors,
@@ -26,7 +26,7 @@ from lidarsynth.metrics.reconstruction import (
 class Pairs:
     """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None."""
 
-    def __init__(self, protocol: Protocol, classes: RangeNet | None = None):
+    def __init__(self, protocol: EvaluationProtocol, classes: RangeNet | None = None):
         self.protocol, self.classes = protocol, classes
         self.errors: list[Errors] = []
         self.confusion = np.zeros((20, 20), np.int64)

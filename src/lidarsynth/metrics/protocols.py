@@ -52,7 +52,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Protocol:
+class EvaluationProtocol:
     """How samples are judged against a reference. Raises nothing: its fields are plain.
 
     sensor, height, width  the images; scans without an image are projected into these
@@ -133,7 +133,7 @@ _BEAMS = (
     Row("range, per beam", "beam-range", "mean over beams of the Wasserstein-1 distance of ranges", None, 1, "m"),
 )
 
-R2DM = Protocol(
+R2DM = EvaluationProtocol(
     "r2dm-2024",
     1,
     "Nakashima & Kurazume, ICRA 2024, table II and the official evaluation program",
@@ -153,7 +153,7 @@ R2DM = Protocol(
     ),
 )
 
-LIDARGEN = Protocol(
+LIDARGEN = EvaluationProtocol(
     "lidargen-2022",
     1,
     "Zyrianov et al., ECCV 2022, and the official evaluation programs",
@@ -176,7 +176,7 @@ LIDARGEN = Protocol(
 )
 
 _EMD = "needs the earth mover's distance between all pairs of 2,048 sets of 2,048 points, which is not here"
-DUSTY = Protocol(
+DUSTY = EvaluationProtocol(
     "dusty-2023",
     1,
     "Nakashima et al., WACV 2023, test script",
@@ -196,7 +196,7 @@ DUSTY = Protocol(
     notes=("the reference is the training set", "KPD takes its subsets from at most 10,000 images per side"),
 )
 
-R2DM_UPSAMPLING = Protocol(
+R2DM_UPSAMPLING = EvaluationProtocol(
     "r2dm-upsampling-2024",
     1,
     "Nakashima & Kurazume, ICRA 2024, table III (4x beams); no program was published, so pixels are LiDARGen's",
@@ -215,7 +215,7 @@ R2DM_UPSAMPLING = Protocol(
     notes=("which of the two IoUs the paper has is not known",),
 )
 
-BEV_1 = Protocol(
+BEV_1 = EvaluationProtocol(
     "bev-1",
     1,
     "lidarsynth: needs no weights; r2dm-2024's gates, grid and kernel, and a report per beam",
@@ -224,10 +224,10 @@ BEV_1 = Protocol(
     Bev(),
 )
 
-PROTOCOLS: dict[str, Protocol] = {p.name: p for p in (R2DM, LIDARGEN, DUSTY, R2DM_UPSAMPLING, BEV_1)}
+PROTOCOLS: dict[str, EvaluationProtocol] = {p.name: p for p in (R2DM, LIDARGEN, DUSTY, R2DM_UPSAMPLING, BEV_1)}
 
 
-def get_protocol(name: str) -> Protocol:
+def get_protocol(name: str) -> EvaluationProtocol:
     """A protocol by its name. Raises ValueError that lists the names."""
     if name not in PROTOCOLS:
         raise ValueError(f"expected a protocol of {', '.join(PROTOCOLS)}, found {name!r}")

@@ -23,7 +23,7 @@ from lidarsynth.lidar.sensor import Sensor, from_dict
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import Array, Moments
 from lidarsynth.metrics.pointnet import PointNet, point_features
-from lidarsynth.metrics.protocols import Protocol, Side, get_protocol
+from lidarsynth.metrics.protocols import EvaluationProtocol, Side, get_protocol
 from lidarsynth.metrics.rangenet import RangeNet, frechet_features
 from lidarsynth.metrics.sensor_report import BeamCounts
 
@@ -46,7 +46,7 @@ class Statistics:
 
     def __init__(
         self,
-        protocol: Protocol,
+        protocol: EvaluationProtocol,
         sensor: Sensor,
         role: Literal["samples", "real"],
         networks: Networks | None = None,
@@ -176,7 +176,7 @@ def _under(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-def _gated(image: RangeImage, protocol: Protocol, side: Side) -> np.ndarray:
+def _gated(image: RangeImage, protocol: EvaluationProtocol, side: Side) -> np.ndarray:
     """(H, W) bool: measured, and strictly within the protocol's limits where it gates this side."""
     if side not in protocol.gated:
         return image.mask
@@ -234,7 +234,7 @@ def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str]
     return metadata["sha256"]
 
 
-def load_statistics(path: Path, protocol: Protocol | None = None) -> tuple[Statistics, dict[str, str]]:
+def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> tuple[Statistics, dict[str, str]]:
     """Statistics that `save_statistics` wrote, verified, and the file's metadata.
 
     protocol  what they must be of; by default the published one of the name in the file
@@ -261,7 +261,7 @@ def load_statistics(path: Path, protocol: Protocol | None = None) -> tuple[Stati
     return statistics, metadata
 
 
-def definition(protocol: Protocol) -> str:
+def definition(protocol: EvaluationProtocol) -> str:
     """Version and hash of a protocol's record: two programs that agree in it compute the same statistics."""
     fields = asdict(protocol)
     for text in ("source", "notes", "absent", "rows"):  # what is said and shown, not what is gathered
