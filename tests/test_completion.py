@@ -12,8 +12,9 @@ from lidarsynth.completion import complete_scan, interpolated, judged, named_sen
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.loading import assemble
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.model import LidarModel, assemble
+from lidarsynth.model import LidarModel
 from lidarsynth.presets import preset
 
 FLAT = Sensor("flat", (2.0, 0.0, -2.0, -4.0), width=8, min_range=1.0, max_range=50.0)

@@ -14,7 +14,8 @@ from lidarsynth.build import build_network
 from lidarsynth.experiment import Card, Data, with_fields
 from lidarsynth.hub import card_text, fetch, is_repository
 from lidarsynth.lidar.sensor import from_dict
-from lidarsynth.model import LidarModel, assemble, load
+from lidarsynth.loading import assemble, load
+from lidarsynth.model import LidarModel
 from lidarsynth.presets import preset
 from lidarsynth.weights import load_parts
 

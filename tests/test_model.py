@@ -15,8 +15,10 @@ from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.model import LidarModel, assemble, sparse_image
+from lidarsynth.loading import assemble
+from lidarsynth.model import LidarModel
 from lidarsynth.presets import preset
+from lidarsynth.scan_model import sparse_image
 
 
 def model_of(experiment: Experiment) -> LidarModel:

@@ -13,7 +13,7 @@ import torch
 from lidarsynth import weights
 from lidarsynth.build import build_network, build_sensor, save
 from lidarsynth.experiment import Data, Model
-from lidarsynth.model import assemble
+from lidarsynth.loading import assemble
 from lidarsynth.presets import preset
 from lidarsynth.weights import RELEASES, cache_folder, download, load_parts, read_official, shipped
 

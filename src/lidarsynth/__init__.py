@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from lidarsynth.lidar.projection import project
     from lidarsynth.lidar.scan import RangeImage, Scan
     from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor, read_sensor
-    from lidarsynth.model import LidarModel, load
+    from lidarsynth.loading import load
+    from lidarsynth.model import LidarModel
 
 __version__ = "0.1.0"
 
@@ -31,7 +32,7 @@ _HOME = {
     "get_sensor": "lidarsynth.lidar.sensor",
     "read_sensor": "lidarsynth.lidar.sensor",
     "LidarModel": "lidarsynth.model",
-    "load": "lidarsynth.model",
+    "load": "lidarsynth.loading",
 }
 
 __all__ = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor, nn
 
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.schedule import SCHEDULES
-from lidarsynth.experiment import Experiment, Model, from_dict
+from lidarsynth.experiment import Experiment, from_dict
 from lidarsynth.lidar import sensor as sensors
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.models.conditional import ConditionalUNet
@@ -32,21 +33,21 @@ def build_sensor(experiment: Experiment) -> Sensor:
 
 
 def build_network(experiment: Experiment) -> nn.Module:
-    """The experiment's network with fresh weights and the sensor's ray angles, in evaluation mode."""
-    sensor, model = build_sensor(experiment), experiment.model
-    if model.network not in NETWORKS:
-        raise ValueError(f"model.network: expected one of {', '.join(NETWORKS)}, found {model.network!r}")
-    network = NETWORKS[model.network](model, (sensor.height, sensor.width))
-    unet = network.unet if isinstance(network, ConditionalUNet) else network
-    assert isinstance(unet, EfficientUNet)
-    unet.coords.copy_(torch.from_numpy(sensor.ray_angles())[None])
-    return network.eval()
+    """The experiment's network with fresh weights and, where it has them, the sensor's ray angles; for evaluation.
+
+    Raises ValueError for a word that is not in NETWORKS.
+    """
+    word = experiment.model.network
+    if word not in NETWORKS:
+        raise ValueError(f"model.network: expected one of {', '.join(NETWORKS)}, found {word!r}")
+    return NETWORKS[word](experiment, build_sensor(experiment)).eval()
 
 
-def _unet(model: Model, resolution: tuple[int, int], in_channels: int = 2) -> EfficientUNet:
-    return EfficientUNet(
+def _unet(experiment: Experiment, sensor: Sensor, in_channels: int = 2) -> EfficientUNet:
+    model = experiment.model
+    unet = EfficientUNet(
         in_channels=in_channels,
-        resolution=resolution,
+        resolution=(sensor.height, sensor.width),
         base_channels=model.base_channels,
         temb_channels=model.temb_channels,
         channel_multipliers=model.channel_multipliers,
@@ -59,11 +60,13 @@ def _unet(model: Model, resolution: tuple[int, int], in_channels: int = 2) -> Ef
         stem=model.stem,
         dropout=model.dropout,
     )
+    unet.coords.copy_(torch.from_numpy(sensor.ray_angles())[None])
+    return unet
 
 
-NETWORKS = {
+NETWORKS: dict[str, Callable[[Experiment, Sensor], nn.Module]] = {
     "efficient-unet": _unet,
-    "conditional-unet": lambda model, resolution: ConditionalUNet(_unet(model, resolution, in_channels=8)),
+    "conditional-unet": lambda experiment, sensor: ConditionalUNet(_unet(experiment, sensor, in_channels=8)),
 }
 
 

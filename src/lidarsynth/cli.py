@@ -7,8 +7,26 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-
+from lidarsynth.arguments import (
+    Count,
+    Device,
+    Format,
+    GenerationSteps,
+    Intensity,
+    Method,
+    NoSeed,
+    Output,
+    Picture,
+    Positional,
+    Recipe,
+    Resamples,
+    Sampler,
+    Seed,
+    SensorWord,
+    Source,
+    Steps,
+    arg,
+)
 from lidarsynth.terminal import answer, at_least, counted, load_with_bar, progress_line, say, step_bar
 from lidarsynth.training.options import Options
 
@@ -18,46 +36,14 @@ if TYPE_CHECKING:
     from lidarsynth.completion import Filled
     from lidarsynth.lidar.scan import RangeImage, Scan
 
-arg = tyro.conf.arg
-Positional = tyro.conf.Positional
-Format = Literal["ply", "pcd", "bin", "npy", "npz"]
-Sampler = Literal["ddpm", "ddim", "dpmpp-2m", "heun"]
-Count = Annotated[int, arg(aliases=["-n"], help="how many scans.")]
-From = Annotated[str | None, arg(name="from")]
-Source = Annotated[
-    str, arg(metavar="MODEL", help="default, an official release, a model folder, or an official .pth file.")
-]
-Seed = Annotated[int, arg(help="of all randomness.")]
-NoSeed = Annotated[int, arg(help="not used; every verb takes it.")]
-Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
-Method = Annotated[
-    Literal["auto", "conditional", "repaint"],
-    arg(help="conditional tells the network what is known; repaint works with any network, and takes minutes."),
-]
-Steps = Annotated[int | None, arg(metavar="INT", help="network steps; default 4 where conditional, 32 where repaint.")]
-Resamples = Annotated[int, arg(help="passes over each step of repaint.")]
-Intensity = Annotated[
-    Literal["auto", "unit", "byte", "uint16", "none"],
-    arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),
-]
-Picture = Annotated[bool, arg(help="write a .png beside each file.")]
-Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the range image.")]
-Recipe = Annotated[
-    str | None,
-    arg(metavar="RECIPE", help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +."),
-]
-SensorWord = Annotated[
-    str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")
-]
-
 
 def generate(
     count: Count = 4,
     out: Annotated[Path, arg(help="folder to write to.")] = Path("out"),
     model: Source = "default",
     format: Annotated[Format, arg(help="of the files.")] = "ply",
-    steps: Annotated[int, arg(help="of the sampler, per scan.")] = 32,
-    sampler: Annotated[Sampler, arg(help="of the reverse process.")] = "ddpm",
+    steps: GenerationSteps = None,
+    sampler: Annotated[Sampler | None, arg(help="of the reverse process; default ddpm.")] = None,
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one, as fast.")] = 4,
     device: Device = "cpu",
@@ -69,6 +55,7 @@ def generate(
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
     at_least(0, {"seed": seed})
     loaded = load_with_bar(model, device)
+    steps = loaded.generation_steps(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
     claim(out, settings)
     endings = (f".{format}", ".png") if picture else (f".{format}",)

@@ -16,9 +16,9 @@ from lidarsynth.lidar.projection import project, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, reconstruction_errors
-from lidarsynth.model import LidarModel, OnStep, sparse_image
 from lidarsynth.models.interpolation import METHODS, interpolate
 from lidarsynth.pictures import before_and_after
+from lidarsynth.scan_model import OnStep, ScanModel, sparse_image
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImag
 
 
 def complete_scan(
-    model: LidarModel,
+    model: ScanModel,
     scan: Scan,
     recipe: str | None = None,
     method: str = "auto",
@@ -95,7 +95,7 @@ def judged(filled: RangeImage, before: RangeImage, known: np.ndarray, truth: Ran
 
 
 def upsample_scan(
-    model: LidarModel,
+    model: ScanModel,
     scan: Scan,
     sensor_in: Sensor,
     method: str = "auto",
@@ -125,7 +125,7 @@ def named_sensor(scan: Scan, path: Path, flag: str, given: str | None) -> Sensor
     return get_sensor(given)
 
 
-def _rays_with_points(scan: Scan, model: LidarModel, projection: str) -> np.ndarray:
+def _rays_with_points(scan: Scan, model: ScanModel, projection: str) -> np.ndarray:
     """(H, W) bool: pixels that any point falls into, at whatever range."""
     return project(scan, replace(model.sensor, min_range=0.0, max_range=math.inf), projection).mask
 

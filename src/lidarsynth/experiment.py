@@ -59,7 +59,8 @@ class Training:
     batch_size: int = 8
     learning_rate: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.99)
-    warmup: int = 10_000  # steps of linear warm-up before the half-cosine decay to 0
+    warmup: int = 10_000  # steps of linear warm-up
+    decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant
     clip_norm: float = 1.0
     ema_decay: float = 0.995
     ema_every: int = 10  # steps
@@ -90,8 +91,8 @@ class Experiment:
     card: Card = field(default_factory=Card)
 
     def to_dict(self) -> dict:
-        """Plain tables, lists and numbers, the inverse of `from_dict`."""
-        return asdict(self)
+        """Plain tables, lists and numbers, the inverse of `from_dict`; without the groups that are None."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 def from_dict(values: Any, source: str = "experiment", record: type = Experiment) -> Any:
@@ -112,8 +113,9 @@ def from_dict(values: Any, source: str = "experiment", record: type = Experiment
 
 def _value(value: Any, hint: Any, source: str) -> Any:
     """A value as the field's hint wants it: tables become records, lists tuples. Raises ValueError by field."""
-    if is_dataclass(hint):
-        return from_dict(value, source, hint)  # type: ignore[arg-type]
+    records = [choice for choice in (hint, *get_args(hint)) if is_dataclass(choice)]
+    if records and not (value is None and type(None) in get_args(hint)):
+        return from_dict(value, source, records[0])  # type: ignore[arg-type]
     value = tuple(value) if isinstance(value, list) else value
     if not any(_fits(value, choice) for choice in (get_args(hint) if isinstance(hint, UnionType) else (hint,))):
         name = hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint)

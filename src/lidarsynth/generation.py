@@ -17,16 +17,16 @@ from typing import Any
 from lidarsynth.data.files import write
 from lidarsynth.lidar.render import save_png
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.model import LidarModel, OnStep
 from lidarsynth.pictures import portrait
+from lidarsynth.scan_model import OnStep, ScanModel
 
 RECORD, SCRATCH = "generate.json", ".unfinished"
 
 
-def fingerprint(model: LidarModel) -> str:
+def fingerprint(model: ScanModel) -> str:
     """16 hex digits of what decides the scans: sensor, network and diffusion settings, and every weight."""
     record = model.experiment.to_dict()
-    settings = {part: record[part] for part in ("data", "model", "diffusion")}
+    settings = {part: values for part, values in record.items() if part not in ("name", "training", "card")}
     digest = blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=8)
     for name, tensor in sorted(model.network.state_dict().items()):
         digest.update(name.encode() + tensor.cpu().numpy().tobytes())
@@ -85,11 +85,11 @@ def batches(folder: Path, count: int, endings: tuple[str, ...], size: int) -> li
 
 def generate_into(
     folder: Path,
-    model: LidarModel,
+    model: ScanModel,
     runs: list[range],  # of `batches`
     endings: tuple[str, ...],
-    steps: int = 32,
-    sampler: str = "ddpm",
+    steps: int | None = None,
+    sampler: str | None = None,
     seed: int = 0,
     on_step: OnStep = None,
 ) -> Iterator[Path]:

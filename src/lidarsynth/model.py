@@ -1,17 +1,14 @@
-"""`LidarModel`, what `load()` returns: generate, complete and upsample scans."""
+"""`LidarModel`, the model of a denoiser: generate, complete and upsample scans."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.build import build_denoiser, build_sensor
-from lidarsynth.data.recognise import recognise
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.repaint import evaluations, repaint
 from lidarsynth.diffusion.samplers import STEPS, State, generators, sample, starting_noise
@@ -19,13 +16,11 @@ from lidarsynth.experiment import Experiment
 from lidarsynth.hub import push
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
-from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import Sensor, get_sensor
-from lidarsynth.weights import load_parts
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.scan_model import OnStep, image_in, known_pixels, sensor_that_made, sparse_image, with_known
 
 METHODS = ("auto", "conditional", "repaint")
-OnStep = Callable[[], object] | None  # called after every network step, for progress bars
 
 
 @dataclass(frozen=True)
@@ -56,16 +51,16 @@ class LidarModel:
     def generate(
         self,
         n: int = 1,
-        steps: int = 32,
+        steps: int | None = None,
         seed: int = 0,
-        sampler: str = "ddpm",
+        sampler: str | None = None,
         batch_size: int = 4,
         on_step: OnStep = None,
     ) -> list[RangeImage]:
         """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
 
-        steps    network evaluations per scan (twice as many for `heun`)
-        sampler  ddpm | ddim | dpmpp-2m | heun
+        steps    network evaluations per scan (twice as many for `heun`); default 32
+        sampler  ddpm (default) | ddim | dpmpp-2m | heun
 
         Raises ValueError for an unknown sampler or counts below 1.
         """
@@ -74,21 +69,22 @@ class LidarModel:
     def stream(
         self,
         n: int,
-        steps: int = 32,
+        steps: int | None = None,
         seed: int = 0,
-        sampler: str = "ddpm",
+        sampler: str | None = None,
         batch_size: int = 4,
         first: int = 0,
         on_step: OnStep = None,
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
+        steps = self.generation_steps(steps, sampler)
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         for start in range(first, n, batch_size):
             count = min(batch_size, n - start)
             rng = generators(seed, count, offset=start)
             x_1 = starting_noise(self.denoiser, self._blank(count), rng)
-            for x in _last(sample(self.denoiser, x_1, _step(sampler), steps, rng), on_step):
+            for x in _last(sample(self.denoiser, x_1, _step(sampler or "ddpm"), steps, rng), on_step):
                 yield self._image(x)
 
     def complete(
@@ -98,7 +94,7 @@ class LidarModel:
         method: str = "auto",
         steps: int | None = None,
         resamples: int = 10,
-        sampler: str = "ddim",
+        sampler: str | None = None,
         seed: int = 0,
         on_step: OnStep = None,
     ) -> RangeImage:
@@ -113,9 +109,7 @@ class LidarModel:
         A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
         """
         image = self.image_of(scan)
-        known = image.mask if known is None else known
-        if known.shape != image.shape or known.dtype != np.bool_:
-            raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
+        known = known_pixels(image, known)
         method = self._method(method)
         steps = (4 if method == "conditional" else 32) if steps is None else steps
         x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
@@ -124,11 +118,11 @@ class LidarModel:
         rng = generators(seed, 1)
         x_1 = starting_noise(self.denoiser, x_0, rng)
         if method == "conditional":
-            states = sample(self.denoiser.given(x_0, mask), x_1, _step(sampler), steps, rng)
+            states = sample(self.denoiser.given(x_0, mask), x_1, _step(sampler or "ddim"), steps, rng)
         else:
             states = repaint(self.denoiser, x_1, x_0, mask, rng, _step("ddpm"), steps, resamples)
         filled = self._image(_last(states, on_step)[0])
-        return _with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
+        return with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
 
     def upsample(
         self,
@@ -146,12 +140,7 @@ class LidarModel:
 
         Raises ValueError when the sensor is not recognised or sees nothing that the model does.
         """
-        if sensor_in is None:
-            sensor_in, reason = recognise(scan)
-            if sensor_in is None:
-                raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
-        sensor_in = get_sensor(sensor_in) if isinstance(sensor_in, str) else sensor_in
-        image, known = sparse_image(scan, sensor_in, self.sensor)
+        image, known = sparse_image(scan, sensor_that_made(scan, sensor_in), self.sensor)
         return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
 
     def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
@@ -166,11 +155,11 @@ class LidarModel:
 
     def image_of(self, scan: Scan | RangeImage) -> RangeImage:
         """The scan in this model's image. Raises ValueError for an image of another size."""
-        if isinstance(scan, Scan):
-            return project(scan, self.sensor, self.experiment.data.projection)
-        if scan.shape != (self.sensor.height, self.sensor.width):
-            raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
-        return scan
+        return image_in(scan, self.sensor, self.experiment.data.projection)
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """How many steps of the sampler `generate` takes per batch."""
+        return 32 if steps is None else steps
 
     def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
         """How many network evaluations `complete` takes."""
@@ -199,32 +188,6 @@ class LidarModel:
         return torch.zeros(count, 2, self.sensor.height, self.sensor.width, device=self._device)
 
 
-def assemble(experiment: Experiment, network: nn.Module) -> LidarModel:
-    """The model of an experiment and its trained network."""
-    return LidarModel(network.eval(), build_denoiser(experiment, network), build_sensor(experiment), experiment)
-
-
-def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeImage, np.ndarray]:
-    """A scan of `sensor_in` in the image of `sensor`, and which pixels it looked at: (H, W) bool.
-
-    A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
-    in that direction. Raises ValueError when no point falls into the image.
-    """
-    image = project(replace(scan, ring=None), sensor, "spherical")
-    if not image.mask.any():
-        raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
-    own = project(scan, sensor_in, "auto", width=sensor.width)
-    gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
-    # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.
-    beams = np.flatnonzero((gap.min(axis=1) < 0.5) & (own.mask.mean(axis=1) > 0.02))
-    known = image.mask.copy()
-    # A beam of fewer returns a turn than columns leaves gaps: empty is what has no return within two columns.
-    answered = np.any([np.roll(own.mask, shift, axis=1) for shift in range(-2, 3)], axis=0)
-    for beam in beams:
-        known[gap[beam].argmin()] |= ~answered[beam]
-    return image, known
-
-
 def _step(name: str):
     if name not in STEPS:
         raise ValueError(f"expected a sampler of {', '.join(STEPS)}, found {name!r}")
@@ -239,30 +202,3 @@ def _last(states: Iterator[State], on_step: OnStep) -> Tensor:
             on_step()
     assert state is not None
     return state.x_s
-
-
-def _with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
-    """The filled image with every known pixel replaced by its measurement, bit by bit."""
-    measured = known & image.mask
-    mask = np.where(known, image.mask, filled.mask)
-    reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
-    points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
-    return RangeImage(
-        range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
-        reflectance=np.where(mask, reflectance, 0).astype(np.float32),
-        mask=mask,
-        sensor=filled.sensor,
-        xyz=points,
-    )
-
-
-def load(source: str | Path = "default", ema: bool = True, device: str | torch.device = "cpu") -> LidarModel:
-    """A trained model.
-
-    source  `default`: the shipped weights; the name of an official release; one of our folders; an official `.pth`;
-            `owner/name` of the Hugging Face hub
-    ema     official files hold two sets of weights: their moving average (True), or the raw ones
-
-    Raises ValueError, or OSError, with one line that says what was expected and what was found.
-    """
-    return assemble(*load_parts(source, ema)).to(device)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 import tyro
 
 if TYPE_CHECKING:
-    from lidarsynth.model import LidarModel
+    from lidarsynth.scan_model import ScanModel
     from lidarsynth.training.loop import Progress
 
 REFUSED, STOPPED, UNHEARD = 2, 130, 141  # exit codes; the last two as shells have them for Ctrl-C and a closed pipe
@@ -85,11 +85,11 @@ def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
         bar.close()
 
 
-def load_with_bar(source: str, device: str) -> LidarModel:
+def load_with_bar(source: str, device: str) -> ScanModel:
     """The model, under a progress bar where it has to be downloaded. Raises ValueError."""
     from tqdm import tqdm
 
-    from lidarsynth.model import assemble
+    from lidarsynth.loading import assemble
     from lidarsynth.weights import load_parts
 
     with tqdm(desc=f"download {source}", unit="B", unit_scale=True, delay=2) as bar:

@@ -81,6 +81,10 @@ class CachedImages:
         label = None if record["label"][0, 0] == NO_LABEL else record["label"].astype(np.int64)
         return RangeImage(distance, reflectance, distance > 0, self.sensor, label)
 
+    def take(self, indices: list[int]) -> list[RangeImage]:
+        """Images by their numbers."""
+        return [self[i] for i in indices]
+
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]: range code and reflectance of the images, as `to_x_0` makes them."""
         if codec not in self._tables:

@@ -18,8 +18,9 @@ from lidarsynth.data.dataset import CachedImages
 from lidarsynth.data.frames import Name
 from lidarsynth.experiment import Experiment, Training
 from lidarsynth.lidar.depth import to_x_0
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.training.steps import Batch, draw
+from lidarsynth.training.tasks import task_of
 
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
 
@@ -46,21 +47,22 @@ class Streets:
         """What scan i is called."""
         return Name(SYNTHETIC, f"seed {self.seed}", str(i))
 
-    def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
-        """(B, 2, H, W) float32 in [-1, 1]."""
+    def take(self, indices: list[int]) -> list[RangeImage]:
+        """Scans as images, with labels."""
         from lidarsynth.data.synthetic.reader import SyntheticStreets
 
         images = []
         for slot, index in enumerate(indices):  # a reader per slot, because a reader remembers only two worlds
             reader = self._readers.setdefault(slot, SyntheticStreets(self.seed, 1 << 62, self.sensor))
-            images.append(to_x_0(reader.image(index), codec))
-        return torch.stack(images)
+            images.append(reader.image(index))
+        return images
+
+    def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
+        """(B, 2, H, W) float32 in [-1, 1]."""
+        return torch.stack([to_x_0(image, codec) for image in self.take(indices)])
 
 
-Images = CachedImages | Streets
-
-
-def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> Images:
+def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> CachedImages | Streets:
     """The images of a cache folder, or streets of `seed` (default the experiment's) for the word `synthetic`.
 
     Raises ValueError when the folder is no cache.
@@ -76,7 +78,7 @@ def epoch_order(seed: int, epoch: int, length: int) -> Tensor:
     return torch.randperm(length, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
 
 
-def batch_indices(training: Training, step: int, images: Images) -> list[int]:
+def batch_indices(training: Training, step: int, images: CachedImages | Streets) -> list[int]:
     """Which images the global batch of step `step` holds: each epoch visits every image of a cache once."""
     if isinstance(images, Streets):
         return images.indices(step, training.batch_size)
@@ -86,12 +88,12 @@ def batch_indices(training: Training, step: int, images: Images) -> list[int]:
 
 
 class Examples(Dataset):
-    """`examples[step, part] -> Batch`: part of `parts` equal parts of a step's global batch, interleaved.
+    """`examples[step, part] -> a batch`: part of `parts` equal parts of a step's global batch, interleaved.
 
     `parts` is processes times passes of gradient accumulation. Raises ValueError unless it divides the batch size.
     """
 
-    def __init__(self, experiment: Experiment, images: Images, parts: int):
+    def __init__(self, experiment: Experiment, images: CachedImages | Streets, parts: int):
         size = experiment.training.batch_size
         if size % parts:
             raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")
@@ -104,18 +106,16 @@ class Examples(Dataset):
         indices = batch_indices(self.experiment.training, step, self.images)
         return ", ".join("/".join(filter(None, self.images.name(i))) for i in indices)
 
-    def __getitem__(self, key: tuple[int, int]) -> Batch:
+    def __getitem__(self, key: tuple[int, int]) -> Any:
         step, part = key
         training = self.experiment.training
         indices = batch_indices(training, step, self.images)
         positions = list(range(part, training.batch_size, self.parts))
-        x_0 = self.images.x_0([indices[p] for p in positions], self.experiment.data.codec)
-        return draw(self.experiment, x_0, step, positions)
+        task = task_of(self.experiment)
+        return task.draw(self.experiment, self.images, [indices[p] for p in positions], step, positions)
 
 
-def load_batches(
-    examples: Examples, first: int, parts: range, workers: int = 0, pinned: bool = False
-) -> Iterator[Batch]:
+def load_batches(examples: Examples, first: int, parts: range, workers: int = 0, pinned: bool = False) -> Iterator[Any]:
     """The batches of the steps from `first` to the last, for each step those of `parts` in turn.
 
     The order does not depend on `workers`, the number of processes that read ahead.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,30 +14,39 @@ from lidarsynth.lidar.render import save_png
 from lidarsynth.training.loop import Progress
 
 TABLE = "losses.csv"
-COLUMNS = ("step", "loss", "generation", "completion", "grad_norm", "learning_rate")
 
 
 class Journal:
     """Writes to folder `out`; entries behind `step`, of a run that was killed after its checkpoint, are dropped.
 
+    parts    names of the parts of the loss
     project  of Weights & Biases, or None
 
     Raises ImportError when Weights & Biases is asked for and not installed. Without tensorboard, only the table and the
     pictures are written.
     """
 
-    def __init__(self, out: str | Path, step: int, batch_size: int, every: int = 50, project: str | None = None):
+    def __init__(
+        self,
+        out: str | Path,
+        step: int,
+        batch_size: int,
+        every: int = 50,
+        project: str | None = None,
+        parts: Sequence[str] = (),
+    ):
         self.out = Path(out)
+        self._columns = ("step", "loss", *parts, "grad_norm", "learning_rate")
         self._batch_size = batch_size
         self._every = every
         self._recent: dict[str, list[float]] = defaultdict(list)
-        self._table = _continue_table(self.out / TABLE, step)
+        self._table = _continue_table(self.out / TABLE, step, self._columns)
         self._board = _tensorboard(self.out / "tensorboard", step)
         self._wandb = _wandb(self.out, project) if project else None
 
     def step(self, progress: Progress) -> None:
         """A line of the table; every `every` steps, a point of each curve: means since the last one."""
-        self._table.write(_row(progress))
+        self._table.write(_row(progress, self._columns))
         self._table.flush()
         for name, value in {**progress.losses, "grad_norm": progress.grad_norm}.items():
             self._recent[name].append(value)
@@ -77,18 +86,18 @@ class Journal:
             self._wandb.finish()
 
 
-def _row(progress: Progress) -> str:
+def _row(progress: Progress, columns: Sequence[str]) -> str:
     values = {**progress.losses, "grad_norm": progress.grad_norm, "learning_rate": progress.learning_rate}
     # repr is exact, so that two curves can be compared bit by bit
-    return f"{progress.step}," + ",".join(repr(values[c]) if c in values else "" for c in COLUMNS[1:]) + "\n"
+    return f"{progress.step}," + ",".join(repr(values[c]) if c in values else "" for c in columns[1:]) + "\n"
 
 
-def _continue_table(path: Path, step: int):
+def _continue_table(path: Path, step: int, columns: Sequence[str]):
     """The open table with the rows up to `step`."""
     lines = path.read_text().splitlines()[1:] if path.exists() else []
-    kept = [line for line in lines if line.count(",") == len(COLUMNS) - 1 and int(line.split(",")[0]) <= step]
+    kept = [line for line in lines if line.count(",") == len(columns) - 1 and int(line.split(",")[0]) <= step]
     scratch = path.with_suffix(".tmp")
-    scratch.write_text("\n".join([",".join(COLUMNS), *kept]) + "\n")
+    scratch.write_text("\n".join([",".join(columns), *kept]) + "\n")
     os.replace(scratch, path)
     return path.open("a")
 

@@ -5,20 +5,21 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from lidarsynth.data.dataset import CachedImages
 from lidarsynth.experiment import Experiment, Training
 from lidarsynth.models.conditional import ConditionalUNet
-from lidarsynth.training.examples import Examples, Images, Streets, load_batches
+from lidarsynth.training.examples import Examples, Streets, load_batches
 from lidarsynth.training.machine import accelerator_of, fixed_randomness, workers_of
 from lidarsynth.training.options import Options
-from lidarsynth.training.steps import Batch, Objective, generation_count
+from lidarsynth.training.task import Phase
+from lidarsynth.training.tasks import task_of
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -26,20 +27,27 @@ if TYPE_CHECKING:
 
 @dataclass
 class Run:
-    """Everything that training changes; `state_dict` of it restores the run exactly."""
+    """Everything that training changes; `state_dict` of it restores the run exactly.
+
+    network     what is trained: of a GAN also the discriminator
+    product     the network that the model needs, a part of `network` or all of it
+    ema         its moving average
+    optimizers  by the names that the task's phases use
+    """
 
     network: nn.Module
+    product: nn.Module
     ema: nn.Module
-    optimizer: torch.optim.Optimizer
+    optimizers: dict[str, torch.optim.Optimizer]
     step: int = 0
     scaler: torch.amp.GradScaler | None = None  # of fp16
 
     def state_dict(self) -> dict:
-        """Weights, their average, optimiser, loss scale and the step, from which randomness and data order follow."""
+        """Weights, their average, optimisers, loss scale and the step, from which randomness and data order follow."""
         return {
             "network": self.network.state_dict(),
             "ema": self.ema.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
             "step": self.step,
             "scaler": self.scaler.state_dict() if self.scaler else {},
         }
@@ -48,7 +56,8 @@ class Run:
         """The inverse of `state_dict`."""
         self.network.load_state_dict(state["network"])
         self.ema.load_state_dict(state["ema"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
         self.step = state["step"]
         if self.scaler and state.get("scaler"):
             self.scaler.load_state_dict(state["scaler"])
@@ -60,7 +69,7 @@ class Progress:
 
     step: int
     losses: dict[str, float]  # `loss` and its parts, means over the global batch
-    grad_norm: float
+    grad_norm: float  # of a GAN, the largest of its phases
     learning_rate: float
     seconds: float = 0.0  # that the step took
     waited: float = 0.0  # seconds of these spent waiting for data
@@ -68,45 +77,42 @@ class Progress:
 
 def start(experiment: Experiment, network: nn.Module, scaler: torch.amp.GradScaler | None = None) -> Run:
     """A fresh run from the network's present weights; `scaler` is accelerate's, for fp16."""
-    training = experiment.training
-    optimizer = torch.optim.AdamW(network.parameters(), training.learning_rate, training.betas, weight_decay=0.0)
-    return Run(network, copy.deepcopy(network).requires_grad_(False), optimizer, scaler=scaler)
+    task = task_of(experiment)
+    with fixed_randomness(experiment.training.seed):
+        trained = task.around(experiment, network)
+    ema = copy.deepcopy(network).requires_grad_(False)
+    return Run(trained, network, ema, task.optimizers(experiment, trained), scaler=scaler)
 
 
 def learning_rate(training: Training, step: int) -> float:
-    """Linear warm-up from 0, then a half-cosine to 0 at the last step (R2DM's schedule); `step` counts from 0."""
+    """Linear warm-up from 0, then `training.decay`; `step` counts from 0. Raises ValueError for another word."""
+    if training.decay not in DECAYS:
+        raise ValueError(f"training.decay: expected one of {', '.join(DECAYS)}, found {training.decay!r}")
     if step < training.warmup:
         return training.learning_rate * step / max(1, training.warmup)
     progress = (step - training.warmup) / max(1, training.steps - training.warmup)
-    return training.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+    return training.learning_rate * DECAYS[training.decay](min(1.0, progress))
 
 
-def ema_due(training: Training, step: int) -> bool:
-    """Whether the average is updated after step `step`, counted from 1: the first, then every `ema_every`-th."""
-    return (step - 1) % training.ema_every == 0
-
-
-def ema_decay(training: Training, step: int) -> float:
-    """Share of the old average that stays after step `step`, counted from 1 (R2DM, i.e. ema-pytorch).
-
-    0 (copy) until `ema_start`, then min(ema_decay, 1 - (1 + k)^(-2/3)) with k steps since.
-    """
-    k = step - training.ema_start - 1
-    return 0.0 if k <= 0 else min(training.ema_decay, 1 - (1 + k) ** (-2 / 3))
+DECAYS: dict[str, Callable[[float], float]] = {  # factor of the rate after a share of the steps behind the warm-up
+    "cosine": lambda progress: 0.5 * (1 + math.cos(math.pi * progress)),  # R2DM's schedule
+    "constant": lambda progress: 1.0,
+}
 
 
 @torch.no_grad()
-def update_ema(ema: nn.Module, network: nn.Module, decay: float) -> None:
-    """ema <- decay * ema + (1 - decay) * network, for parameters and floating buffers."""
-    source = network.state_dict()
+def update_ema(ema: nn.Module, network: nn.Module, decay: float, buffers: bool = True) -> None:
+    """ema <- decay * ema + (1 - decay) * network, for parameters and, if `buffers`, floating buffers, else copied."""
+    source, learned = network.state_dict(), dict(ema.named_parameters())
     for name, average in ema.state_dict().items():
-        average.lerp_(source[name], 1 - decay) if average.is_floating_point() else average.copy_(source[name])
+        averaged = average.is_floating_point() and (buffers or name in learned)
+        average.lerp_(source[name], 1 - decay) if averaged else average.copy_(source[name])
 
 
 def train(
     experiment: Experiment,
     run: Run,
-    images: Images,
+    images: CachedImages | Streets,
     options: Options | None = None,
     accelerator: Accelerator | None = None,
 ) -> Iterator[Progress]:
@@ -118,79 +124,116 @@ def train(
     """
     options = options or Options(workers=0)
     accelerator = accelerator or accelerator_of(options)
-    training, passes = experiment.training, accelerator.gradient_accumulation_steps
-    examples = Examples(experiment, images, accelerator.num_processes * passes)
-    parts = range(accelerator.process_index, examples.parts, accelerator.num_processes)
-    pinned = accelerator.device.type == "cuda"
-    workers = workers_of(options, pinned or isinstance(images, Streets))
-    batches = load_batches(examples, run.step, parts, workers, pinned)
+    training, task = experiment.training, task_of(experiment)
+    batches, examples = _batches(experiment, images, run.step, options, accelerator)
     run.ema.to(accelerator.device)
-    run.network.train()
+    run.network.to(accelerator.device).train()
     if options.compile:
         # the U-Net only: interpolation of the known pixels has loops that depend on the data
-        (run.network.unet if isinstance(run.network, ConditionalUNet) else run.network).compile()
-    objective, optimizer = accelerator.prepare(Objective(experiment, run.network), run.optimizer)
+        (run.product.unet if isinstance(run.product, ConditionalUNet) else run.product).compile()
+    turns = _prepare(accelerator, task.phases(experiment, run.network), run.optimizers)
     while run.step < training.steps:
         began = time.perf_counter()
-        with _dropout(experiment, run.step, accelerator.process_index):
-            losses, waited = _gradients(accelerator, objective, optimizer, batches, training)
-        norm = float(accelerator.clip_grad_norm_(run.network.parameters(), training.clip_norm))  # type: ignore[arg-type]
-        finite = math.isfinite(losses["loss"]) and (math.isfinite(norm) or accelerator.scaler is not None)
-        if not finite:
-            raise FloatingPointError(f"step {run.step + 1}: expected a finite loss and gradient, "
-                                     f"found {losses['loss']} and {norm}; "
-                                     f"scans {examples.names(run.step)}")  # fmt: skip
-        rate = _update(run, optimizer, training)
+        passes, waited = _fetch(accelerator, batches)
+        rate = learning_rate(training, run.step)
+        losses, norm = _step(run.step, turns, passes, rate, training, accelerator, examples)
+        run.step += 1
+        task.after(experiment, run.network, run.step, accelerator)
+        if (decay := task.average(training, run.step)) is not None:
+            update_ema(run.ema, run.product, decay, task.buffers)
         yield Progress(run.step, losses, norm, rate, time.perf_counter() - began, waited)
 
 
-def _dropout(experiment: Experiment, step: int, process: int) -> AbstractContextManager:
-    """Dropout draws from torch's global generator: fixed for the step, and put back."""
-    if experiment.model.dropout == 0:
-        return nullcontext()
-    return fixed_randomness(experiment.training.seed, step, process)
+def _batches(
+    experiment: Experiment, images: CachedImages | Streets, step: int, options: Options, accelerator: Accelerator
+) -> tuple[Iterator[Any], Examples]:
+    """This process's batches from `step` on, one per pass, and what makes them."""
+    examples = Examples(experiment, images, accelerator.num_processes * accelerator.gradient_accumulation_steps)
+    parts = range(accelerator.process_index, examples.parts, accelerator.num_processes)
+    pinned = accelerator.device.type == "cuda"
+    workers = workers_of(options, pinned or isinstance(images, Streets))
+    return load_batches(examples, step, parts, workers, pinned), examples
 
 
-def _gradients(
-    accelerator: Accelerator,
-    objective: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    batches: Iterator[Batch],
-    training: Training,
-) -> tuple[dict[str, float], float]:
-    """Gradients of one step's global batch; its losses, and the seconds spent waiting for data."""
+class _Turn(NamedTuple):
+    """A phase, with what accelerate made of its objective and optimiser."""
+
+    objective: nn.Module
+    optimizer: torch.optim.Optimizer
+    every: int
+
+
+def _prepare(
+    accelerator: Accelerator, phases: Sequence[Phase], optimizers: dict[str, torch.optim.Optimizer]
+) -> list[_Turn]:
+    prepared = accelerator.prepare(*(phase.objective for phase in phases), *optimizers.values())
+    wrapped = dict(zip(optimizers, prepared[len(phases) :], strict=True))
+    return [
+        _Turn(objective, wrapped[phase.optimizer], phase.every)
+        for phase, objective in zip(phases, prepared[: len(phases)], strict=True)
+    ]
+
+
+def _fetch(accelerator: Accelerator, batches: Iterator[Any]) -> tuple[list[Any], float]:
+    """The batches of one step's passes, on the device, and the seconds spent waiting for them."""
     from accelerate.utils import send_to_device
 
-    waited, sums = 0.0, torch.zeros(2, device=accelerator.device)
-    optimizer.zero_grad()
-    for _ in range(accelerator.gradient_accumulation_steps):
-        began = time.perf_counter()
-        batch = next(batches)
-        waited += time.perf_counter() - began
-        batch: Batch = send_to_device(batch, accelerator.device, non_blocking=True)  # type: ignore[assignment]
-        with accelerator.accumulate(objective):
-            losses = objective(batch)
-            accelerator.backward(losses.mean())
-        n = batch.generation
-        sums += torch.stack([losses[:n].sum(), losses[n:].sum()]).detach()
-    total = accelerator.reduce(sums, reduction="sum")
+    began = time.perf_counter()
+    passes = [next(batches) for _ in range(accelerator.gradient_accumulation_steps)]
+    waited = time.perf_counter() - began
+    return [send_to_device(batch, accelerator.device, non_blocking=True) for batch in passes], waited
+
+
+def _step(
+    step: int,
+    turns: list[_Turn],
+    passes: list[Any],
+    rate: float,
+    training: Training,
+    accelerator: Accelerator,
+    examples: Examples,
+) -> tuple[dict[str, float], float]:
+    """All phases that are due, each with its optimiser's step; the sum and the parts of their losses, largest norm."""
+    losses, norms = {"loss": 0.0}, []
+    with fixed_randomness(training.seed, step, accelerator.process_index):  # of dropout and augmentations
+        for turn in turns:
+            if step % turn.every == 0:
+                found, norm = _turn(accelerator, turn, passes, rate, training.clip_norm)
+                _check(step, found["loss"], norm, accelerator, examples)
+                turn.optimizer.step()
+                losses = {**losses, **found, "loss": losses["loss"] + found["loss"]}
+                norms.append(norm)
+    return losses, max(norms)
+
+
+def _turn(
+    accelerator: Accelerator, turn: _Turn, passes: list[Any], rate: float, clip_norm: float
+) -> tuple[dict[str, float], float]:
+    """Clipped gradients of one phase for one step's global batch; the mean of each part of its loss, and their norm."""
+    sums: dict[str, Tensor] = {}
+    for group in turn.optimizer.param_groups:
+        group["lr"] = rate * group.get("factor", 1.0)
+    turn.optimizer.zero_grad()
+    for batch in passes:
+        with accelerator.accumulate(turn.objective):
+            losses = turn.objective(batch)
+            accelerator.backward(torch.cat([*losses.values()]).mean())
+        for name, values in losses.items():
+            part = torch.stack([values.detach().sum(), values.new_tensor(float(len(values)))])
+            sums[name] = sums.get(name, 0) + part
+    total = accelerator.reduce(torch.stack([*sums.values()]), reduction="sum")
     assert isinstance(total, Tensor)
-    return _means(total.tolist(), training), waited
+    parameters = [p for group in turn.optimizer.param_groups for p in group["params"]]
+    norm = float(accelerator.clip_grad_norm_(parameters, clip_norm))  # type: ignore[arg-type]
+    parts = {name: (float(part[0]), float(part[1])) for name, part in zip(sums, total, strict=True)}
+    mean = sum(value for value, _ in parts.values()) / sum(count for _, count in parts.values())
+    return {"loss": mean, **{name: value / count for name, (value, count) in parts.items() if count}}, norm
 
 
-def _means(sums: list[float], training: Training) -> dict[str, float]:
-    count, size = generation_count(training), training.batch_size
-    parts = {"generation": (sums[0], count), "completion": (sums[1], size - count)}
-    return {"loss": sum(sums) / size, **{name: total / n for name, (total, n) in parts.items() if n}}
-
-
-def _update(run: Run, optimizer: torch.optim.Optimizer, training: Training) -> float:
-    """One optimiser step and, when due, the moving average; returns the learning rate."""
-    rate = learning_rate(training, run.step)
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-    optimizer.step()
-    run.step += 1
-    if ema_due(training, run.step):
-        update_ema(run.ema, run.network, ema_decay(training, run.step))
-    return rate
+def _check(step: int, loss: float, norm: float, accelerator: Accelerator, examples: Examples) -> None:
+    """Raises FloatingPointError unless loss and gradient are finite; an infinite gradient of fp16 is skipped later."""
+    if not (math.isfinite(loss) and (math.isfinite(norm) or accelerator.scaler is not None)):
+        raise FloatingPointError(
+            f"step {step + 1}: expected a finite loss and gradient, found {loss} and {norm}; "
+            f"scans {examples.names(step)}"
+        )

@@ -12,18 +12,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lidarsynth.build import build_network, build_sensor, read_experiment
+from lidarsynth.data.dataset import CachedImages
 from lidarsynth.data.index import PLACE
 from lidarsynth.experiment import Card, Experiment, with_fields
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.presets import preset
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
-from lidarsynth.training.examples import Images, Streets, open_images
+from lidarsynth.training.examples import Streets, open_images
 from lidarsynth.training.finetune import transfer
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
 from lidarsynth.training.options import Options
-from lidarsynth.training.validation import Watch
+from lidarsynth.training.tasks import task_of
+from lidarsynth.training.watch import Watch
 from lidarsynth.weights import load_parts
 
 if TYPE_CHECKING:
@@ -108,7 +110,12 @@ def run(
 
 
 def _begin(
-    experiment: Experiment, images: Images, out: Path, weights: str | None, resume: bool, accelerator: Accelerator
+    experiment: Experiment,
+    images: CachedImages | Streets,
+    out: Path,
+    weights: str | None,
+    resume: bool,
+    accelerator: Accelerator,
 ) -> tuple[Experiment, Run]:
     """The experiment with its card, and the run: fresh, from weights, or as the newest checkpoint has it."""
     found, expected = images.sensor, build_sensor(experiment)
@@ -140,7 +147,7 @@ def _begin(
     return replace(experiment, card=card), state
 
 
-def _learned_from(images: Images) -> str:
+def _learned_from(images: CachedImages | Streets) -> str:
     """What a card says of the images: how many of what, and not where they lie on this disk."""
     count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
     details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
@@ -189,5 +196,8 @@ def _journal(
     if not accelerator.is_main_process:
         yield None
         return
-    with closing(Journal(out, step, experiment.training.batch_size, options.log_every, options.wandb)) as journal:
+    parts = task_of(experiment).parts
+    with closing(
+        Journal(out, step, experiment.training.batch_size, options.log_every, options.wandb, parts)
+    ) as journal:
         yield journal

@@ -19,6 +19,8 @@ from lidarsynth.diffusion.denoiser import Denoiser, masked_mean, min_snr_weight
 from lidarsynth.experiment import Data, Experiment, Training
 from lidarsynth.lidar.depth import CODECS
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.training.task import Images, Phase, Task
+from lidarsynth.training.validation import judge_diffusion, picture_samples
 
 
 class Batch(NamedTuple):
@@ -33,7 +35,7 @@ class Batch(NamedTuple):
 
 
 class Objective(nn.Module):
-    """`objective(batch) -> (b,)`, the loss per sample; its mean over the global batch is minimised.
+    """`objective(batch)` -> the losses per sample of generation and of completion; their mean is minimised.
 
     The first samples learn p(x_0), the others p(x_0 | known pixels): for a network that is told the known pixels, cf.
     conditional diffusion for LiDAR upsampling (Helgesen et al. 2024, arXiv 2405.04889). A module, so that one wrapper
@@ -46,15 +48,16 @@ class Objective(nn.Module):
         self.network = network
         self.denoiser = build_denoiser(experiment, network)
 
-    def forward(self, batch: Batch) -> Tensor:
-        losses, n = [], batch.generation
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        n = batch.generation
+        losses = {"generation": batch.t[:0], "completion": batch.t[:0]}
         if n:
             x_0, t, eps = (part[:n] for part in (batch.x_0, batch.t, batch.eps))
-            losses.append(generation_loss(self.experiment, self.denoiser, x_0, t, eps, batch.times))
+            losses["generation"] = generation_loss(self.experiment, self.denoiser, x_0, t, eps, batch.times)
         if n < len(batch.x_0):
             x_0, t, eps, known = (part[n:] for part in (batch.x_0, batch.t, batch.eps, batch.known))
-            losses.append(completion_loss(self.experiment, self.denoiser, x_0, t, eps, known))
-        return torch.cat(losses)
+            losses["completion"] = completion_loss(self.experiment, self.denoiser, x_0, t, eps, known)
+        return losses
 
 
 def generation_loss(
@@ -114,6 +117,11 @@ def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -
     ]
     x_0, t, eps, known = map(torch.stack, zip(*drawn, strict=True))
     return Batch(x_0, t, eps, known, torch.tensor(times), sum(p < count for p in positions))
+
+
+def draw_images(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
+    """`draw` of images of a cache or of streets."""
+    return draw(experiment, images.x_0(indices, experiment.data.codec), step, positions)
 
 
 def sample_rng(seed: int, step: int, position: int) -> torch.Generator:
@@ -183,3 +191,12 @@ def _pattern(height: int, width: int, draw: list[float], rng: torch.Generator) -
         mask[top : top + rows, :columns] = False
         mask = mask.roll(int(draw[6] * width), dims=1)
     return mask
+
+
+DIFFUSION = Task(
+    parts=("generation", "completion"),
+    draw=draw_images,
+    phases=lambda experiment, network: (Phase(Objective(experiment, network)),),
+    judge=judge_diffusion,
+    pictures=picture_samples,
+)

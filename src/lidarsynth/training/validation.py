@@ -1,8 +1,8 @@
-"""How good the averaged weights are: losses at fixed noise levels on fixed noise, and pictures of fixed seeds."""
+"""How good a denoiser's averaged weights are: losses at fixed noise levels on fixed noise, and pictures of samples."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,49 +11,19 @@ from torch import Tensor, nn
 from lidarsynth.build import build_denoiser, build_sensor
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.experiment import Experiment
+from lidarsynth.lidar.depth import to_x_0
 from lidarsynth.lidar.figure import panel
 from lidarsynth.lidar.render import range_strip, reflectance_strip
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.model import LidarModel
-from lidarsynth.training.examples import SYNTHETIC, Images, Streets, open_images
-from lidarsynth.training.journal import Journal
 
-VALIDATION_SEED = 1_000_003  # of streets that are never trained on
-IMAGES = 16
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # noise levels
 EVERY = 4  # completion is judged on every fourth beam, from pure noise
 
 
-class Watch:
-    """Looks at a run from time to time: at images that are not trained on where there are such, and at samples.
-
-    data        what is trained on: a cache, or `synthetic`, for which streets of another seed are held out
-    validation  cache of images that are not trained on; without one, a cache's curves are called `training_images`
-    """
-
-    def __init__(self, experiment: Experiment, data: str | Path, validation: str | Path | None = None):
-        self._experiment = experiment
-        self._source = validation or data
-        held_out = validation is not None or str(data) == SYNTHETIC
-        self._name = "validation" if held_out else "training_images"
-        self._x_0: Tensor | None = None
-
-    def look(self, network: nn.Module, step: int, journal: Journal) -> None:
-        """Losses per noise level and sample pictures of the averaged weights, into the journal."""
-        if self._x_0 is None:
-            self._x_0 = _spread(self._experiment, open_images(self._source, self._experiment, VALIDATION_SEED))
-        losses = fixed_losses(self._experiment, network, self._x_0)
-        journal.curves(step, {f"{self._name}/{level}": loss for level, loss in losses.items()})
-        journal.pictures(step, "sample", sample_pictures(self._experiment, network))
-
-
-def _spread(experiment: Experiment, images: Images) -> Tensor:
-    """x_0 (n, 2, H, W) of at most IMAGES images from everywhere in a cache, or of as many streets."""
-    if isinstance(images, Streets):
-        indices = images.indices(0, IMAGES)
-    else:
-        count = min(IMAGES, len(images))
-        indices = [i * len(images) // count for i in range(count)]
-    return images.x_0(indices, experiment.data.codec)
+def judge_diffusion(experiment: Experiment, network: nn.Module, images: Sequence[RangeImage]) -> dict[str, float]:
+    """`fixed_losses` of range images."""
+    return fixed_losses(experiment, network, torch.stack([to_x_0(i, experiment.data.codec) for i in images]))
 
 
 @torch.no_grad()
@@ -88,9 +58,15 @@ def _losses(experiment: Experiment, denoiser: Denoiser, x_0: Tensor, eps: Tensor
     return losses
 
 
-def sample_pictures(experiment: Experiment, network: nn.Module, count: int = 2, steps: int = 16) -> list[np.ndarray]:
-    """Pictures (H', W', 3) uint8 of scans that the network makes from seeds 0, 1, ...: range above reflectance."""
+def picture_samples(
+    experiment: Experiment, network: nn.Module, images: Sequence[RangeImage], count: int = 2, steps: int = 16
+) -> list[np.ndarray]:
+    """Pictures (H', W', 3) uint8 of scans that the network makes from seeds 0, 1, ...; `images` are not looked at."""
     sensor = build_sensor(experiment)
     model = LidarModel(network, build_denoiser(experiment, network), sensor, experiment)
-    images = model.generate(count, steps=steps, seed=0)
-    return [panel([[("range", range_strip(image))], [("reflectance", reflectance_strip(image))]]) for image in images]
+    return [strips(image) for image in model.generate(count, steps=steps, seed=0)]
+
+
+def strips(image: RangeImage) -> np.ndarray:
+    """(H', W', 3) uint8: range above reflectance."""
+    return panel([[("range", range_strip(image))], [("reflectance", reflectance_strip(image))]])

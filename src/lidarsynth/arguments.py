@@ -1,0 +1,41 @@
+"""The words that several verbs of the command line take, with their help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+arg = tyro.conf.arg
+Positional = tyro.conf.Positional
+Format = Literal["ply", "pcd", "bin", "npy", "npz"]
+Sampler = Literal["ddpm", "ddim", "dpmpp-2m", "heun"]
+Count = Annotated[int, arg(aliases=["-n"], help="how many scans.")]
+From = Annotated[str | None, arg(name="from")]
+Source = Annotated[
+    str, arg(metavar="MODEL", help="default, an official release, a model folder, or an official .pth file.")
+]
+Seed = Annotated[int, arg(help="of all randomness.")]
+NoSeed = Annotated[int, arg(help="not used; every verb takes it.")]
+Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
+Method = Annotated[
+    Literal["auto", "conditional", "repaint"],
+    arg(help="conditional tells the network what is known; repaint works with any network, and takes minutes."),
+]
+GenerationSteps = Annotated[int | None, arg(metavar="INT", help="of the sampler, per scan; default 32.")]
+Steps = Annotated[int | None, arg(metavar="INT", help="network steps; default 4 where conditional, 32 where repaint.")]
+Resamples = Annotated[int, arg(help="passes over each step of repaint.")]
+Intensity = Annotated[
+    Literal["auto", "unit", "byte", "uint16", "none"],
+    arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),
+]
+Picture = Annotated[bool, arg(help="write a .png beside each file.")]
+Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the range image.")]
+Recipe = Annotated[
+    str | None,
+    arg(metavar="RECIPE", help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +."),
+]
+SensorWord = Annotated[
+    str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")
+]

@@ -1,0 +1,171 @@
+"""What every model of scans can do, whatever its network, and how scans come into its images and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import nn
+
+from lidarsynth.data.recognise import recognise
+from lidarsynth.experiment import Experiment
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+
+OnStep = Callable[[], object] | None  # called after every network step, for progress bars
+
+
+class ScanModel(Protocol):
+    """A trained model with its sensor, as `load` returns it.
+
+    A model that cannot do what is asked, such as a GAN that is asked for a number of steps, raises ValueError. `steps`,
+    `sampler` and `method` of None or `auto` are the model's own.
+    """
+
+    @property
+    def network(self) -> nn.Module:
+        """The bare torch module."""
+        ...
+
+    @property
+    def sensor(self) -> Sensor:
+        """The beams and columns of its images."""
+        ...
+
+    @property
+    def experiment(self) -> Experiment:
+        """What it is and how it was trained."""
+        ...
+
+    def to(self, device: str | torch.device) -> ScanModel:
+        """The same model with its network on another device."""
+        ...
+
+    def generate(
+        self,
+        n: int = 1,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        on_step: OnStep = None,
+    ) -> list[RangeImage]:
+        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size."""
+        ...
+
+    def stream(
+        self,
+        n: int,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
+        ...
+
+    def complete(
+        self,
+        scan: Scan | RangeImage,
+        known: np.ndarray | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int = 10,
+        sampler: str | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """Fill what was not measured; pixels of `known` (H, W) bool come back exactly as they were."""
+        ...
+
+    def upsample(
+        self,
+        scan: Scan,
+        sensor_in: Sensor | str | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor."""
+        ...
+
+    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
+        """The scan in this model's image."""
+        ...
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """How often `generate` calls `on_step` per batch."""
+        ...
+
+    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
+        """How often `complete` calls `on_step`."""
+        ...
+
+
+def image_in(scan: Scan | RangeImage, sensor: Sensor, projection: str) -> RangeImage:
+    """The scan in an image of `sensor`. Raises ValueError for an image of another size."""
+    if isinstance(scan, Scan):
+        return project(scan, sensor, projection)
+    if scan.shape != (sensor.height, sensor.width):
+        raise ValueError(f"expected an image of {sensor.height} x {sensor.width}, found {scan.shape}")
+    return scan
+
+
+def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
+    """(H, W) bool: the given pixels, or the measured ones. Raises ValueError for another shape or type."""
+    known = image.mask if known is None else known
+    if known.shape != image.shape or known.dtype != np.bool_:
+        raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
+    return known
+
+
+def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
+    """The given sensor, or as recognised from the points. Raises ValueError when it is not."""
+    if sensor_in is None:
+        sensor_in, reason = recognise(scan)
+        if sensor_in is None:
+            raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
+    return get_sensor(sensor_in) if isinstance(sensor_in, str) else sensor_in
+
+
+def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeImage, np.ndarray]:
+    """A scan of `sensor_in` in the image of `sensor`, and which pixels it looked at: (H, W) bool.
+
+    A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
+    in that direction. Raises ValueError when no point falls into the image.
+    """
+    image = project(replace(scan, ring=None), sensor, "spherical")
+    if not image.mask.any():
+        raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
+    own = project(scan, sensor_in, "auto", width=sensor.width)
+    gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
+    # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.
+    beams = np.flatnonzero((gap.min(axis=1) < 0.5) & (own.mask.mean(axis=1) > 0.02))
+    known = image.mask.copy()
+    # A beam of fewer returns a turn than columns leaves gaps: empty is what has no return within two columns.
+    answered = np.any([np.roll(own.mask, shift, axis=1) for shift in range(-2, 3)], axis=0)
+    for beam in beams:
+        known[gap[beam].argmin()] |= ~answered[beam]
+    return image, known
+
+
+def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
+    """The filled image with every known pixel replaced by its measurement, bit by bit."""
+    measured = known & image.mask
+    mask = np.where(known, image.mask, filled.mask)
+    reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
+    points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
+    return RangeImage(
+        range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
+        reflectance=np.where(mask, reflectance, 0).astype(np.float32),
+        mask=mask,
+        sensor=filled.sensor,
+        xyz=points,
+    )
