@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # From nothing to the default weights, in chunks of under ten minutes; run again, it goes on where it was.
-# Usage: train_default.sh OUT [--cpu]. With a GPU: 60,000 steps of 64; --cpu: the 5,250 steps of 4 of the shipped weights.
+# Usage: train_default.sh OUT [--cpu]. With a GPU: 60,000 steps of 64; --cpu: the 5,000 steps of 4 of the shipped weights.
 set -euo pipefail
 out=$1
 cache=$out/streets
 if [ "${2:-}" = "--cpu" ]; then
   export ACCELERATE_USE_CPU=true
-  images=4096 options=(--save-every 250)
+  images=3072 options=(--save-every 250 --precision bf16)
   budget=()
 else
   images=32768 options=(--precision bf16)

@@ -11,15 +11,21 @@ from lidarsynth.models.adaptive_augmentation import (
     SYM2,
     SYM6,
     AdaptiveAugmentation,
+    Dice,
     octave_filters,
     random_affine,
     random_colour,
+    roll_dice,
     transform_colour,
     transform_geometry,
 )
 from lidarsynth.models.adversarial import r1_penalty
 from lidarsynth.models.dusty2 import Discriminator
 from lidarsynth.models.grid_sampling import sample_bilinear
+
+
+def rolled(count: int, seed: int) -> Dice:
+    return roll_dice(count, torch.Generator().manual_seed(seed))
 
 
 def test_given_matrices_transform_as_the_reference(fixture_tensors):
@@ -59,15 +65,17 @@ def test_wavelets_are_orthonormal_and_bands_add_up():
     assert_close(octave_filters().sum(0), identity, atol=1e-6, rtol=0)
 
 
-def test_nothing_changes_at_probability_zero_and_seeds_decide_above():
+def test_nothing_changes_at_probability_zero_and_an_image_s_dice_decide_above():
     images = torch.randn(4, 1, 32, 64)
-    zero, generator = torch.tensor(0.0), torch.Generator()
-    assert torch.equal(random_affine(images, zero, generator), torch.eye(3).expand(4, 3, 3))
-    assert torch.equal(random_colour(images, zero, generator), torch.eye(4).expand(4, 4, 4))
+    zero, dice = torch.tensor(0.0), rolled(4, 1)
+    assert torch.equal(random_affine(images, zero, dice), torch.eye(3).expand(4, 3, 3))
+    assert torch.equal(random_colour(images, zero, dice), torch.eye(4).expand(4, 4, 4))
     augmentation = AdaptiveAugmentation(p=0.8)
-    first, second = (augmentation(images, generator.manual_seed(seed)) for seed in (1, 1))
+    first, second = (augmentation(images, rolled(4, seed)) for seed in (1, 1))
     assert torch.equal(first, second)
-    assert not torch.equal(first, augmentation(images, generator.manual_seed(2)))
+    assert not torch.equal(first, augmentation(images, rolled(4, 2)))
+    halves = [augmentation(images[i : i + 2], Dice(*(part[i : i + 2] for part in dice))) for i in (0, 2)]
+    assert_close(torch.cat(halves), first, atol=1e-4, rtol=0)  # other padding, other rounding
 
 
 def test_shifts_run_around_the_ring_and_flips_mirror():
@@ -82,12 +90,12 @@ def test_shifts_run_around_the_ring_and_flips_mirror():
 
 def test_draws_follow_their_distributions():
     images = torch.zeros(20_000, 1, 32, 64)
-    affine = random_affine(images, torch.tensor(1.0), torch.Generator().manual_seed(0))
+    affine = random_affine(images, torch.tensor(1.0), rolled(20_000, 0))
     assert_close(affine[:, 0, 0].mean(), torch.tensor(0.0), atol=0.03, rtol=0)  # flips in half of the cases
     assert bool((affine[:, 0, 0].abs() == 1).all()), "scaling is vertical only"
     assert_close(affine[:, 1, 1].abs().log2().std(), torch.tensor(0.2), atol=0.01, rtol=0)
     assert_close(affine[:, 0, 2].std(), torch.tensor(64 * math.sqrt(0.125**2 + 0.125**2 / 3)), atol=0.2, rtol=0)
-    colour = random_colour(images, torch.tensor(1.0), torch.Generator().manual_seed(0))[:, :3].mean(1)
+    colour = random_colour(images, torch.tensor(1.0), rolled(20_000, 0))[:, :3].mean(1)
     contrast, offset = colour[:, :3].sum(1), colour[:, 3]
     assert_close(contrast.abs().log2().std(), torch.tensor(0.5), atol=0.02, rtol=0)
     assert_close((contrast > 0).float().mean(), torch.tensor(0.5), atol=0.02, rtol=0)
@@ -106,7 +114,7 @@ def test_sampling_has_the_second_derivative_that_r1_needs():
 def test_r1_through_the_augmentation_reaches_the_weights():
     net = Discriminator((32, 64), 2, 4)
     images = torch.randn(4, 1, 32, 64, requires_grad=True)
-    augmented = AdaptiveAugmentation(p=0.9)(images, torch.Generator().manual_seed(0))
+    augmented = AdaptiveAugmentation(p=0.9)(images, rolled(4, 0))
     penalty = r1_penalty(net(augmented), images)
     penalty.backward()
     assert penalty > 0

@@ -36,6 +36,43 @@ def test_an_untrained_network_returns_the_interpolation(net, case):
     torch.testing.assert_close(net(case["x_t"], case["log_snr"]), torch.zeros(3, 2, 16, 64))
 
 
+@pytest.fixture
+def chooser() -> ConditionalUNet:
+    torch.manual_seed(0)
+    unet = EfficientUNet(8, 14, (16, 64), 8, None, (1, 1, 2, 2), (1, 1, 1, 1), stem=(2, 4))
+    return ConditionalUNet(unet).eval().requires_grad_(False)
+
+
+def test_candidates_replace_the_interpolation_where_the_network_says_so(chooser, case):
+    untrained = chooser(**case)
+    fill = fill_in(case["known"], case["mask"])
+    inside = slice(5, 8)  # between known rows 4 and 8: two beams and "nothing returned" compete with the interpolation
+    above, below = case["known"][0, :, 4], case["known"][0, :, 8]
+    prior = torch.tensor([3.0, 0.0, 0.0, 0.0]).softmax(0)
+    for row in range(inside.start, inside.stop):
+        expected = prior[0] * fill[0, :, row] + prior[1] * above + prior[2] * below - prior[3]
+        torch.testing.assert_close(untrained[0, :, row], expected)
+    out = chooser.unet.out_conv
+    bias = next(value for name, value in out.named_parameters() if name.endswith("bias")).view(14, 8)
+    for word, expected in ((3, above), (4, below), (5, torch.full_like(above, -1))):
+        bias.zero_()
+        bias[2 + 2 * word : 4 + 2 * word] = 100.0
+        torch.testing.assert_close(chooser(**case)[0, :, 6], expected)
+
+
+def test_candidates_need_known_pixels(chooser, case):
+    assert torch.equal(chooser(case["x_t"], case["log_snr"]), torch.zeros(3, 2, 16, 64))
+    assert torch.equal(chooser(**case)[2], torch.zeros(2, 16, 64)), "nothing known in sample 2"
+    assert torch.equal(chooser(**case)[1, 1], torch.zeros(16, 64)), "no reflectance known in sample 1"
+    assert bool(randomised(chooser)(**case).isfinite().all())
+
+
+def test_a_network_of_another_width_is_refused():
+    unet = EfficientUNet(8, 3, (16, 64), 8, None, (1, 1, 2, 2), (1, 1, 1, 1), stem=(2, 4))
+    with pytest.raises(ValueError, match="out_channels = C or 7 C, got 8 and 3"):
+        ConditionalUNet(unet)
+
+
 def test_an_empty_mask_is_no_mask(net, case):
     case["mask"].zero_()
     torch.testing.assert_close(randomised(net)(**case), net(case["x_t"], case["log_snr"]))
@@ -72,5 +109,5 @@ def test_impossible_inputs_are_refused(net, case):
         net(**{**case, "mask": None})
     with pytest.raises(ValueError, match=r"known must have the shape of x_t, .* got \(3, 1, 16, 64\)"):
         net(**{**case, "known": case["known"][:, :1]})
-    with pytest.raises(ValueError, match=r"in_channels = 4 \* out_channels = 8, got 2"):
+    with pytest.raises(ValueError, match="out_channels = C or 7 C, got 2 and 2"):
         ConditionalUNet(EfficientUNet(resolution=(16, 64), base_channels=8))

@@ -73,6 +73,17 @@ def test_frechet_distance_equals_scipy_and_is_zero_for_equal_sets(count):
     assert frechet_distance(moments(x), moments(x[::-1])) == pytest.approx(0, abs=1e-5 * np.trace(cov[0]))
 
 
+def test_frechet_distance_of_few_against_many_equals_scipy_from_either_side():
+    few, many = draw(12, 30, 1).astype(np.float64), draw(200, 30, 2, shift=0.2).astype(np.float64)
+    few[6:] = few[:6]  # rank 5
+    cov = [np.cov(v, rowvar=False) for v in (few, many)]
+    root = sqrtm(cov[1])
+    trace = np.sqrt(np.linalg.eigvalsh(root @ cov[0] @ root).clip(0)).sum()
+    expected = ((few.mean(0) - many.mean(0)) ** 2).sum() + np.trace(cov[0] + cov[1]) - 2 * trace
+    for pair in ((few, many), (many, few)):
+        assert frechet_distance(*map(moments, pair)) == pytest.approx(expected, rel=1e-6)
+
+
 def split(values: np.ndarray, sizes: list[int]) -> list[np.ndarray]:
     return np.split(values, np.cumsum(sizes)[:-1])
 
@@ -128,6 +139,20 @@ def test_kernel_distance_of_whole_sets_equals_the_reference_in_any_order(feature
     for pair, seed in ((sets, 0), (sets[::-1], 1)):
         distance = kernel_distance(*pair, np.random.default_rng(seed), subsets=1)
         assert distance == pytest.approx(expected["value"], rel=1e-5)
+
+
+def test_kernel_distance_equals_its_definition():
+    """Unbiased: no pair of a feature with itself (Binkowski et al. 2018, eq. 4; torch-fidelity, k-diffusion)."""
+    x, y = draw(9, 6, 1).astype(np.float64), draw(9, 6, 2, shift=0.3).astype(np.float64)
+
+    def kernel(a: np.ndarray, b: np.ndarray) -> float:
+        return (sum(p * q for p, q in zip(a, b, strict=True)) / 6 + 1) ** 3
+
+    within = sum(kernel(v[i], v[j]) for v in (x, y) for i in range(9) for j in range(9) if i != j) / (9 * 8)
+    between = sum(kernel(p, q) for p in x for q in y) / 81
+    distance = kernel_distance(x, y, np.random.default_rng(0), subsets=2)
+    assert distance == pytest.approx(within - 2 * between, rel=1e-10)
+    assert kernel_distance(x, x, np.random.default_rng(0), subsets=1) < 0, "unbiased, so it may be negative"
 
 
 def test_kernel_distance_reads_memory_maps(tmp_path):

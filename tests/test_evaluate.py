@@ -1,6 +1,10 @@
 """Evaluation as a user meets it: every form of samples, kept and merged statistics, the verb, and how it refuses."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +22,9 @@ from lidarsynth.image_sets import image_set
 from lidarsynth.lidar.projection import thin
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.metrics.pairs import Pairs
 from lidarsynth.metrics.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING
+from lidarsynth.metrics.rangenet import RangeNet
 from lidarsynth.metrics.statistics import load_statistics
 
 SENSOR = SENSORS["hdl-64e"].resized(width=64)
@@ -42,7 +48,9 @@ REAL = [street(i) for i in range(100, 108)]
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache folder, and files that cannot be downloaded, at once."""
     monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(gathering, "URLS", dict.fromkeys(gathering.URLS, (tmp_path / "nowhere").as_uri()))
     return tmp_path / "cache"
 
 
@@ -64,6 +72,22 @@ def saved(folder: Path, images: list[RangeImage], form: str = "npz") -> Path:
 @pytest.fixture
 def real(tmp_path: Path) -> Path:
     return saved(tmp_path / "real", REAL)
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*words: object) -> tuple[int, str, str]:
+        code = 0
+        try:
+            main([str(word) for word in words])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capsys.readouterr()
+
+    return run
 
 
 def test_a_list_of_images_is_judged_in_memory():
@@ -108,13 +132,16 @@ def test_a_cache_is_a_reference_and_larger_images_are_thinned(tmp_path: Path):
 def test_statistics_of_the_reference_are_kept_shared_and_verified(tmp_path: Path, real: Path, cache: Path):
     calls: list[tuple[str, int, int]] = []
     first = evaluation.evaluate(STREETS, real, on_images=lambda *told: calls.append(told))
-    assert calls[-1] == ("real", 8, 8)
+    assert ("real", 8, 8) in calls and calls[-1] == ("compute range, per beam", 3, 4)
     calls.clear()
     again = evaluation.evaluate(STREETS, real, on_images=lambda *told: calls.append(told))
-    assert {what for what, _, _ in calls} == {"samples"}, "the reference is not read twice"
+    assert "samples" in {told[0] for told in calls} and ("real", 8, 8) not in calls, "it is not read twice"
     assert again.values == first.values
     (kept,) = (cache / "statistics").iterdir()
     assert first.sources["reference statistics"] == str(kept)
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert kept.stat().st_mode == plain.stat().st_mode, "as readable as any file, to be shared"
     shared = tmp_path / "given.safetensors"
     shared.write_bytes(kept.read_bytes())
     assert ls.evaluate(STREETS, shared).values == first.values
@@ -143,6 +170,75 @@ def test_two_machines_share_the_samples(tmp_path: Path, real: Path):
         evaluation.gather_part(samples, "3/2", parts[0], "bev-1")
 
 
+def test_parts_of_points_are_drawn_into_the_images_of_the_reference(tmp_path: Path, run: Run):
+    sensor = SENSORS["hdl-64e-kitti"].resized(width=64)
+    real = saved(tmp_path / "real", [street(i, sensor) for i in range(100, 104)])
+    points, out = saved(tmp_path / "ply", [street(i, sensor) for i in range(4)], "ply"), tmp_path / "r.json"
+    run("evaluate", points, "--reference", real, "--out", out)
+    expected = json.loads(out.read_text())["values"]
+    reference = tmp_path / "real.safetensors"
+    run("evaluate", real, "--part", "1/1", "--side", "reference", "--out", reference)
+    for like in (real, reference):
+        run("evaluate", points, "--part", "1/1", "--reference", like, "--out", tmp_path / "part.safetensors")
+        assert run("evaluate", tmp_path / "part.safetensors", "--reference", reference, "--out", out)[0] == 0
+        assert json.loads(out.read_text())["values"] == expected
+
+
+def test_parts_of_a_reference_become_one_file_to_share(tmp_path: Path, real: Path):
+    parts = [tmp_path / f"{i}.safetensors" for i in (1, 2, 3)]
+    for i, part in enumerate(parts, 1):
+        evaluation.gather_part(real, f"{i}/3", part, "bev-1", side="reference")
+    shared_file = tmp_path / "streets.safetensors"
+    evaluation.gather_part(parts, "1/1", shared_file, "bev-1")
+    whole = ls.evaluate(STREETS, real)
+    for reference in (shared_file, parts):
+        report = ls.evaluate(STREETS, reference)
+        assert report.values == pytest.approx(whole.values, rel=1e-6)
+        assert report.hashes["reference"] == whole.hashes["reference"]
+    report = ls.evaluate(STREETS, parts[:2])
+    assert "expected all parts of the images, found none of 3/3" in report.warnings
+    with pytest.raises(ValueError, match="found none of 2/3"):
+        evaluation.gather_part([parts[0], parts[2]], "1/1", shared_file, "bev-1")
+    evaluation.gather_part(real, "1/1", shared_file, "bev-1")
+    with pytest.raises(ValueError, match="found samples and samples; gather a reference as such"):
+        ls.evaluate(STREETS, shared_file)
+    evaluation.gather_part(real, "2/2", shared_file, "bev-1", side="reference")
+    with pytest.raises(ValueError, match="expected parts of one division, found 1/3, 2/2"):
+        ls.evaluate(STREETS, [parts[0], shared_file])
+    with pytest.raises(ValueError, match="takes as many of the reference as there are samples"):
+        evaluation.gather_part(real, "1/1", shared_file, LIDARGEN, side="reference")
+
+
+KILLED = """
+import os, signal, sys
+from lidarsynth import evaluation, gathering
+gathering.SAVE_EVERY = 0.0
+def kill(what, done, total):
+    if done == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+evaluation.evaluate(sys.argv[1], sys.argv[2], sys.argv[3], batch_size=1, on_images=kill)
+"""
+
+
+@pytest.mark.parametrize("protocol", ["bev-1", "r2dm-upsampling-2024"])
+def test_a_killed_evaluation_goes_on(protocol: str, tmp_path: Path, real: Path, cache: Path):
+    """kill -9 in the middle: the second call begins at the fourth image, and finds what one call would have found."""
+    samples = saved(tmp_path / "samples", [*STREETS, *STREETS[:2]])
+    expected = ls.evaluate([*STREETS, *STREETS[:2]], REAL, protocol=protocol)
+    command = [sys.executable, "-c", KILLED, str(samples), str(real), protocol]
+    done = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, timeout=100)
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()[-2000:]
+    assert len(list((cache / "statistics").glob("unfinished-*"))) == 1
+    seen: list[int] = []
+    report = evaluation.evaluate(
+        samples, real, protocol, batch_size=1, on_images=lambda what, done, total: seen.append(done)
+    )
+    assert seen[0] == 4, "three images were kept"
+    assert report.values == expected.values, "bit by bit: integers, and sums in the same order"
+    assert {**expected.hashes, **report.hashes} == report.hashes
+    assert not list((cache / "statistics").glob("unfinished-*"))
+
+
 def test_a_stopped_evaluation_goes_on(tmp_path: Path, real: Path, cache: Path, monkeypatch: pytest.MonkeyPatch):
     samples = saved(tmp_path / "samples", STREETS)
     expected = ls.evaluate(STREETS, real)
@@ -165,18 +261,23 @@ def test_a_stopped_evaluation_goes_on(tmp_path: Path, real: Path, cache: Path, m
     assert not list((cache / "statistics").glob("unfinished-*"))
 
 
-def test_networks_that_are_not_here_make_rows_na(tmp_path: Path, real: Path, cache: Path, shared: Path):
+def test_networks_are_downloaded_or_make_rows_na(
+    tmp_path: Path, real: Path, cache: Path, shared: Path, monkeypatch: pytest.MonkeyPatch
+):
     report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
     assert report.values["FPD"] is None and report.values["JSD x1e2"] is not None
-    assert f"put cls_model_39.pth at {cache / 'cls_model_39.pth'}" in str(report)
+    assert f"without a network, put the file at {cache / 'cls_model_39.pth'}" in str(report)
+    assert "N/A: FPD, FPD squared MMD: file:" in str(report), "the reason stands there once"
     assert "no official rangenet for 64 columns, only for 2048, 1024, 512" in str(report)
-    (cache / "cls_model_39.pth").write_bytes((shared / "fixtures/pointnet/cls_model_39.pth").read_bytes())
+    monkeypatch.setitem(gathering.URLS, "pointnet", (shared / "fixtures/pointnet").as_uri())
     report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
     assert report.values["FPD"] is not None and report.values["FPD squared MMD"] is not None
     assert len(report.hashes["pointnet"]) == 64
     assert any("singular covariance of 1808" in warning for warning in report.warnings)
     (cache / "cls_model_39.pth").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"cls_model_39\.pth: expected weights"):
+    with pytest.raises(
+        ValueError, match=r"cls_model_39\.pth: expected weights.*; delete the file to download it again"
+    ):
         ls.evaluate(STREETS, real, protocol="r2dm-2024")
 
 
@@ -216,10 +317,41 @@ def test_upsampling_compares_images_one_by_one():
         ls.evaluate(STREETS, REAL, protocol=R2DM_UPSAMPLING.name)
 
 
-def test_rows_that_nobody_here_computes_say_why():
-    report = evaluation.evaluate(STREETS, REAL, DUSTY)
-    assert report.values["COV"] is None and "earth mover's distance" in str(report)
-    assert json.loads(report.json())["values"]["1-NNA"]["reason"].startswith("needs the earth mover")
+def test_classes_are_compared_pixel_by_pixel_and_named(tmp_path: Path):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = RangeNet(21, width=4).eval()
+    both = [Pairs(R2DM_UPSAMPLING, network) for _ in range(2)]
+    both[0].update(STREETS[:2], REAL[:2])
+    both[1].update(STREETS[2:3], REAL[2:3])
+    both[0].merge(both[1])
+    report = both[0].report()
+    labels = [np.concatenate([both[0]._labels([image]) for image in images[:3]]) for images in (REAL, STREETS)]
+    union = [[((labels[0] == c) & (labels[0] > 0) & (labels[1] > 0) & (labels[1] == c)).sum(),
+              (((labels[0] == c) | (labels[1] == c)) & (labels[0] > 0) & (labels[1] > 0)).sum()]
+             for c in range(1, 20)]  # fmt: skip
+    iou = np.array([hit / max(either, 1) for hit, either in union])
+    assert list(report.classes.values()) == pytest.approx(iou.tolist()) and "car" in report.classes
+    assert report.values["IoU"] == pytest.approx(100 * iou.mean())
+    assert "| car |" in report.markdown() and json.loads(report.json())["classes"] == report.classes
+    truth = saved(tmp_path / "truth", REAL[:2])
+    (truth / "1.npz").rename(truth / "2.npz")
+    report = ls.evaluate(saved(tmp_path / "samples", STREETS[:2]), truth, protocol="r2dm-upsampling-2024")
+    assert "1 of 2 samples are compared with a reference of another name, first" in report.warnings[-1]
+
+
+def test_point_sets_are_judged_where_they_are_few_enough():
+    small = ls.evaluate(STREETS, REAL, protocol="dusty-2023-small")
+    assert small.counts["samples as point sets"] == 6 and small.counts["reference as point sets"] == 8
+    assert 0 < small.values["JSD"] < 1 and 0 < small.values["MMD"] < 0.2
+    assert 100 / 8 <= small.values["COV"] <= 100 and 0 <= small.values["1-NNA"] <= 100
+    same = ls.evaluate(STREETS, STREETS, protocol="dusty-2023-small")
+    assert same.values == pytest.approx({"JSD": 0, "COV": 100, "MMD": 0, "1-NNA": 0})
+    few = replace(DUSTY, sets=replace(DUSTY.sets, points=16, pairs=90))
+    report = evaluation.evaluate(STREETS, REAL, few)  # 6 * 8 + 15 + 28 = 91 pairs
+    assert report.values["COV"] is None and report.values["JSD"] is not None
+    assert "N/A: COV, MMD, 1-NNA: needs 91 earth mover's distances between sets of 16 points, at most 90" in str(report)
+    assert json.loads(report.json())["values"]["SWD"]["reason"].endswith("not here")
 
 
 def broken_sample(folder: Path, values: torch.Tensor) -> Path:
@@ -251,6 +383,32 @@ def test_errors_name_the_sample_and_say_both_sides(tmp_path: Path, real: Path):
         ls.evaluate(tmp_path / "code", real)
 
 
+def test_batches_in_one_file_are_images_like_others(tmp_path: Path, real: Path):
+    (tmp_path / "batches").mkdir()
+    for name, images in (("a", STREETS[:4]), ("b", STREETS[4:])):
+        arrays = {key: np.stack([getattr(image, key) for image in images]) for key in ("range", "reflectance", "mask")}
+        sensor = np.array(json.dumps(SENSOR.to_dict()))
+        np.savez_compressed(tmp_path / f"batches/{name}.npz", sensor=sensor, **arrays)
+    report, expected = ls.evaluate(tmp_path / "batches", real), ls.evaluate(STREETS, real)
+    assert report.values == expected.values and report.hashes["samples"] == expected.hashes["samples"]
+    assert image_set(tmp_path / "batches").names[4].endswith("b.npz[0]")
+    np.savez(tmp_path / "batches/b.npz", sensor=sensor, **{**arrays, "mask": arrays["mask"][:1]})
+    with pytest.raises(ValueError, match=r"b.npz.*expected a batch of arrays \(B, ...\)"):
+        ls.evaluate(tmp_path / "batches", real)
+
+
+def test_a_scan_counts_once_and_hidden_files_not_at_all(tmp_path: Path, real: Path):
+    samples = saved(tmp_path / "samples", STREETS)
+    (samples / "._0.npz").write_bytes(b"of another system")
+    saved(samples / ".unfinished", STREETS[:1])
+    for name in ("a.v1.ply", "a.v2.ply"):
+        write(samples / name, STREETS[0])
+    assert len(image_set(samples)) == 8
+    write(samples / "3.ply", STREETS[3])
+    with pytest.raises(ValueError, match=r"samples: expected one file per scan, found 3.npz and 3.ply"):
+        ls.evaluate(samples, real)
+
+
 def test_other_beams_have_no_report_per_beam():
     other = [street(i, SENSORS["hdl-64e-kitti"].resized(width=64)) for i in range(3)]
     report = ls.evaluate(STREETS, other)
@@ -264,22 +422,6 @@ def test_an_image_set_tells_where_it_comes_from(tmp_path: Path, real: Path):
     assert len(images) == 8 and images.source == str(real)
     assert images.stamp == image_set(str(real)).stamp != image_set(saved(tmp_path / "b", REAL[:2])).stamp
     assert image_set(real / "3.npz").image(0, SENSOR, "spherical").shape == (64, 64)
-
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def run(*words: object) -> tuple[int, str, str]:
-        code = 0
-        try:
-            main([str(word) for word in words])
-        except SystemExit as end:
-            code = int(end.code or 0)
-        return code, *capsys.readouterr()
-
-    return run
 
 
 def test_the_verb_prints_a_table_and_writes_json_and_markdown(tmp_path: Path, real: Path, run: Run):
@@ -307,7 +449,9 @@ def test_the_verb_gathers_parts_and_refuses_in_one_line(tmp_path: Path, real: Pa
     for words, reason in (
         ((samples,), "expected --reference CACHE, STATS or FOLDER, found none"),
         ((samples, "--reference", real, "--protocol", "fid"), "expected a protocol of r2dm-2024"),
-        ((samples, "--reference", real, "--out", "r.txt"), "expected a name that ends in .json"),
+        ((samples, "--reference", real, "--out", "r.txt"), "expected the name of a file that ends in .json"),
+        ((samples, "--reference", real, "--out", tmp_path), "found "),
+        (("--reference", real), "expected SAMPLES to judge"),
         ((tmp_path / "no", "--reference", real), "found no such file or folder"),
     ):
         code, _, error = run("evaluate", *words)

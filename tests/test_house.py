@@ -25,11 +25,15 @@ EVERYTHING = {
     "data",
     "metrics",
     "presets",
+    "upsampling_presets",
     "build",
     "hub",
     "weights",
     "model",
+    "gan_model",
     "scan_model",
+    "upsampling_model",
+    "interpolation_model",
     "loading",
 }
 # DESIGN.md, "Who may import whom": part -> the other parts that it may import.
@@ -40,13 +44,23 @@ ARROWS: dict[str, set[str]] = {
     "experiment": set(),
     "data": {"lidar"},
     "metrics": {"lidar"},
-    "presets": {"experiment"},
+    "presets": {"experiment", "upsampling_presets"},
+    "upsampling_presets": {"experiment"},
     "build": {"lidar", "models", "diffusion", "experiment", "data", "metrics", "presets"},
     "hub": {"build", "experiment"},
-    "weights": {"build", "hub", "experiment", "presets"},  # plain records, so that a release is built from its preset
+    "official": {"experiment", "official_gan", "official_lidargen", "official_upsampling"},
+    "official_gan": {"build", "experiment", "lidar", "models", "presets"},
+    "official_lidargen": {"experiment", "models", "presets"},
+    "official_upsampling": {"experiment", "models", "upsampling_presets"},
+    # plain records, so that a release is built from its preset
+    "weights": {"build", "hub", "official", "experiment", "presets", "upsampling_presets", "official_upsampling"},
     "model": {"hub", "lidar", "diffusion", "experiment", "scan_model"},
+    "gan_model": {"hub", "lidar", "diffusion", "experiment", "models", "scan_model"},
+    "upsampling_model": {"hub", "lidar", "models", "experiment", "scan_model"},
+    "interpolation_model": {"lidar", "models", "experiment", "scan_model"},
     "scan_model": {"lidar", "experiment", "data"},  # data: to recognise a sensor
-    "loading": {"build", "experiment", "model", "scan_model", "weights"},
+    "loading": {"build", "experiment", "models", "model", "gan_model", "upsampling_model", "interpolation_model"}
+    | {"scan_model", "weights"},
     "training": EVERYTHING,
     # The command line's own logic: texts, pictures, what verbs do, how they speak.
     "arguments": set(),
@@ -58,16 +72,19 @@ ARROWS: dict[str, set[str]] = {
     "image_sets": {"data", "lidar"},
     "gathering": EVERYTHING | {"image_sets"},
     "evaluation": EVERYTHING | {"image_sets", "gathering"},
+    "benchmark": EVERYTHING
+    | {"pictures", "image_sets", "gathering", "evaluation", "completion", "generation", "arguments", "terminal"},
     "terminal": EVERYTHING | {"training"},
     "cli": EVERYTHING
     | {"training", "viewer"}
-    | {"arguments", "pictures", "targets", "report", "completion", "generation", "evaluation", "terminal"},
+    | {"arguments", "pictures", "targets", "report", "completion", "generation", "evaluation", "terminal"}
+    | {"benchmark"},
     "viewer": EVERYTHING | {"training", "cli"},
     "__main__": {"cli"},
 }
 CORE = {"torch", "numpy", "einops", "safetensors", "tyro", "tqdm", "PIL", "tomli"}  # pyproject's dependencies
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
-PURE = {"experiment", "presets"}  # no torch, no numpy, no lidar: they read in milliseconds
+PURE = {"experiment", "presets", "upsampling_presets"}  # no torch, no numpy, no lidar: they read in milliseconds
 SPEAKERS = {"terminal", "__main__"}  # the only ones that print and set the exit code
 
 

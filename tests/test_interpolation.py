@@ -4,7 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarsynth.models.interpolation import METHODS, fill_in, interpolate, resize_rows, sample_queries
+from lidarsynth.models.interpolation import (
+    METHODS,
+    fill_in,
+    interpolate,
+    nearest_along_axes,
+    resize_rows,
+    sample_queries,
+)
 
 
 def rows_mask(shape: tuple[int, int, int, int], *rows: int) -> Tensor:
@@ -153,3 +160,19 @@ def test_errors_say_both_sides():
         resize_rows(x, 20, alignment="rows")
     with pytest.raises(ValueError, match="got 'corners'"):
         resize_rows(x, 16, alignment="corners")
+
+
+def test_the_nearest_known_pixels_along_both_axes():
+    generator = torch.Generator().manual_seed(5)
+    known = torch.rand(1, 1, 5, 7, generator=generator)
+    mask = torch.rand(1, 1, 5, 7, generator=generator) < 0.3
+    values, found = nearest_along_axes(known, mask)
+    for row in range(5):
+        for column in range(7):
+            around = [(column + step) % 7 for step in range(7)]
+            ways = ([(row, c) for c in [column, *around[:0:-1]]], [(row, c) for c in around],
+                    [(r, column) for r in range(row, -1, -1)], [(r, column) for r in range(row, 5)])  # fmt: skip
+            for way, path in enumerate(ways):
+                hits = [float(known[0, 0, r, c]) for r, c in path if mask[0, 0, r, c]]
+                assert bool(found[way, 0, 0, row, column]) == bool(hits)
+                assert float(values[way, 0, 0, row, column]) == (hits[0] if hits else 0.0)

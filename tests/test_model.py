@@ -113,7 +113,7 @@ def test_streams_hold_one_batch(model):
         ({"n": 0}, "expected n, steps and batch_size of at least 1, found 0, 32, 4"),
         ({"steps": 0}, "of at least 1, found 1, 0, 4"),
         ({"batch_size": -1}, "of at least 1, found 1, 32, -1"),
-        ({"sampler": "euler"}, "expected a sampler of ddpm, ddim, dpmpp-2m, heun, found 'euler'"),
+        ({"sampler": "euler"}, "expected a sampler of ddpm, ddim, dpmpp-2m, heun, langevin, found 'euler'"),
     ],
 )
 def test_generation_refuses_what_it_cannot_do(model, options, message):
@@ -151,7 +151,7 @@ def test_unconditional_models_complete_too(unconditional, image):
     assert not unconditional.conditional
     result = unconditional.complete(image.keep(known), known, steps=3, resamples=2)
     assert_known_is_kept(result, image, known)
-    with pytest.raises(ValueError, match=r"tiny: expected method repaint, .*, found conditional"):
+    with pytest.raises(ValueError, match=r"tiny: expected method repaint or posterior, .*, found conditional"):
         unconditional.complete(image, known, method="conditional")
 
 
@@ -208,7 +208,7 @@ def test_completion_refuses_what_does_not_fit(model, image):
         model.complete(image, image.mask.T)
     with pytest.raises(ValueError, match=r"known must be \(16, 64\) bool, got \(16, 64\) float32"):
         model.complete(image, image.range)
-    with pytest.raises(ValueError, match="expected a method of auto, conditional, repaint, found 'inpaint'"):
+    with pytest.raises(ValueError, match="expected a method of auto, conditional, repaint, posterior, found 'inpaint'"):
         model.complete(image, method="inpaint")
     with pytest.raises(ValueError, match=r"expected a sampler of .* found 'euler'"):
         model.complete(image, sampler="euler")

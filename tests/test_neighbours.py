@@ -54,6 +54,19 @@ def test_distance_matrix_of_point_clouds():
     assert matrix.shape == (3, 2)
     assert matrix[0, 0] == matrix[1, 1] == 0
     assert matrix[0, 1] == matrix[1, 0] == chamfer_distance(clouds[0], clouds[1])
+    tensors = [torch.from_numpy(matrix) for matrix in (matrix[:2], matrix[:2], matrix[:2])]
+    assert coverage(tensors[0]) == coverage(matrix[:2]) and nearest_neighbour_accuracy(*tensors) == 0
+    assert minimum_matching_distance(tensors[0]) == minimum_matching_distance(matrix[:2])
+    calls: list[int] = []
+
+    def counted(a: np.ndarray, b: np.ndarray) -> float:
+        calls.append(1)
+        return chamfer_distance(a, b)
+
+    assert np.array_equal(
+        distance_matrix(clouds, clouds, counted), distance_matrix(clouds, list(clouds), chamfer_distance)
+    )
+    assert len(calls) == 3, "of one set with itself each pair is computed once"
     assert distance_matrix([], clouds, chamfer_distance).shape == (0, 3)
 
 

@@ -10,21 +10,32 @@ import tyro
 arg = tyro.conf.arg
 Positional = tyro.conf.Positional
 Format = Literal["ply", "pcd", "bin", "npy", "npz"]
-Sampler = Literal["ddpm", "ddim", "dpmpp-2m", "heun"]
+Sampler = Literal["ddpm", "ddim", "dpmpp-2m", "heun", "langevin"]
 Count = Annotated[int, arg(aliases=["-n"], help="how many scans.")]
 From = Annotated[str | None, arg(name="from")]
 Source = Annotated[
-    str, arg(metavar="MODEL", help="default, an official release, a model folder, or an official .pth file.")
+    str, arg(metavar="MODEL", help="default, an official release, a model folder, an official .pth file, or bilinear.")
 ]
 Seed = Annotated[int, arg(help="of all randomness.")]
 NoSeed = Annotated[int, arg(help="not used; every verb takes it.")]
 Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
 Method = Annotated[
-    Literal["auto", "conditional", "repaint"],
-    arg(help="conditional tells the network what is known; repaint works with any network, and takes minutes."),
+    Literal["auto", "conditional", "repaint", "posterior", "inversion", "network", "monte-carlo"],
+    arg(
+        help="conditional tells the network what is known; repaint and LiDARGen's posterior need no such network, "
+        "and take minutes; inversion is that of GANs; LiDAR-SR has network, one pass, and monte-carlo, many."
+    ),
 ]
-GenerationSteps = Annotated[int | None, arg(metavar="INT", help="of the sampler, per scan; default 32.")]
-Steps = Annotated[int | None, arg(metavar="INT", help="network steps; default 4 where conditional, 32 where repaint.")]
+GenerationSteps = Annotated[
+    int | None, arg(metavar="INT", help="of the sampler, per scan; default 32, or 1161 of langevin.")
+]
+Steps = Annotated[
+    int | None,
+    arg(
+        metavar="INT",
+        help="network steps; default 4 where conditional, 32 where repaint, 1161 where posterior, 500 where inversion.",
+    ),
+]
 Resamples = Annotated[int, arg(help="passes over each step of repaint.")]
 Intensity = Annotated[
     Literal["auto", "unit", "byte", "uint16", "none"],
@@ -35,6 +46,9 @@ Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz f
 Recipe = Annotated[
     str | None,
     arg(metavar="RECIPE", help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +."),
+]
+SensorOut = Annotated[
+    str | None, arg(name="to", metavar="SENSOR", help="of the result; for models of any sensor, such as iln, bilinear.")
 ]
 SensorWord = Annotated[
     str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")

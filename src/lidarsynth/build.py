@@ -15,14 +15,23 @@ from safetensors.torch import save as serialized
 from torch import Tensor, nn
 
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.schedule import SCHEDULES
-from lidarsynth.experiment import Experiment, from_dict
+from lidarsynth.diffusion.schedule import SCHEDULES, Schedule, ve
+from lidarsynth.experiment import Adversarial, Experiment, Score, Segmentation, Upsampling, from_dict
 from lidarsynth.lidar import sensor as sensors
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.models.conditional import ConditionalUNet
+from lidarsynth.metrics.rangenet import RangeNet
+from lidarsynth.models import dusty2, gan
+from lidarsynth.models.conditional import CANDIDATES, ConditionalUNet
 from lidarsynth.models.efficient_unet import EfficientUNet
+from lidarsynth.models.iln import ILN, LIIF
+from lidarsynth.models.interpolation import METHODS, Interpolation
+from lidarsynth.models.lidar_sr import LidarSR
+from lidarsynth.models.refinenet import RefineNet, geometric_sigmas
+from lidarsynth.models.scan_generator import ScanGenerator
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
+GANS = ("vanilla-gan", "dusty-v1", "dusty-v2")
+UPSAMPLERS = ("lidar-sr", "iln", "liif")  # networks that put beams between known ones
 
 
 def build_sensor(experiment: Experiment) -> Sensor:
@@ -43,10 +52,11 @@ def build_network(experiment: Experiment) -> nn.Module:
     return NETWORKS[word](experiment, build_sensor(experiment)).eval()
 
 
-def _unet(experiment: Experiment, sensor: Sensor, in_channels: int = 2) -> EfficientUNet:
+def _unet(experiment: Experiment, sensor: Sensor, in_channels: int = 2, out_channels: int = 2) -> EfficientUNet:
     model = experiment.model
     unet = EfficientUNet(
         in_channels=in_channels,
+        out_channels=out_channels,
         resolution=(sensor.height, sensor.width),
         base_channels=model.base_channels,
         temb_channels=model.temb_channels,
@@ -64,9 +74,78 @@ def _unet(experiment: Experiment, sensor: Sensor, in_channels: int = 2) -> Effic
     return unet
 
 
+def _refinenet(experiment: Experiment, sensor: Sensor) -> RefineNet:
+    """For images in [-1, 1]: with a score group the published score network, else a noise predictor."""
+    score = experiment.score or Score()
+    divide = experiment.diffusion.kind == "score"
+    network = RefineNet(2, experiment.model.base_channels, score.levels, unit_range=False, divide=divide)
+    network.sigmas.copy_(geometric_sigmas(score.levels, score.sigma_max, score.sigma_min))
+    return network
+
+
+def _conditional(experiment: Experiment, sensor: Sensor) -> ConditionalUNet:
+    return ConditionalUNet(_unet(experiment, sensor, 8, 2 * (1 + CANDIDATES) if experiment.model.candidates else 2))
+
+
+def _rangenet(experiment: Experiment, sensor: Sensor) -> RangeNet:
+    layers = (experiment.segmentation or Segmentation()).layers
+    return RangeNet(layers, experiment.model.base_channels, dropout=experiment.model.dropout)
+
+
+def _lidar_sr(experiment: Experiment, sensor: Sensor) -> LidarSR:
+    model, group = experiment.model, experiment.upsampling or Upsampling()
+    return LidarSR(group.factor, model.base_channels, model.dropout, group.keras)
+
+
+def _iln(experiment: Experiment, sensor: Sensor) -> ILN:
+    model, group = experiment.model, experiment.upsampling or Upsampling()
+    blocks = sum(model.num_residual_blocks)
+    return ILN(group.depth, model.attn_num_heads, model.base_channels, blocks, model.dropout)
+
+
+def _liif(experiment: Experiment, sensor: Sensor) -> LIIF:
+    channels = experiment.model.base_channels
+    return LIIF(channels, 4 * channels, sum(experiment.model.num_residual_blocks))
+
+
+def _interpolation(experiment: Experiment, sensor: Sensor) -> Interpolation:
+    return Interpolation(experiment.model.network)
+
+
+def _gan(experiment: Experiment, sensor: Sensor) -> ScanGenerator:
+    """The generator of a GAN of inverse depth. Raises ValueError for another codec."""
+    model, group, codec = experiment.model, experiment.adversarial or Adversarial(), experiment.data.codec
+    if codec not in ("inverse", "inverse-minmax"):
+        raise ValueError(f"data.codec: expected inverse or inverse-minmax for {model.network}, found {codec!r}")
+    size, widths = (sensor.height, sensor.width), (model.base_channels, group.max_channels)
+    if model.network == "dusty-v2":
+        latents = (group.latent_channels, group.style_channels)
+        angles = torch.from_numpy(sensor.ray_angles())[None]
+        return ScanGenerator(dusty2.Generator(size, *latents, *widths, group.temperature), angles)
+    drops = model.network == "dusty-v1"
+    return ScanGenerator(gan.Generator(size, group.latent_channels, *widths, drops, group.iros21, group.temperature))
+
+
+def build_discriminator(experiment: Experiment) -> nn.Module:
+    """What a GAN's generator is trained against, with fresh weights: images (B, 1, H, W) -> logits, large = real."""
+    model, group, sensor = experiment.model, experiment.adversarial or Adversarial(), build_sensor(experiment)
+    size = (sensor.height, sensor.width)
+    widths = (group.discriminator_channels or model.base_channels, group.max_channels)
+    if model.network == "dusty-v2":
+        return dusty2.Discriminator(size, *widths)
+    return gan.Discriminator(size, *widths, vertical="reflect" if group.iros21 else "replicate")
+
+
 NETWORKS: dict[str, Callable[[Experiment, Sensor], nn.Module]] = {
     "efficient-unet": _unet,
-    "conditional-unet": lambda experiment, sensor: ConditionalUNet(_unet(experiment, sensor, in_channels=8)),
+    "conditional-unet": _conditional,
+    "rangenet": _rangenet,
+    "refinenet": _refinenet,
+    "lidar-sr": _lidar_sr,
+    "iln": _iln,
+    "liif": _liif,
+    **dict.fromkeys(METHODS, _interpolation),
+    **dict.fromkeys(GANS, _gan),
 }
 
 
@@ -75,7 +154,16 @@ def build_denoiser(experiment: Experiment, network: nn.Module) -> Denoiser:
     diffusion = experiment.diffusion
     if diffusion.schedule not in SCHEDULES:
         raise ValueError(f"diffusion.schedule: expected one of {', '.join(SCHEDULES)}, found {diffusion.schedule!r}")
-    return Denoiser(network, SCHEDULES[diffusion.schedule](), diffusion.kind, diffusion.clip)
+    return Denoiser(network, _schedule(experiment), diffusion.kind, diffusion.clip)
+
+
+def _schedule(experiment: Experiment) -> Schedule:
+    """Images here lie in [-1, 1], twice as wide as those of the score group, and so are its noise levels."""
+    if experiment.score is None:
+        return SCHEDULES[experiment.diffusion.schedule]()
+    if experiment.diffusion.schedule != "ve":
+        raise ValueError(f"diffusion.schedule: expected ve beside a score group, found {experiment.diffusion.schedule}")
+    return ve(2 * experiment.score.sigma_min, 2 * experiment.score.sigma_max)
 
 
 def load_weights(network: nn.Module, weights: dict[str, Tensor], source: str) -> None:

@@ -22,11 +22,13 @@ from lidarsynth.arguments import (
     Resamples,
     Sampler,
     Seed,
+    SensorOut,
     SensorWord,
     Source,
     Steps,
     arg,
 )
+from lidarsynth.benchmark.verb import benchmark
 from lidarsynth.terminal import answer, at_least, counted, load_with_bar, progress_line, say, step_bar
 from lidarsynth.training.options import Options
 
@@ -108,6 +110,7 @@ def upsample(
     scan: Annotated[Positional[Path], arg(help="file of the sparse scan.")],
     out: Output,
     sensor_in: Annotated[SensorWord, arg(name="from")] = None,
+    sensor_out: SensorOut = None,
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -118,7 +121,7 @@ def upsample(
     picture: Picture = True,
 ) -> None:
     """Make a scan of a sensor with few beams dense: every measured point stays, bit by bit, and new ones are added."""
-    from lidarsynth.completion import named_sensor, upsample_scan
+    from lidarsynth.completion import into_sensor, named_sensor, upsample_scan
     from lidarsynth.targets import target
 
     at_least(1, {"steps": steps, "resamples": resamples})
@@ -127,6 +130,7 @@ def upsample(
     sparse = _read(scan, intensity)
     sensor = named_sensor(sparse, scan, "--from", sensor_in)
     loaded = load_with_bar(model, device)
+    loaded = into_sensor(loaded, sensor_out) if sensor_out else loaded
     with step_bar(scan.name, loaded.evaluations(method, steps, resamples)) as on_step:
         filled = upsample_scan(loaded, sparse, sensor, method, steps, resamples, seed, on_step)
     say(f"{scan}: {len(sparse)} points of {sensor.name} became {len(filled.points)}")
@@ -188,7 +192,7 @@ def demo(
     generate(4, out / "generated", model, seed=seed)
     complete([street], out / "beams.ply", "beams:4", model, seed=seed)
     complete([street], out / "sector.ply", "sector:90", model, seed=seed)
-    upsample(out / "sixteen_beams.pcd", out / "dense.ply", None, model, seed=seed)
+    upsample(out / "sixteen_beams.pcd", out / "dense.ply", model=model, seed=seed)
     info(model)
     made = sorted(path for path in out.rglob("*") if path.is_file())
     say("\n".join([f"\n{len(made)} files in {out}/, look at the pictures:", *(f"  {path}" for path in made)]))
@@ -266,11 +270,12 @@ def train(
 def evaluate(
     samples: Annotated[Positional[list[Path]], arg(metavar="SAMPLES", help="folder, cache, or .safetensors parts.")],
     reference: Annotated[Path | None, arg(metavar="CACHE|STATS|FOLDER", help="what to compare with.")] = None,
-    protocol: Annotated[str, arg(help="r2dm-2024, lidargen-2022, dusty-2023, r2dm-upsampling-2024, bev-1.")] = "bev-1",
+    protocol: Annotated[str, arg(help="such as r2dm-2024, bev-1; a wrong word lists all.")] = "bev-1",
     out: Annotated[Path, arg(help=".json, with .md beside it; of a part .safetensors.")] = Path("report.json"),
     part: Annotated[str | None, arg(metavar="I/N", help="only gather the statistics of this part, to merge.")] = None,
+    side: Annotated[Literal["samples", "reference"], arg(help="what the images of a part are.")] = "samples",
     sensor: Annotated[str | None, arg(help="of samples that are points; default: the reference's.")] = None,
-    batch_size: Annotated[int, arg(help="images at once; makes no difference to the result.")] = 4,
+    batch_size: Annotated[int, arg(help="images at once; makes no difference but of rounding.")] = 4,
     seed: Annotated[int, arg(help="of the subsets of the squared MMDs.")] = 0,
     device: Device = "cpu",
 ) -> None:
@@ -280,9 +285,11 @@ def evaluate(
 
     at_least(1, {"batch-size": batch_size})
     at_least(0, {"seed": seed})
+    if not samples:
+        raise ValueError("expected SAMPLES to judge: a folder, a cache or .safetensors parts, found none")
     with image_bar() as on_images:
         if part is not None:
-            evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, device, on_images)
+            evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, device, on_images, side, reference)
         elif reference is not None:
             evaluation.check_out(out)
             report = evaluation.evaluate(samples, reference, protocol, sensor, seed, batch_size, device, on_images)
@@ -326,6 +333,7 @@ VERBS = {
     "data": data,
     "train": train,
     "evaluate": evaluate,
+    "benchmark": benchmark,
     "info": info,
 }
 

@@ -8,17 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from lidarsynth.data.recognise import recognise
+from lidarsynth.interpolation_model import InterpolationModel, interpolated
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import project, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, reconstruction_errors
-from lidarsynth.models.interpolation import METHODS, interpolate
+from lidarsynth.models.interpolation import METHODS
 from lidarsynth.pictures import before_and_after
 from lidarsynth.scan_model import OnStep, ScanModel, sparse_image
+from lidarsynth.upsampling_model import UpsamplingModel
 
 
 @dataclass(frozen=True)
@@ -41,17 +42,6 @@ class Filled:
         """(H', W', 3) uint8: strips, 3-D and bird's eye views of before, after and, where known, the truth."""
         after = next(name for name, image in self.shown.items() if image is self.image)
         return before_and_after(self.shown, {after: self.points})
-
-
-def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImage:
-    """The baseline: range in metres and reflectance interpolated from the known pixels, empty ones as 0.
-
-    known (H, W) bool; method `nearest`, `bilinear` or `bicubic`. Negative overshoots become empty.
-    """
-    pixels = torch.from_numpy(np.stack([image.range, image.reflectance]))[None].float()
-    mask = torch.from_numpy(known).expand(pixels.shape)
-    distance, reflectance = interpolate(pixels, mask, method)[0].clamp(min=0).numpy()
-    return RangeImage(distance, reflectance.clip(0, 1), distance > 0, image.sensor)
 
 
 def complete_scan(
@@ -111,9 +101,20 @@ def upsample_scan(
     sparse, known = sparse_image(scan, sensor_in, model.sensor)
     loose = replace(scan, ring=None)  # its rings are not the model's
     known |= _rays_with_points(loose, model, "spherical")
-    filled = model.complete(sparse, known, method, steps, resamples, seed=seed, on_step=on_step)
+    if isinstance(model, UpsamplingModel):  # it looks at the beams of sensor_in, not at their shadows in its image
+        filled = model.upsample(scan, sensor_in, method, steps, seed, on_step)
+    else:
+        filled = model.complete(sparse, known, method, steps, resamples, seed=seed, on_step=on_step)
     points = with_measured(loose, sparse.mask, filled, "spherical")
     return Filled(filled, points, {f"measured, {sensor_in.name}": sparse, "upsampled": filled}, {})
+
+
+def into_sensor(model: ScanModel, sensor: str) -> ScanModel:
+    """The model with images of another sensor. Raises ValueError for a network that knows the rays of its own only."""
+    if isinstance(model, UpsamplingModel | InterpolationModel):
+        return model.into(sensor)
+    raise ValueError(f"{model.experiment.name}: expected a model of any sensor, such as iln, lidar-sr or bilinear, for "
+                     f"--to {sensor}, found one of {model.sensor.name} only")  # fmt: skip
 
 
 def named_sensor(scan: Scan, path: Path, flag: str, given: str | None) -> Sensor:

@@ -15,7 +15,8 @@ class Data:
     projection: str = "spherical"  # spherical | unfolding | auto
     height: int = 64  # rows of the image
     width: int = 1024  # columns of the image
-    codec: str = "log"  # log | inverse | metric
+    codec: str = "log"  # log | inverse | metric | log-63m (LiDARGen) | inverse-minmax (DUSty of 2021)
+    reflectance: bool = True  # whether the network knows reflectance
     roll: bool = False  # augmentation: turn the scan by any number of columns
     mirror: bool = False  # augmentation: swap left and right
 
@@ -35,6 +36,7 @@ class Model:
     coords_encoding: str | None = "fourier_features"  # | spherical_harmonics | polar_coordinates | None
     ring: bool = True  # circular in width
     stem: tuple[int, int] = (1, 1)  # patch of pixels that becomes channels, (1, 1) = R2DM
+    candidates: bool = False  # conditional-unet: chooses among the nearest known values, not only corrects their mean
     dropout: float = 0.0
 
 
@@ -52,6 +54,64 @@ class Diffusion:
 
 
 @dataclass(frozen=True)
+class Score:
+    """Denoising score matching and annealed Langevin steps; defaults are LiDARGen's, sigmas those of data in [0, 1]."""
+
+    levels: int = 232  # noise levels, falling geometrically
+    sigma_max: float = 50.0
+    sigma_min: float = 0.01
+    steps: int = 5  # Langevin steps at each level
+    rate: float = 0.062  # share of the way to x_0_hat in a step: step_lr / sigma_min^2
+
+
+@dataclass(frozen=True)
+class Upsampling:
+    """Networks that put beams between known ones: LiDAR-SR, ILN and LIIF. Lengths are metres."""
+
+    factor: tuple[int, int] = (4, 1)  # rows and columns of the image per known row and column
+    first: int = 0  # the first known row from the top, as in beams:4:FIRST
+    spread: bool = False  # LiDAR-SR's rows reach from the first known row to the last (official weights)
+    norm: float = 100.0  # the range that is 1
+    max_range: float = 80.0  # farther is no return
+    noise: float = 0.0  # standard deviation of what training adds to ranges
+    keras: bool = False  # LiDAR-SR's original program: no return is 0 and not 1, dropout of single values
+    passes: int = 50  # of LiDAR-SR under Monte-Carlo dropout
+    threshold: float = 0.03  # LiDAR-SR drops pixels whose standard deviation is more than this share of their mean
+    depth: int = 1  # layers of ILN's transformer
+    queries: int = 16_384  # pixels of a scan that a step of ILN or LIIF learns from
+
+
+@dataclass(frozen=True)
+class Adversarial:
+    """A GAN and how it is trained; defaults are those of the DUSty v2 program (WACV 2023), the same for all three."""
+
+    latent_channels: int = 512  # of z ~ N(0, I)
+    style_channels: int = 512  # of dusty-v2; the styles of the others are z
+    max_channels: int = 512  # at the coarsest map; model.base_channels are those of the finest
+    discriminator_channels: int | None = None  # at its finest map; None = model.base_channels
+    temperature: float = 1.0  # of the Gumbel-sigmoid that drops rays
+    iros21: bool = False  # layers of the first release of vanilla GAN and DUSty v1: tanh, mirrored blur
+    empty_below: float = 0.0  # code in [0, 1] up to which a pixel is empty
+    r1_weight: float = 1.0
+    r1_every: int = 16  # steps
+    path_length_weight: float = 0.0  # 0 = off
+    path_length_every: int = 4  # steps
+    augmentation_target: float | None = 0.6  # mean sign of the logits of real images; None = no augmentation
+    augmentation_images: int = 500_000  # in which its probability can rise from 0 to 1
+    augmentation_every: int = 4  # steps between its updates
+    warmup_images: int = 200_000  # in which pixels are dropped before the discriminator, half of them at first
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """A class for every pixel: RangeNet; `model.base_channels` is its width, 32 in the published networks."""
+
+    layers: int = 53  # 21 | 53
+    columns: int | None = None  # of a training image, cut out anywhere; None = all
+    drop: float = 0.0  # augmentation: the largest share of an image's points that is dropped
+
+
+@dataclass(frozen=True)
 class Training:
     """The optimiser and its budget; defaults are R2DM's."""
 
@@ -61,10 +121,11 @@ class Training:
     betas: tuple[float, float] = (0.9, 0.99)
     warmup: int = 10_000  # steps of linear warm-up
     decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant
-    clip_norm: float = 1.0
+    clip_norm: float | None = 1.0  # None = gradients as they are
     ema_decay: float = 0.995
     ema_every: int = 10  # steps
     ema_start: int = 10_000  # steps of plain copying
+    ema_half_life: int = 10_000  # images; of GANs, in the place of the three above
     generation_share: float = 1.0  # share of a batch trained without known pixels; 1 for unconditional networks
     seed: int = 0
 
@@ -89,6 +150,10 @@ class Experiment:
     diffusion: Diffusion = field(default_factory=Diffusion)
     training: Training = field(default_factory=Training)
     card: Card = field(default_factory=Card)
+    score: Score | None = None  # of networks trained by score matching
+    upsampling: Upsampling | None = None  # of networks that put beams between known ones
+    adversarial: Adversarial | None = None  # of GANs
+    segmentation: Segmentation | None = None  # of networks that classify pixels
 
     def to_dict(self) -> dict:
         """Plain tables, lists and numbers, the inverse of `from_dict`; without the groups that are None."""

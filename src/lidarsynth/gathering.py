@@ -11,16 +11,26 @@ from typing import Literal, TypeAlias
 
 from torch import nn
 
+from lidarsynth.build import WEIGHTS
 from lidarsynth.data.cache import sha256
 from lidarsynth.image_sets import ImageSet
+from lidarsynth.metrics.point_sets import spread
 from lidarsynth.metrics.pointnet import read_pointnet
 from lidarsynth.metrics.protocols import EvaluationProtocol, Network
-from lidarsynth.metrics.rangenet import read_rangenet
+from lidarsynth.metrics.rangenet import RangeNet, read_rangenet
 from lidarsynth.metrics.statistics import Statistics, load_statistics, save_statistics
-from lidarsynth.weights import cache_folder
+from lidarsynth.metrics.street import StreetFeatures
+from lidarsynth.weights import cache_folder, download, load_parts, shipped
 
 SAVE_EVERY = 60.0  # seconds between two writings of unfinished statistics: what a kill can cost
 OnImages: TypeAlias = Callable[[str, int, int], object] | None  # (what, images done, images in all), for progress bars
+
+# Kind of network -> where the official files lie: the RangeNet repository's models, and the copy of TreeGAN's PointNet
+# that R2DM's evaluation takes. No checksums are published; what is read is tensors only, of the right names and shapes.
+URLS: dict[str, str] = {
+    "rangenet": "https://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models",
+    "pointnet": "https://github.com/microsoft/SpareNet/raw/HEAD/Frechet",
+}
 
 
 @dataclass(frozen=True)
@@ -32,20 +42,42 @@ class Loaded:
     missing: dict[str, str] = field(default_factory=dict)
 
 
-def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu") -> Loaded:
-    """The networks whose official files are in the cache folder. Raises ValueError for a damaged or another file."""
+def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu", on_images: OnImages = None) -> Loaded:
+    """A protocol's networks, shipped or downloaded once into the cache folder; of the others, why they are missing.
+
+    Raises ValueError for a damaged or another file.
+    """
     loaded = Loaded()
     for network in protocol.networks:
         name = network.file(width)
         if name is None:
             widths = ", ".join(str(w) for w, _ in network.files)
             loaded.missing[network.kind] = f"no official {network.kind} for {width} columns, only for {widths}"
-        elif not (path := cache_folder() / name).is_file():
-            loaded.missing[network.kind] = f"put {name} at {path}"
-        else:
+            continue
+        if name in (own := shipped()):
+            loaded.networks[network.kind] = _read_shipped(name).to(device)
+            loaded.weights[network.kind] = sha256(own[name] / WEIGHTS)
+            continue
+        path = cache_folder() / name
+        try:
+            for done, total in download(f"{URLS[network.kind]}/{name}", path):
+                if on_images:
+                    on_images(f"download {name}", done, total or done)
+        except ValueError as error:
+            loaded.missing[network.kind] = str(error)
+            continue
+        try:
             loaded.networks[network.kind] = _read_network(network, path).to(device)
-            loaded.weights[network.kind] = sha256(path)
+        except ValueError as error:
+            raise ValueError(f"{error}; delete the file to download it again") from None
+        loaded.weights[network.kind] = sha256(path)
     return loaded
+
+
+def _read_shipped(word: str) -> StreetFeatures:
+    rangenet = load_parts(word)[1]
+    assert isinstance(rangenet, RangeNet)
+    return StreetFeatures(rangenet)
 
 
 def _read_network(network: Network, path: Path) -> nn.Module:
@@ -59,13 +91,14 @@ def _read_network(network: Network, path: Path) -> nn.Module:
 
 @dataclass(frozen=True)
 class Selection:
-    """Numbers of the images that count for features, and for the bird's eye view."""
+    """Numbers of the images that count for features, for the bird's eye view, and for the measures of point sets."""
 
     features: frozenset[int]
     bev: frozenset[int]
+    sets: frozenset[int] = frozenset()
 
     def numbers(self) -> list[int]:
-        return sorted(self.features | self.bev)
+        return sorted(self.features | self.bev | self.sets)
 
 
 def select(
@@ -77,7 +110,8 @@ def select(
     """
     if role == "samples":
         limits = (protocol.samples, protocol.samples_bev)
-        return Selection(*(frozenset(range(len(names))[:limit]) for limit in limits))
+        features, bev = (frozenset(range(len(names))[:limit]) for limit in limits)
+        return Selection(features, bev, _spread(protocol, range(len(names))[: protocol.samples]))
     chosen = []
     for sequences, limit in ((protocol.sequences, protocol.real), (protocol.sequences_bev, protocol.real_bev)):
         of_protocol = [i for i, name in enumerate(names) if any(part in name for part in sequences)]
@@ -86,7 +120,11 @@ def select(
             random.Random(0).shuffle(numbers)  # as R2DM and LiDARGen order their real scans
             numbers = numbers[: samples if limit == 0 else limit]
         chosen.append(frozenset(numbers))
-    return Selection(*chosen)
+    return Selection(chosen[0], chosen[1], _spread(protocol, range(len(names))))
+
+
+def _spread(protocol: EvaluationProtocol, numbers: range) -> frozenset[int]:
+    return frozenset(numbers[k] for k in spread(len(numbers), protocol.sets.images)) if protocol.sets else frozenset()
 
 
 def unlike_names(protocol: EvaluationProtocol, names: Sequence[str]) -> tuple[str, ...]:
@@ -123,7 +161,8 @@ def gather(
     for start in range(done, len(numbers), batch_size):
         batch = numbers[start : start + batch_size]
         arrays = [images.image(i, empty.sensor, projection, resize=empty.role == "real") for i in batch]
-        statistics.update(arrays, [i in chosen.features for i in batch], [i in chosen.bev for i in batch])
+        wanted = ([i in numbered for i in batch] for numbered in (chosen.features, chosen.bev, chosen.sets))
+        statistics.update(arrays, *wanted)
         if on_images:
             on_images(empty.role, start + len(batch), len(numbers))
         if unfinished and time.monotonic() - saved > SAVE_EVERY:

@@ -12,7 +12,7 @@ from pathlib import Path
 from torch import nn
 
 from lidarsynth.build import RECORD, WEIGHTS, build_sensor, save
-from lidarsynth.experiment import Card, Experiment
+from lidarsynth.experiment import Card, Experiment, Model
 
 REPOSITORY = re.compile(r"(?P<id>[\w-][\w.-]*/[\w-][\w.-]*)(@(?P<revision>[\w./-]+))?", re.ASCII)
 HUB = "https://huggingface.co"
@@ -72,7 +72,7 @@ def card_text(experiment: Experiment, repo_id: str = "owner/name") -> str:
 
     Everything in it comes from the experiment and its card. Raises ValueError when the experiment has no valid sensor.
     """
-    sections = [_metadata(experiment.card.licence), _title(experiment), _usage(repo_id), _table(experiment)]
+    sections = [_metadata(experiment.card.licence), _title(experiment), _usage(experiment, repo_id), _table(experiment)]
     sections += _story(experiment.card)
     return "\n\n".join(sections) + "\n"
 
@@ -88,18 +88,22 @@ def _metadata(licence: str) -> str:
 
 def _title(experiment: Experiment) -> str:
     what = "generates and completes" if experiment.model.network == "conditional-unet" else "generates"
+    kind, paper, number = ("diffusion", "R2DM", "2309.09256")
+    if experiment.score is not None:
+        kind, paper, number = ("score-based", "LiDARGen", "2209.03954")
     return (
-        f"# {experiment.name}, {build_sensor(experiment).name}\n\nA diffusion model that {what} LiDAR scans, made with "
-        "lidarsynth after R2DM ([arXiv 2309.09256](https://arxiv.org/abs/2309.09256))."
+        f"# {experiment.name}, {build_sensor(experiment).name}\n\nA {kind} model that {what} LiDAR scans, made with "
+        f"lidarsynth after {paper} ([arXiv {number}](https://arxiv.org/abs/{number}))."
     )
 
 
-def _usage(repo_id: str) -> str:
+def _usage(experiment: Experiment, repo_id: str) -> str:
+    steps = "steps=32, " if experiment.score is None else ""  # few steps are not enough for Langevin dynamics
     return f"""```python
 import lidarsynth as ls  # pip install 'lidarsynth[hub]'
 
 model = ls.load("{repo_id}")
-images = model.generate(4, steps=32, seed=0)
+images = model.generate(4, {steps}seed=0)
 dense = model.complete(ls.read("scan.pcd"))
 ```"""
 
@@ -111,8 +115,8 @@ def _table(experiment: Experiment) -> str:
         "sensor": f"{sensor.name}, {sensor.height} beams from {sensor.elevations[0]:+.2f} to "
         f"{sensor.elevations[-1]:+.2f} degrees, {sensor.min_range:g} to {sensor.max_range:g} m",
         "images": f"{data.height} x {data.width}, {data.projection} projection, {data.codec} range, reflectance 0 to 1",
-        "network": f"{model.network}, base {model.base_channels} x {list(model.channel_multipliers)}, blocks "
-        f"{list(model.num_residual_blocks)}, stem {model.stem[0]}x{model.stem[1]}, {model.coords_encoding}",
+        "network": f"{model.network}, base {model.base_channels}"
+        + ("" if model.network == "refinenet" else _unet(model)),
         "diffusion": f"{diffusion.schedule} schedule, predicts {diffusion.kind}, {diffusion.loss} loss, "
         f"weighting {weighted}",
         "training": f"{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}, "
@@ -120,6 +124,13 @@ def _table(experiment: Experiment) -> str:
         "augmentation": ", ".join(w for w, on in (("roll", data.roll), ("mirror", data.mirror)) if on) or "none",
     }
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows.items())])
+
+
+def _unet(model: Model) -> str:
+    return (
+        f" x {list(model.channel_multipliers)}, blocks {list(model.num_residual_blocks)}, "
+        f"stem {model.stem[0]}x{model.stem[1]}, {model.coords_encoding}"
+    )
 
 
 def _story(card: Card) -> list[str]:

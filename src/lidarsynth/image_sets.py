@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import TypeAlias
@@ -12,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.data.arrays import image_of, unzip
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.data.fields import FileError
 from lidarsynth.data.files import READERS, read, read_image
@@ -72,22 +76,57 @@ def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) 
     files = _files(path)
     stats = [(str(file.relative_to(path)), file.stat()) for file in files] if path.is_dir() else [("", path.stat())]
     stamp = sha256(repr([(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]).encode()).hexdigest()
-    return ImageSet(tuple(map(str, files)), lambda i: read_item(files[i]), str(path), stamp)
+    items = [(file, k) for file in files for k in _numbers(file)]
+    names = tuple(str(file) if k is None else f"{file}[{k}]" for file, k in items)
+    return ImageSet(names, lambda i: read_item(*items[i]), str(path), stamp)
 
 
 def _files(path: Path) -> list[Path]:
-    """The readable files under a folder, sorted, or the file itself."""
+    """The readable files under a folder, sorted, or the file itself. Hidden files and folders are left out."""
     known = (*READERS, *TENSORS)
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path] if path.is_file() else []
     files = [file for file in files if file.name.lower().endswith(known)]
+    files = [file for file in files if not any(part[0] == "." for part in file.relative_to(path).parts)]
     if not files:
         found = "none" if path.is_dir() else "another file" if path.is_file() else "no such file or folder"
         raise ValueError(f"{path}: expected a cache, or samples ({', '.join(known)}), found {found}")
+    stems = [file.with_name(stem_of(file.name)) for file in files]
+    if doubled := [stem for stem, count in Counter(stems).items() if count > 1]:
+        two = [file.name for file, stem in zip(files, stems, strict=True) if stem == doubled[0]][:2]
+        raise ValueError(f"{path}: expected one file per scan, found {' and '.join(two)}")
     return files
 
 
-def read_item(path: Path) -> Item:
-    """A range image (our `.npz`), points of any readable file, or the tensor of a published sample (`.pth`)."""
+def stem_of(name: str) -> str:
+    """The last part of a name, without the ending of a readable file."""
+    last = name.rpartition("/")[2]
+    endings = [ending for ending in (*READERS, *TENSORS) if last.lower().endswith(ending)]
+    return last[: -len(max(endings, key=len))] if endings else last
+
+
+def _numbers(path: Path) -> Sequence[int | None]:
+    """Numbers of the images of a batch, by the header of its `.npz`; [None] for a file of one scan."""
+    if path.suffix.lower() != ".npz":
+        return [None]
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("range.npy") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape = read_header[version](file)[0]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        return [None]  # something else, or damaged: reading it says so
+    return range(shape[0]) if len(shape) == 3 else [None]
+
+
+def read_item(path: Path, number: int | None = None) -> Item:
+    """A range image (our `.npz`), points of any readable file, or the tensor of a published sample (`.pth`).
+
+    number  which image of a batch: an `.npz` whose range, reflectance, mask, and label, xyz are (B, ...). Raises
+    ValueError.
+    """
+    if number is not None:
+        arrays = {name: array if name == "sensor" else array[number] for name, array in _batch(path).items()}
+        return image_of(arrays)
     if path.suffix.lower() in TENSORS:
         return _read_tensor(path)
     if path.suffix.lower() == ".npz":
@@ -97,6 +136,15 @@ def read_item(path: Path) -> Item:
             if "expected a saved range image" not in str(error):
                 raise
     return read(path)
+
+
+@lru_cache(maxsize=1)  # images of a batch are read one after the other
+def _batch(path: Path) -> dict[str, np.ndarray]:
+    arrays = unzip(path.read_bytes())
+    sizes = {name: array.shape[:1] for name, array in arrays.items() if name != "sensor"}
+    if len(set(sizes.values())) != 1:
+        raise ValueError(f"{path}: expected a batch of arrays (B, ...), found {sizes}")
+    return arrays
 
 
 def _read_tensor(path: Path) -> Tensor:

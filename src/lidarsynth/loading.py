@@ -8,10 +8,17 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from lidarsynth.build import build_denoiser, build_sensor
+from lidarsynth.build import GANS, build_denoiser, build_sensor
 from lidarsynth.experiment import Experiment
+from lidarsynth.gan_model import GanModel
+from lidarsynth.interpolation_model import InterpolationModel
 from lidarsynth.model import LidarModel
+from lidarsynth.models.iln import ILN, LIIF
+from lidarsynth.models.interpolation import METHODS, Interpolation
+from lidarsynth.models.lidar_sr import LidarSR
+from lidarsynth.models.scan_generator import ScanGenerator
 from lidarsynth.scan_model import ScanModel
+from lidarsynth.upsampling_model import UpsamplingModel
 from lidarsynth.weights import load_parts
 
 
@@ -19,9 +26,30 @@ def _diffusion(experiment: Experiment, network: nn.Module) -> LidarModel:
     return LidarModel(network, build_denoiser(experiment, network), build_sensor(experiment), experiment)
 
 
+def _upsampling(experiment: Experiment, network: nn.Module) -> UpsamplingModel:
+    assert isinstance(network, LidarSR | ILN | LIIF)
+    return UpsamplingModel(network, build_sensor(experiment), experiment)
+
+
+def _interpolation(experiment: Experiment, network: nn.Module) -> InterpolationModel:
+    assert isinstance(network, Interpolation)
+    return InterpolationModel(network, build_sensor(experiment), experiment)
+
+
+def _gan(experiment: Experiment, network: nn.Module) -> GanModel:
+    assert isinstance(network, ScanGenerator)
+    return GanModel(network, build_sensor(experiment), experiment)
+
+
 MODELS: dict[str, Callable[[Experiment, nn.Module], ScanModel]] = {  # word of a network -> its model
     "efficient-unet": _diffusion,
     "conditional-unet": _diffusion,
+    "refinenet": _diffusion,
+    "lidar-sr": _upsampling,
+    "iln": _upsampling,
+    "liif": _upsampling,
+    **dict.fromkeys(METHODS, _interpolation),
+    **dict.fromkeys(GANS, _gan),
 }
 
 

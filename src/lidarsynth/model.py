@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidarsynth.diffusion import langevin, repaint
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.repaint import evaluations, repaint
-from lidarsynth.diffusion.samplers import STEPS, State, generators, sample, starting_noise
-from lidarsynth.experiment import Experiment
+from lidarsynth.diffusion.samplers import STEPS, Rng, State, even_log_snr, generators, sample, starting_noise
+from lidarsynth.experiment import Experiment, Score
 from lidarsynth.hub import push
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
@@ -20,7 +20,8 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.scan_model import OnStep, image_in, known_pixels, sensor_that_made, sparse_image, with_known
 
-METHODS = ("auto", "conditional", "repaint")
+METHODS = ("auto", "conditional", "repaint", "posterior")
+SAMPLERS = (*STEPS, "langevin")
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,11 @@ class LidarModel:
     ) -> list[RangeImage]:
         """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
 
-        steps    network evaluations per scan (twice as many for `heun`); default 32
-        sampler  ddpm (default) | ddim | dpmpp-2m | heun
+        steps    network evaluations per scan (twice as many for `heun`; for `langevin` at most as many, in whole noise
+                 levels); default 32, or 1161 for `langevin`: 232 levels x 5 and a final denoising
+        sampler  ddpm | ddim | dpmpp-2m | heun | langevin; default ddpm, or langevin after score matching
 
-        Raises ValueError for an unknown sampler or counts below 1.
+        Raises ValueError for an unknown sampler or counts below 1, or below 11 for `langevin`.
         """
         return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
 
@@ -77,14 +79,14 @@ class LidarModel:
         on_step: OnStep = None,
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
-        steps = self.generation_steps(steps, sampler)
+        sampler, steps = self._sampler(sampler), self.generation_steps(steps, sampler)
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         for start in range(first, n, batch_size):
             count = min(batch_size, n - start)
             rng = generators(seed, count, offset=start)
-            x_1 = starting_noise(self.denoiser, self._blank(count), rng)
-            for x in _last(sample(self.denoiser, x_1, _step(sampler or "ddpm"), steps, rng), on_step):
+            x_1 = self._start(self._blank(count), rng, sampler == "langevin")
+            for x in _last(self._states(self.denoiser, x_1, rng, sampler, steps), on_step):
                 yield self._image(x)
 
     def complete(
@@ -103,25 +105,21 @@ class LidarModel:
         scan    points, or an image of this model's sensor
         known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
         method  `conditional`: the network is told the known pixels (few steps); `repaint`: R2DM's way, for any network;
-                `auto`: conditional where the network can
-        steps   default 4, or 32 for repaint, where `resamples` passes go over each step
+                `posterior`: LiDARGen's, for any network; `auto`: conditional where the network can, else posterior
+                after score matching, else repaint
+        steps   default 4; or 32 for repaint, where `resamples` passes go over each step; or, for posterior, at most so
+                many network evaluations, default 1161
 
         A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
         """
         image = self.image_of(scan)
         known = known_pixels(image, known)
-        method = self._method(method)
-        steps = (4 if method == "conditional" else 32) if steps is None else steps
         x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
         mask = torch.from_numpy(known).to(self._device).expand(1, 2, *known.shape).clone()
         mask[:, 1] &= bool(image.reflectance[known].any())
-        rng = generators(seed, 1)
-        x_1 = starting_noise(self.denoiser, x_0, rng)
-        if method == "conditional":
-            states = sample(self.denoiser.given(x_0, mask), x_1, _step(sampler or "ddim"), steps, rng)
-        else:
-            states = repaint(self.denoiser, x_1, x_0, mask, rng, _step("ddpm"), steps, resamples)
-        filled = self._image(_last(states, on_step)[0])
+        calls = self.evaluations(method, steps, resamples)
+        states = self._completion(x_0, mask, self._method(method), steps, resamples, sampler, generators(seed, 1))
+        filled = self._image(_last(states, on_step, calls)[0])
         return with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
 
     def upsample(
@@ -159,21 +157,81 @@ class LidarModel:
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How many steps of the sampler `generate` takes per batch."""
-        return 32 if steps is None else steps
+        if self._sampler(sampler) != "langevin":
+            return 32 if steps is None else steps
+        return self._langevin_calls(steps)
 
     def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
         """How many network evaluations `complete` takes."""
-        if self._method(method) == "conditional":
+        method = self._method(method)
+        if method == "posterior":
+            return self._langevin_calls(steps)
+        if method == "conditional":
             return 4 if steps is None else steps
-        return evaluations(32 if steps is None else steps, resamples)
+        return repaint.evaluations(32 if steps is None else steps, resamples)
 
     def _method(self, method: str) -> str:
         if method not in METHODS:
             raise ValueError(f"expected a method of {', '.join(METHODS)}, found {method!r}")
         if method == "conditional" and not self.conditional:
-            raise ValueError(f"{self.experiment.name}: expected method repaint, since this network cannot be told the "
-                             f"known pixels, found conditional")  # fmt: skip
-        return method if method != "auto" else "conditional" if self.conditional else "repaint"
+            raise ValueError(f"{self.experiment.name}: expected method repaint or posterior, since this network cannot "
+                             f"be told the known pixels, found conditional")  # fmt: skip
+        if method != "auto":
+            return method
+        return "conditional" if self.conditional else "repaint" if self.experiment.score is None else "posterior"
+
+    def _sampler(self, sampler: str | None) -> str:
+        if sampler is None:
+            return "ddpm" if self.experiment.score is None else "langevin"
+        if sampler not in SAMPLERS:
+            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {sampler!r}")
+        return sampler
+
+    def _completion(
+        self,
+        x_0: Tensor,
+        mask: Tensor,
+        method: str,
+        steps: int | None,
+        resamples: int,
+        sampler: str | None,
+        rng: Rng,
+    ) -> Iterator[State]:
+        """The states of completing x_0 (1, 2, H, W) where `mask` is False; the last pull of `posterior` is one more."""
+        x_1 = self._start(x_0, rng, method == "posterior")
+        if method == "conditional":
+            told = self.denoiser.given(x_0, mask)
+            return self._states(told, x_1, rng, self._sampler(sampler or "ddim"), 4 if steps is None else steps)
+        if method == "repaint":
+            return repaint.repaint(
+                self.denoiser, x_1, x_0, mask, rng, steps=32 if steps is None else steps, resamples=resamples
+            )
+        levels, per_level, rate = self._annealing(steps)
+        return langevin.langevin_posterior(
+            self.denoiser, x_1, x_0, mask, rng, levels=levels, steps=per_level, rate=rate, grid=even_log_snr
+        )
+
+    def _states(self, denoiser: Denoiser, x_1: Tensor, rng: Rng, sampler: str, steps: int) -> Iterator[State]:
+        if sampler != "langevin":
+            return sample(denoiser, x_1, STEPS[sampler], steps, rng)
+        levels, per_level, rate = self._annealing(steps)
+        return langevin.langevin(denoiser, x_1, rng, levels, per_level, rate, even_log_snr)
+
+    def _start(self, x: Tensor, rng: Rng, annealed: bool) -> Tensor:
+        """x_1 like x: LiDARGen's chains, and only those, begin at uniform noise between the limits of the data."""
+        if annealed and self.experiment.score is not None:
+            return langevin.starting_uniform(x, rng, -1, 1)
+        return starting_noise(self.denoiser, x, rng)
+
+    def _annealing(self, calls: int | None) -> tuple[int, int, float]:
+        """Noise levels, Langevin steps at each and their rate, for at most `calls` network calls; None = all levels."""
+        score = self.experiment.score or Score()
+        levels = score.levels if calls is None else langevin.levels_within(calls, score.steps)
+        return levels, score.steps, score.rate
+
+    def _langevin_calls(self, calls: int | None) -> int:
+        levels, per_level, _ = self._annealing(calls)
+        return langevin.evaluations(levels, per_level)
 
     def _image(self, x_0: Tensor) -> RangeImage:
         """x_0 (2, H, W) as an image; mixed pixels are mended for our own kind of network, R2DM's stay as published."""
@@ -188,17 +246,11 @@ class LidarModel:
         return torch.zeros(count, 2, self.sensor.height, self.sensor.width, device=self._device)
 
 
-def _step(name: str):
-    if name not in STEPS:
-        raise ValueError(f"expected a sampler of {', '.join(STEPS)}, found {name!r}")
-    return STEPS[name]
-
-
-def _last(states: Iterator[State], on_step: OnStep) -> Tensor:
-    """Run the sampler to its end; (B, 2, H, W)."""
+def _last(states: Iterator[State], on_step: OnStep, calls: int | None = None) -> Tensor:
+    """Run the sampler to its end; (B, 2, H, W). States behind the first `calls` took no network step."""
     state = None
-    for state in states:  # noqa: B007, the last one counts
-        if on_step is not None:
+    for index, state in enumerate(states):  # noqa: B007, the last one counts
+        if on_step is not None and (calls is None or index < calls):
             on_step()
     assert state is not None
     return state.x_s

@@ -50,7 +50,8 @@ def image_bar() -> Iterator[Callable[[str, int, int], object]]:
     with tqdm(unit="image", delay=2, leave=False) as bar:
 
         def on_images(what: str, done: int, total: int) -> None:
-            bar.total = total
+            bar.total, bar.unit = total, {"download": "B", "compute": "row"}.get(what.split()[0], "image")
+            bar.unit_scale = bar.unit == "B"
             bar.set_description(what, refresh=False)
             bar.update(done - bar.n)
 

@@ -1,6 +1,6 @@
-"""Where trained weights come from: shipped ones, our folders, official R2DM releases and their `.pth` files.
+"""Where trained weights come from: shipped ones, our folders, official R2DM releases, official `.pth` files.
 
-The official format is dict(cfg, weights, ema_weights, optimizer, lr_scheduler, global_step), read with
+R2DM's format is dict(cfg, weights, ema_weights, optimizer, lr_scheduler, global_step), read with
 `weights_only=True`. Releases are downloaded once into the user's cache and continue where they were interrupted.
 """
 
@@ -25,7 +25,10 @@ from torch import Tensor, nn
 from lidarsynth.build import RECORD, WEIGHTS, build_network, build_sensor, load, load_weights
 from lidarsynth.experiment import Card, Data, Experiment, with_fields
 from lidarsynth.hub import fetch, is_repository
-from lidarsynth.presets import PRESETS
+from lidarsynth.official import STAND_INS, SYSTEMS, system_of
+from lidarsynth.official_upsampling import is_keras, read_keras
+from lidarsynth.presets import PRESETS, preset
+from lidarsynth.upsampling_presets import WITHOUT_WEIGHTS
 
 BASE_URL = "https://github.com/kazuto1011/r2dm/releases/download/weights"
 
@@ -82,9 +85,10 @@ OnBytes = Callable[[int, "int | None"], object]  # called with (bytes so far, by
 def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = None) -> tuple[Experiment, nn.Module]:
     """The experiment and the network, in evaluation mode, of trained weights.
 
-    source    in this order: a shipped word (`default`); the name of an official release (`r2dm-h-kitti360`), which is
-              downloaded once; a folder that `build.save` wrote; an official `.pth` file; a repository `owner/name` of
-              the Hugging Face hub, `owner/name@revision` for one of its versions. `./default` is always a path
+    source    in this order: a shipped word (`default`); an interpolation (`bilinear`), which has none; the name of an
+              official release (`r2dm-h-kitti360`), which is downloaded once; a folder that `build.save` wrote; an
+              official `.pth`, or `.h5` of Keras; a repository `owner/name` of the Hugging Face hub, or
+              `owner/name@revision` for one of its versions. `./default` is always a path
     ema       of an official file, the moving average (True) or the raw weights
     on_bytes  called while a release downloads
 
@@ -93,6 +97,8 @@ def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = 
     word = source.removesuffix("-300k") if isinstance(source, str) else None
     if word in (own := shipped()):
         return load(own[word])
+    if word in WITHOUT_WEIGHTS:
+        return preset(word), build_network(preset(word))
     if word in RELEASES:
         return _load_release(word, ema, on_bytes)
     path = Path(source)
@@ -136,16 +142,22 @@ def _unknown(source: str) -> str:
 
 
 def read_official(path: str | Path, ema: bool = True) -> tuple[Experiment, nn.Module]:
-    """The experiment and the network of an official R2DM checkpoint; `ema` False takes the raw weights.
+    """The experiment and the network of an official checkpoint, of R2DM or of SYSTEMS; `ema` False takes raw weights.
 
-    The ray angles that the network learned with come from the checkpoint, and the experiment's sensor has them.
-    Raises ValueError when the file is no such checkpoint, is damaged or cannot be built.
+    Of R2DM, the ray angles that the network learned with come from the checkpoint, and the experiment's sensor has
+    them. Raises ValueError when the file is no such checkpoint, is damaged or cannot be built.
     """
     path = Path(path)
-    checkpoint = _checkpoint(path)
+    if is_keras(path):
+        return _read_keras(path)
+    checkpoint = _unpickled(path)
+    system = system_of(checkpoint)
     name = "ema_weights" if ema else "weights"
-    weights = {key.removeprefix("model."): v for key, v in checkpoint[name].items() if key != "_dummy"}
     try:
+        if system is not None:
+            return system.read(checkpoint, path.stem, ema)
+        _check(checkpoint)
+        weights = {key.removeprefix("model."): v for key, v in checkpoint[name].items() if key != "_dummy"}
         experiment = _experiment(checkpoint, weights.get("coords"), path.stem)
         network = build_network(experiment)
     except ValueError as error:
@@ -154,28 +166,43 @@ def read_official(path: str | Path, ema: bool = True) -> tuple[Experiment, nn.Mo
     return experiment, network
 
 
-def _checkpoint(path: Path) -> dict[str, Any]:
-    """The official dict. Raises ValueError that says what the file holds instead."""
-    expected = f"{path}: expected an official R2DM checkpoint"
+def _read_keras(path: Path) -> tuple[Experiment, nn.Module]:
+    try:
+        return read_keras(path)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+EXPECTED = f"expected an official R2DM checkpoint, or one of {', '.join(SYSTEMS)}"
+
+
+def _unpickled(path: Path) -> Any:
+    """What the file holds. Raises ValueError for a file that is damaged or is none."""
+    expected = f"{path}: {EXPECTED}"
     try:
         zipped = zipfile.is_zipfile(path)
         with path.open("rb") as file:
             start = file.read(4)
-        # Mapped, so that the optimiser's two thirds of the file are not read.
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except OSError as error:
         raise ValueError(f"{expected}, found {error.strerror or error}") from None
+    try:
+        # Mapped, so that the optimiser's two thirds of the file are not read.
+        with torch.serialization.safe_globals(STAND_INS):
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except Exception as error:  # a damaged pickle raises whatever it likes
         raise ValueError(f"{expected}, found {_damage(start, zipped, error)}") from None
+
+
+def _check(checkpoint: Any) -> None:
+    """Raises ValueError, saying what there is instead, unless this is R2DM's dict."""
     if not isinstance(checkpoint, dict):
-        raise ValueError(f"{expected} with cfg, weights and ema_weights, found a {type(checkpoint).__name__}")
+        raise ValueError(f"{EXPECTED}, found a {type(checkpoint).__name__}")
     if not all(isinstance(checkpoint.get(key), dict) for key in ("cfg", "weights", "ema_weights")):
         keys = [str(key) for key in checkpoint]
-        raise ValueError(f"{expected} with cfg, weights and ema_weights, found {len(keys)} keys {keys[:4]}")
+        raise ValueError(f"{EXPECTED}, and R2DM's with cfg, weights and ema_weights, found {len(keys)} keys {keys[:4]}")
     for key, value in [*checkpoint["weights"].items(), *checkpoint["ema_weights"].items()]:
         if not isinstance(key, str) or not isinstance(value, Tensor):
-            raise ValueError(f"{expected} with tensors by name, found {key!r:.60} {type(value).__name__}")
-    return checkpoint
+            raise ValueError(f"{EXPECTED} with tensors by name, found {key!r:.60} {type(value).__name__}")
 
 
 def _damage(start: bytes, zipped: bool, error: Exception) -> str:

@@ -89,6 +89,16 @@ def evaluations(levels: int = LEVELS, steps: int = STEPS) -> int:
     return levels * steps + 1
 
 
+def levels_within(calls: int, steps: int = STEPS) -> int:
+    """The most noise levels that `calls` network calls are enough for. Raises ValueError for fewer than two levels."""
+    least = evaluations(2, steps)
+    if calls < least:
+        raise ValueError(
+            f"expected at least {least} network calls for langevin, 2 levels of {steps} and 1, found {calls}"
+        )
+    return (calls - 1) // steps
+
+
 def _anneal(
     denoiser: Denoiser,
     x: Tensor,

@@ -1,4 +1,4 @@
-"""Depth codecs: metres <-> `log`, `inverse` or `metric` in [0, 1], and RangeImage <-> x_0 in [-1, 1]."""
+"""Depth codecs: metres <-> `log`, `inverse`, `metric`, `log-63m` or `inverse-minmax` in [0, 1], and RangeImage <-> x_0 in [-1, 1]."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _log_scale(sensor: Sensor) -> float:
     return math.log2(sensor.max_range + 1)
 
 
-# R2DM table II, rows C (log), D (metric) and E (inverse).
+# R2DM table II, rows C (log), D (metric) and E (inverse); LiDARGen's; and that of DUSty's first release.
 CODECS: dict[str, DepthCodec] = {
     "log": DepthCodec(
         lambda d, sensor: torch.log2(d + 1) / _log_scale(sensor),
@@ -39,6 +39,16 @@ CODECS: dict[str, DepthCodec] = {
     "metric": DepthCodec(
         lambda d, sensor: d / sensor.max_range,
         lambda u, sensor: u * sensor.max_range,
+    ),
+    # Whatever the sensor, and all that is farther becomes 63 m; without the 0.1 mm that LiDARGen adds before.
+    "log-63m": DepthCodec(
+        lambda d, sensor: torch.log2(d + 1) / 6,
+        lambda u, sensor: torch.exp2(u * 6) - 1,
+    ),
+    # 1 / d from the farthest, 0, to the nearest, 1; the code 0 stays no return.
+    "inverse-minmax": DepthCodec(
+        lambda d, sensor: (1 / d - 1 / sensor.max_range) / (1 / sensor.min_range - 1 / sensor.max_range),
+        lambda u, sensor: (u > 0) / (u * (1 / sensor.min_range - 1 / sensor.max_range) + 1 / sensor.max_range),
     ),
 }
 

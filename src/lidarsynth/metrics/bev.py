@@ -66,7 +66,7 @@ class BevCounts:
 
     count   number of scans so far
     pooled  (bins, bins) int64, the sum of all histograms; for the JSD
-    scans   (min(count, keep), bins, bins) int32, for the MMD; 40 kB each at 100 bins
+    scans   (min(count, keep), bins, bins) int16, or int32 where that is too small, for the MMD; 20 kB each at 100 bins
 
     `merge` adds what another process gathered. Grid and gate as in `bev_histograms`.
     """
@@ -81,8 +81,10 @@ class BevCounts:
 
     @property
     def scans(self) -> Tensor:
-        """(n, bins, bins) int32: the kept histograms, in the order they came."""
-        return torch.cat([self.pooled.new_zeros(0, self.bins, self.bins).int(), *self._kept])
+        """(n, bins, bins) int16 or int32: the kept histograms, in the order they came."""
+        if len(self._kept) != 1:  # one copy of them, not two: 10,000 are 200 MB
+            self._kept = [torch.cat([torch.zeros(0, self.bins, self.bins, dtype=torch.int16), *self._kept])]
+        return self._kept[0]
 
     def update(self, xyz: Array) -> None:
         """Take in the points of a batch of scans (B, N, 3), metres. Raises ValueError as `bev_histograms` does."""
@@ -107,11 +109,12 @@ class BevCounts:
         expected = {"count": (), "pooled": (self.bins, self.bins), "scans": (kept, self.bins, self.bins)}
         if found != expected:
             raise ValueError(f"expected {expected}, found {found}")
-        self._add(int(state["count"]), state["pooled"], state["scans"].int())
+        self._add(int(state["count"]), state["pooled"], state["scans"])
 
     def _add(self, count: int, pooled: Tensor, scans: Tensor) -> None:
         free = len(scans) if self.keep is None else self.keep - sum(map(len, self._kept))
         if free > 0 and len(scans):
-            self._kept.append(scans[:free].clone())
+            small = scans[:free].amax() < 1 << 15
+            self._kept.append(scans[:free].to(torch.int16 if small else torch.int32, copy=True))
         self.count += count
         self.pooled += pooled

@@ -116,17 +116,26 @@ def frechet_distance(a: Moments, b: Moments) -> float:
         raise ValueError(f"expected moments of {len(a.mean)} dimensions, found {len(b.mean)}")
     first, second = a.covariance(), b.covariance().to(a.mean)
     # S_a S_b = L (L^T S_b) has the eigenvalues of the symmetric L^T S_b L, whose roots add up to the trace
-    root = _factor(first)
-    eigenvalues = torch.linalg.eigvalsh(root.T @ second @ root).clamp(min=0)
+    fewer = a.count <= b.count
+    root = _factor(*((first, a.count) if fewer else (second, b.count)))
+    eigenvalues = torch.linalg.eigvalsh(root.T @ (second if fewer else first) @ root).clamp(min=0)
     distance = (a.mean - b.mean.to(a.mean)).square().sum() + first.trace() + second.trace()
     return float(distance - 2 * eigenvalues.sqrt().sum())
 
 
-def _factor(covariance: Tensor) -> Tensor:
-    """L (D, R) with covariance = L L^T, R its rank: Cholesky, or the eigenvectors where it is singular."""
+def _factor(covariance: Tensor, count: int) -> Tensor:
+    """L (D, R) with covariance = L L^T, of `count` samples: Cholesky, or eigenvectors where it is singular."""
+    size = len(covariance)
+    if count <= size:
+        # Its rank is below `count`, so `count` random directions reach all of its range (Halko et al. 2011).
+        probe = torch.randn(size, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        basis = torch.linalg.qr(covariance @ probe.to(covariance)).Q
+        return basis @ _eigen_root(basis.T @ covariance @ basis)
     lower, failed = torch.linalg.cholesky_ex(covariance)
-    if not failed:
-        return lower
+    return _eigen_root(covariance) if failed else lower
+
+
+def _eigen_root(covariance: Tensor) -> Tensor:
     values, vectors = torch.linalg.eigh(covariance)
     solid = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
     return vectors[:, solid] * values[solid].sqrt()

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import numpy as np
-from torch import Tensor
-
-from lidarsynth.metrics.distributions import frechet_distance, gaussian_mmd, jensen_shannon_distance, kernel_distance
+from lidarsynth.metrics.measures import MEASURES, filled_scans, set_distances
 from lidarsynth.metrics.protocols import EvaluationProtocol, Row
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 from lidarsynth.metrics.statistics import Statistics, definition
+
+OnRow = Callable[[str, int, int], object] | None  # (what, rows done, rows in all), for progress bars
 
 
 @dataclass(frozen=True)
@@ -31,75 +31,35 @@ class Result:
         return "N/A" if self.value is None else f"{self.value:.{self.digits}f}{f' {self.unit}' if self.unit else ''}"
 
 
-def _frechet(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    assert row.network
-    return frechet_distance(samples.moments[row.network], real.moments[row.network])
-
-
-def _kernel(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    assert row.network
-    protocol, rng = samples.protocol, np.random.RandomState(seed)  # the official programs draw from this generator
-    both = samples.features(row.network), real.features(row.network)
-    return kernel_distance(*both, rng, protocol.subsets, protocol.subset_size)
-
-
-def _bev_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    assert samples.protocol.bev
-    return gaussian_mmd(_scans(samples), _scans(real), samples.protocol.bev.width)
-
-
-def _bev_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    assert samples.bev and real.bev
-    return jensen_shannon_distance(samples.bev.pooled, real.bev.pooled)
-
-
-def _scans(statistics: Statistics) -> Tensor:
-    """The histograms of the scans that have any point in the gate."""
-    assert statistics.bev
-    scans = statistics.bev.scans
-    return scans[scans.flatten(1).any(1)]
-
-
-def _drop_rate(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    return _beams(samples, real).drop_rate_error
-
-
-def _beam_range(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    return _beams(samples, real).range_error
-
-
-def _beams(samples: Statistics, real: Statistics) -> BeamReport:
-    if not samples.beams or not real.beams:
-        raise ValueError(f"{samples.protocol.title} does not count beams")
-    return compare_beams(samples.beams, real.beams)
-
-
-MEASURES: dict[str, Callable[[Row, Statistics, Statistics, int], float]] = {
-    "frechet": _frechet,
-    "kernel": _kernel,
-    "bev-mmd": _bev_mmd,
-    "bev-jsd": _bev_jsd,
-    "drop-rate": _drop_rate,
-    "beam-range": _beam_range,
-}
-
-
 def results_of(
-    samples: Statistics, real: Statistics, missing: Mapping[str, str] | None = None, seed: int = 0
+    samples: Statistics,
+    real: Statistics,
+    missing: Mapping[str, str] | None = None,
+    seed: int = 0,
+    on_row: OnRow = None,
 ) -> tuple[Result, ...]:
     """The protocol's rows, those that cannot be computed as N/A with the reason.
 
     missing  kind of network -> why it is not there
     seed     of the subsets of the squared MMDs
-    Raises ValueError when the two were gathered under different protocols, or images of different sizes.
+    Raises ValueError when the two were gathered under different protocols, as other sides than samples and reference,
+    or of images of different sizes.
     """
     if samples.protocol != real.protocol:
         raise ValueError(f"expected statistics of one protocol, found {samples.protocol.title} and "
                          f"{real.protocol.title}")  # fmt: skip
+    if (samples.role, real.role) != ("samples", "real"):
+        raise ValueError(f"expected statistics of samples and of a reference (real), found {samples.role} and "
+                         f"{real.role}; gather a reference as such")  # fmt: skip
     size, size_real = ((s.sensor.height, s.sensor.width) for s in (samples, real))
     if size != size_real:
         raise ValueError(f"expected samples and reference of one resolution, found {size} and {size_real}")
-    rows = [_result(row, samples, real, missing or {}, seed) for row in samples.protocol.rows]
+    rows = []
+    for i, row in enumerate(samples.protocol.rows):
+        if on_row:
+            on_row(f"compute {row.name}", i, len(samples.protocol.rows))
+        rows.append(_result(row, samples, real, missing or {}, seed))
+    set_distances.cache_clear()
     return (*rows, *(Result(name, None, reason=reason) for name, reason in samples.protocol.absent))
 
 
@@ -138,6 +98,11 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     protocol, told = samples.protocol, []
     if protocol.samples is not None and samples.count != protocol.samples:
         told.append(f"{protocol.title} judges {protocol.samples:,} samples, found {samples.count:,}")
+    size = (samples.sensor.height, samples.sensor.width)
+    own_size = protocol.measured or protocol.sets  # published with images of one size
+    if own_size and (samples.sensor.name, *size) != (protocol.sensor, protocol.height, protocol.width):
+        told.append(f"{protocol.title} is of {protocol.height} x {protocol.width} images of {protocol.sensor}, found "
+                    f"{size[0]} x {size[1]} of {samples.sensor.name}")  # fmt: skip
     if samples.count != real.count:
         told.append(f"{samples.count:,} samples against {real.count:,} of the reference: "
                     "scores of small sets are larger, compare only with the same counts")  # fmt: skip
@@ -148,9 +113,12 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
                 told.append(f"{statistics.count:,} images of the {name} give a singular covariance of {size} {kind} "
                             "features: the Frechet distance is larger than that of many")  # fmt: skip
     for statistics, name in ((samples, "samples"), (real, "reference")):
-        empty = len(statistics.bev.scans) - len(_scans(statistics)) if statistics.bev else 0
+        empty = len(statistics.bev.scans) - len(filled_scans(statistics)) if statistics.bev else 0
         if empty:
             told.append(f"{empty} of the {name} have no point within the bird's eye gate, and no part in the MMD")
+    if protocol.measured and real.measured < real.count:
+        told.append(f"{real.count - real.measured:,} of the reference hold no measured points (a cache keeps none): x, "
+                    "y, z are those of the pixels' rays, in the official program the points' own")  # fmt: skip
     if samples.sensor.elevations != real.sensor.elevations:
         told.append(f"samples are of {samples.sensor.name}, the reference of {real.sensor.name}: other beams")
     return tuple(told)
@@ -168,7 +136,9 @@ class Report:
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0  # wall time
     sources: Mapping[str, str] = field(default_factory=dict)
+    images: str = ""  # size and sensor
     beams: BeamReport | None = None
+    classes: Mapping[str, float] | None = None  # class -> IoU, without pixels of class 0
 
     @property
     def values(self) -> dict[str, float | None]:
@@ -178,7 +148,11 @@ class Report:
     def __str__(self) -> str:
         width = max(len(result.name) for result in self.results) + 2
         lines = [f"{self.protocol.title}: {self.counts['samples']:,} samples against {self.counts['reference']:,}"]
-        lines += [f"  {r.name:<{width}}{r!s:>14}{f'   {r.reason}' if r.reason else ''}" for r in self.results]
+        lines[0] += f", {self.images}" if self.images else ""
+        lines += [f"  {r.name:<{width}}{r!s:>14}" for r in self.results]
+        reasons = dict.fromkeys(r.reason for r in self.results if r.reason)
+        for reason in reasons:
+            lines.append(f"  N/A: {', '.join(r.name for r in self.results if r.reason == reason)}: {reason}")
         lines += [f"  note: {warning}" for warning in self.warnings]
         return "\n".join(lines)
 
@@ -192,6 +166,7 @@ class Report:
             "version": protocol.version,
             "definition": definition(protocol),
             "values": {r.name: {"value": r.value, "unit": r.unit, "reason": r.reason} for r in self.results},
+            "images": self.images,
             "counts": dict(self.counts),
             "seeds": dict(self.seeds),
             "hashes": dict(self.hashes),
@@ -200,6 +175,7 @@ class Report:
             "seconds": round(self.seconds, 3),
             "record": _plain(asdict(protocol)),
             "beams": beams,
+            "classes": dict(self.classes) if self.classes else None,
         }
 
     def json(self) -> str:
@@ -211,7 +187,7 @@ class Report:
         lines = [f"# {p.title}", "", p.source + ".", "", "| measure | value | |", "|---|---:|---|"]
         lines += [f"| {r.name} | {r} | {r.reason} |" for r in self.results]
         lines += ["", *(f"- {text}" for text in self.warnings)] if self.warnings else []
-        lines += ["", "## Made with", ""]
+        lines += ["", "## Made with", "", f"- images: {self.images}"]
         for title, table in (
             ("", self.counts),
             ("seed of ", self.seeds),
@@ -223,6 +199,9 @@ class Report:
         lines += [f"- {row.name}: {row.formula}" for row in p.rows]
         lines += [f"- pixels: {p.near:g} < range < {p.far:g} m of {', '.join(p.gated)}"] if p.gated else []
         lines += [f"- {note}" for note in p.notes]
+        if self.classes:
+            lines += ["", "## Classes", "", "| class | IoU |", "|---|---:|"]
+            lines += [f"| {name} | {value:.2%} |" for name, value in self.classes.items()]
         if self.beams:
             lines += ["", "## Beams", "", "```", str(self.beams), "```"]
         return "\n".join(lines) + "\n"
@@ -237,14 +216,22 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def report_of(samples: Statistics, real: Statistics, missing: Mapping[str, str] | None = None, seed: int = 0) -> Report:
+def report_of(
+    samples: Statistics,
+    real: Statistics,
+    missing: Mapping[str, str] | None = None,
+    seed: int = 0,
+    on_row: OnRow = None,
+) -> Report:
     """The whole report of two sets of statistics, but for wall time and sources. Raises ValueError as `results_of`."""
-    results = results_of(samples, real, missing, seed)
+    results = results_of(samples, real, missing, seed, on_row)
     beams = None
-    if samples.beams and real.beams and samples.beams.pixels.all() and real.beams.pixels.all():
-        comparable = samples.beams.sensor.elevations == real.beams.sensor.elevations
-        beams = compare_beams(samples.beams, real.beams) if comparable else None
+    if samples.beams and real.beams:
+        with suppress(ValueError):  # of other beams; the rows say so
+            beams = compare_beams(samples.beams, real.beams)
     counts = {"samples": samples.count, "reference": real.count}
+    if samples.protocol.sets:
+        counts |= {"samples as point sets": len(samples.sets()), "reference as point sets": len(real.sets())}
     if samples.bev and real.bev:
         counts |= {"samples in bird's eye view": samples.bev.count, "reference in bird's eye view": real.bev.count}
     hashes = {"samples": samples.digest, "reference": real.digest, **samples.weights}

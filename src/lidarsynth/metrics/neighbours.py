@@ -16,17 +16,28 @@ from torch import Tensor
 from lidarsynth.metrics.distributions import Array, as_tensor
 
 
-def distance_matrix(a: Sequence, b: Sequence, distance: Callable[..., float]) -> np.ndarray:
-    """(len(a), len(b)) float64: `distance` of every item of `a` to every item of `b`, such as `chamfer_distance`."""
+def distance_matrix(a: Sequence | np.ndarray, b: Sequence | np.ndarray, distance: Callable[..., float]) -> np.ndarray:
+    """(len(a), len(b)) float64: `distance` of every item of `a` to every item of `b`, such as `chamfer_distance`.
+
+    It must be symmetric and 0 of an item to itself: of one set with itself, `a is b`, each pair is computed once.
+    """
+    if a is b:
+        matrix = np.zeros((len(a), len(a)))
+        for i in range(len(a)):
+            matrix[i, :i] = [distance(a[i], a[j]) for j in range(i)]
+        return matrix + matrix.T
     return np.array([[distance(one, other) for other in b] for one in a], np.float64).reshape(len(a), len(b))
 
 
-def minimum_matching_distance(between: np.ndarray) -> float:
-    """Mean over real ones of the distance to the nearest generated one; `between` (G, R) (Achlioptas et al. 2018)."""
+def minimum_matching_distance(between: Array) -> float:
+    """Mean over real ones of the distance to the nearest generated one; `between` (G, R) (Achlioptas et al. 2018).
+
+    MMD-CD where the distance is `chamfer_distance`, MMD-EMD where it is `earth_movers_distance`.
+    """
     return float(_matrix(between).min(axis=0).mean())
 
 
-def coverage(between: np.ndarray) -> float:
+def coverage(between: Array) -> float:
     """Share of the real ones that are the nearest of some generated one; `between` (G, R), in [1 / R, 1].
 
     Achlioptas et al. 2018; 1 for two identical sets of different items. Raises ValueError for an empty matrix or NaN.
@@ -34,26 +45,27 @@ def coverage(between: np.ndarray) -> float:
     return len(np.unique(_matrix(between).argmin(axis=1))) / between.shape[1]
 
 
-def nearest_neighbour_accuracy(generated: np.ndarray, between: np.ndarray, real: np.ndarray) -> float:
+def nearest_neighbour_accuracy(generated: Array, between: Array, real: Array) -> float:
     """1-NNA: share of all items whose nearest other item is of their own set; 0.5 is best, 1 tells the sets apart.
 
     generated (G, G), between (G, R) and real (R, R) distances (Lopez-Paz & Oquab 2017, Yang et al. 2019). An item as
     near to both sets counts as told apart. Raises ValueError for shapes that do not fit or NaN.
     """
-    between = _matrix(between)
+    among, between, within = (_matrix(distances) for distances in (generated, between, real))
     g, r = between.shape
-    if generated.shape != (g, g) or real.shape != (r, r):
+    if among.shape != (g, g) or within.shape != (r, r):
         raise ValueError(f"expected distances {(g, g)}, {(g, r)}, {(r, r)}, "
-                         f"found {generated.shape}, {between.shape}, {real.shape}")  # fmt: skip
-    alone = [np.where(np.eye(len(own), dtype=bool), np.inf, _matrix(own)).min(axis=1) for own in (generated, real)]
+                         f"found {among.shape}, {between.shape}, {within.shape}")  # fmt: skip
+    alone = [np.where(np.eye(len(own), dtype=bool), np.inf, own).min(axis=1) for own in (among, within)]
     told_apart = (alone[0] <= between.min(axis=1)).sum() + (alone[1] <= between.min(axis=0)).sum()
     return float(told_apart / (g + r))
 
 
-def _matrix(distances: np.ndarray) -> np.ndarray:
-    if distances.ndim != 2 or not distances.size or np.isnan(distances).any():
-        raise ValueError(f"expected a matrix of distances without NaN, found {distances.shape}")
-    return distances
+def _matrix(distances: Array) -> np.ndarray:
+    matrix = distances.cpu().numpy() if isinstance(distances, Tensor) else distances
+    if matrix.ndim != 2 or not matrix.size or np.isnan(matrix).any():
+        raise ValueError(f"expected a matrix of distances without NaN, found {matrix.shape}")
+    return matrix
 
 
 @dataclass(frozen=True)

@@ -3,46 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from hashlib import blake2b
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
+from lidarsynth.lidar.colours import CLASSES
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.evaluate import Report, Result
 from lidarsynth.metrics.protocols import EvaluationProtocol
 from lidarsynth.metrics.rangenet import RangeNet
 from lidarsynth.metrics.reconstruction import (
     Errors,
+    class_iou,
     confusion_matrix,
     mean_errors,
     mean_iou,
     reconstruction_errors,
     weighted_iou,
 )
+from lidarsynth.metrics.statistics import hash_of
 
 
 class Pairs:
-    """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None."""
+    """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None.
+
+    Of bounded size but for a few numbers per pair; `merge` adds what another process gathered, `state` and `restore`
+    are for files.
+    """
 
     def __init__(self, protocol: EvaluationProtocol, classes: RangeNet | None = None):
         self.protocol, self.classes = protocol, classes
         self.errors: list[Errors] = []
-        self.confusion = np.zeros((20, 20), np.int64)
+        self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
         self.lit = False
-        self._digests = [blake2b(digest_size=16), blake2b(digest_size=16)]
+        self._digests = [0, 0]
 
     def update(self, results: Sequence[RangeImage], truths: Sequence[RangeImage]) -> None:
         """Take in a batch of images and their truths, all pixels of both. Raises ValueError for different sizes."""
         for result, truth in zip(results, truths, strict=True):
             self.errors.append(reconstruction_errors(result, truth))
             self.lit |= bool(result.reflectance.any())
-            for digest, image in zip(self._digests, (result, truth), strict=True):
-                digest.update(np.ascontiguousarray(np.stack([image.range, image.reflectance])).tobytes())
+            self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:
             labels = [self._labels(images) for images in (truths, results)]
             self.confusion += confusion_matrix(labels[0], labels[1])
+
+    def _add_digests(self, digests: Sequence[int]) -> None:
+        self._digests = [(own + its) % (1 << 128) for own, its in zip(self._digests, digests, strict=True)]
+
+    def merge(self, other: Pairs) -> None:
+        """Take in all that `other` has seen. Raises ValueError for another protocol."""
+        if self.protocol != other.protocol:
+            raise ValueError(f"expected pairs of {self.protocol.title}, found {other.protocol.title}")
+        self.restore(other.state())
+
+    def state(self) -> dict[str, Any]:
+        """Plain lists and numbers, for a file; the inverse of `restore`."""
+        errors = [list(asdict(e).values()) for e in self.errors]
+        digests = [f"{digest:032x}" for digest in self._digests]
+        return {"errors": errors, "confusion": self.confusion.tolist(), "lit": self.lit, "digests": digests}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take in what `state` of another gave."""
+        self.errors += [Errors(*values) for values in state["errors"]]
+        self.confusion += np.array(state["confusion"], np.int64)
+        self.lit |= state["lit"]
+        self._add_digests([int(digest, 16) for digest in state["digests"]])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: all but the network."""
+        return {**vars(self), "classes": None}
 
     @torch.no_grad()
     def _labels(self, images: Sequence[RangeImage]) -> np.ndarray:
@@ -67,8 +100,10 @@ class Pairs:
             results.append(Result(row.name, value, row.unit, row.digits, reason))
         counts = {"samples": len(self.errors), "reference": len(self.errors)}
         names = ("samples", "reference")
-        hashes = {name: digest.hexdigest() for name, digest in zip(names, self._digests, strict=True)}
-        return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {})
+        hashes = {name: f"{digest:032x}" for name, digest in zip(names, self._digests, strict=True)}
+        iou = class_iou(self.confusion, (0,)).tolist() if self.classes and self.lit else []
+        classes = {name: value for (name, _), value in zip(CLASSES[1:], iou[1:], strict=False)} or None
+        return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {}, classes=classes)
 
 
 MEASURES: dict[str, Callable[[Errors, np.ndarray], float]] = {

@@ -119,7 +119,9 @@ class _Backbone(nn.Module):
         self.dropout = nn.Dropout2d(dropout)
 
     def forward(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
-        x = nn.functional.leaky_relu(self.bn1(self.conv1(x)), 0.1)
+        # a bfloat16 has 8 bits: of 24 m it would drop what is less than 0.1 m, so the first layer sees all of float32
+        with torch.autocast(x.device.type, enabled=False):
+            x = nn.functional.leaky_relu(self.bn1(self.conv1(x.float())), 0.1)
         skips = []
         for stage in (self.enc1, self.enc2, self.enc3, self.enc4, self.enc5):
             skips.append(x.detach())

@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.metrics.distributions import Array
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def mean_errors(errors: list[Errors]) -> Errors:
     return Errors(*means, pixels=sum(e.pixels for e in errors))
 
 
-def nearest_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+def nearest_distances(points: Array, others: Array) -> np.ndarray:
     """(N,) float64, metres: from each of `points` (N, 3) to the nearest of `others` (M, 3).
 
     Raises ValueError for other shapes, no points or NaN; ImportError without scipy, naming the extra that brings it.
@@ -61,8 +62,8 @@ def nearest_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return KDTree(sets[1]).query(sets[0])[0]
 
 
-def _points(values: np.ndarray) -> np.ndarray:
-    points = np.asarray(values, np.float64)
+def _points(values: Array) -> np.ndarray:
+    points = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
         raise ValueError(f"expected finite points (N, 3), at least one, found {points.shape}")
     return points
@@ -80,7 +81,7 @@ class PointErrors:
     f_score: float  # harmonic mean of the two, 0 where both are 0
 
 
-def point_errors(result: np.ndarray, truth: np.ndarray, threshold: float = 0.2) -> PointErrors:
+def point_errors(result: Array, truth: Array, threshold: float = 0.2) -> PointErrors:
     """Chamfer and Hausdorff distance, and F-score at `threshold` metres, of points (N, 3) and (M, 3).
 
     F-score: Knapitsch et al. 2017. Raises ValueError for other shapes, no points or NaN.
@@ -97,7 +98,7 @@ def point_errors(result: np.ndarray, truth: np.ndarray, threshold: float = 0.2) 
     )
 
 
-def chamfer_distance(a: np.ndarray, b: np.ndarray) -> float:
+def chamfer_distance(a: Array, b: Array) -> float:
     """Mean distance from `a` (N, 3) to `b` (M, 3) plus that from `b` to `a`, metres."""
     return float(nearest_distances(a, b).mean() + nearest_distances(b, a).mean())
 
@@ -116,7 +117,7 @@ class VoxelErrors:
     f1: float
 
 
-def voxel_errors(result: np.ndarray, truth: np.ndarray, size: float = 0.1) -> VoxelErrors:
+def voxel_errors(result: Array, truth: Array, size: float = 0.1) -> VoxelErrors:
     """Overlap of the voxels floor(x / size) that points (N, 3) and (M, 3) in metres occupy; one scan (ILN, TULIP).
 
     Means over scans are taken of these. Raises ValueError for other shapes, no points or NaN.
@@ -127,7 +128,7 @@ def voxel_errors(result: np.ndarray, truth: np.ndarray, size: float = 0.1) -> Vo
     return VoxelErrors(both / len(first | second), precision, recall, _harmonic(precision, recall))
 
 
-def confusion_matrix(truth: np.ndarray | Tensor, predicted: np.ndarray | Tensor, classes: int = 20) -> np.ndarray:
+def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.ndarray:
     """(classes, classes) int64 pixels, truth by row, predicted by column; those of several scans simply add up.
 
     Labels of one shape, 0 to classes - 1. Raises ValueError for other shapes or labels.

@@ -68,8 +68,10 @@ def check_comparable(a: BeamCounts, b: BeamCounts) -> None:
     """Raises ValueError unless both count the same beams in the same bins; widths may differ."""
     own, its = ((c.sensor.elevations, c.histogram.shape, c.step) for c in (a, b))
     if own != its:
-        raise ValueError(f"expected counts of one sensor and step, found {a.sensor.name} {own[1:]} and {b.sensor.name} "
-                         f"{its[1:]}")  # fmt: skip
+        names = (
+            f"{c.sensor.name} ({len(c.histogram)} beams, {c.histogram.shape[1]} bins of {c.step} m)" for c in (a, b)
+        )
+        raise ValueError(f"expected counts of one sensor and step, found {' and '.join(names)}")
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, from_dict
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import Array, Moments
-from lidarsynth.metrics.pointnet import PointNet, point_features
+from lidarsynth.metrics.features import drawn_again, features, gated
+from lidarsynth.metrics.point_sets import farthest_points
 from lidarsynth.metrics.protocols import EvaluationProtocol, Side, get_protocol
-from lidarsynth.metrics.rangenet import RangeNet, frechet_features
 from lidarsynth.metrics.sensor_report import BeamCounts
 
 FORMAT = "lidarsynth statistics 1"
@@ -39,6 +38,7 @@ class Statistics:
     weights   kind -> SHA-256 of each network's file
     count     images so far, for features; `bev.count` is that of the histograms
     lit       images with any reflectance above 0
+    measured  images that hold the measured points themselves; those of others lie on their pixels' rays
     digest    hexadecimal hash of all images, whatever their order
 
     Two sets of different images merge into what one pass over all of them gives.
@@ -55,9 +55,10 @@ class Statistics:
         self.protocol, self.sensor = protocol, sensor
         self.role: Side = role
         self.networks, self.weights = dict(networks or {}), dict(weights or {})
-        self.count = self.lit = self._digest = 0
+        self.count = self.lit = self.measured = self._digest = 0
         self.moments: dict[str, Moments] = {}
         self._kept: dict[str, list[Tensor]] = {}
+        self._sets: list[Tensor] = []
         grid = protocol.bev
         self.bev = BevCounts(grid.bins, grid.extent, grid.near, grid.far, protocol.keep) if grid else None
         far = min(protocol.far, sensor.max_range)  # so that sensors of other limits compare
@@ -70,20 +71,28 @@ class Statistics:
 
     def features(self, kind: str) -> Tensor:
         """(n, D) float32: the kept features of a network, on the CPU."""
-        return torch.cat(self._kept[kind])
+        self._kept[kind] = [torch.cat(self._kept[kind])]
+        return self._kept[kind][0]
 
-    def update(self, images: Sequence[RangeImage], features: Sequence[bool], bev: Sequence[bool]) -> None:
-        """Take in a batch; `features` and `bev` say which of the images count for which.
+    def sets(self) -> np.ndarray:
+        """(n, P, 3) float32: the farthest points of the images taken for the measures of point sets."""
+        size = self.protocol.sets.points if self.protocol.sets else 0
+        return torch.cat([torch.zeros(0, size, 3), *self._sets]).numpy()
+
+    def update(
+        self, images: Sequence[RangeImage], features: Sequence[bool], bev: Sequence[bool], sets: Sequence[bool] = ()
+    ) -> None:
+        """Take in a batch; `features`, `bev` and `sets` say which of the images count for which.
 
         Raises ValueError for an image of another size than the sensor's, or with values that are not finite.
         """
         for image in images:
             self._check(image)
-            content = b"".join(np.ascontiguousarray(v).tobytes() for v in (image.range, image.reflectance, image.mask))
-            self._digest = (self._digest + int(blake2b(content, digest_size=16).hexdigest(), 16)) % (1 << 128)
+            self._digest = (self._digest + hash_of(image)) % (1 << 128)
         self.update_features([i for i, n in zip(images, features, strict=True) if n],
                              [b for b, n in zip(bev, features, strict=True) if n])  # fmt: skip
         self.update_histograms([image for image, needed in zip(images, bev, strict=True) if needed])
+        self.update_sets([image for image, needed in zip(images, sets, strict=False) if needed])
 
     def _check(self, image: RangeImage) -> None:
         if image.shape != (self.sensor.height, self.sensor.width):
@@ -99,20 +108,22 @@ class Statistics:
         """Take in images for the feature networks only; the features of those to `keep` stay one by one."""
         self.count += len(images)
         self.lit += sum(bool((image.reflectance[image.mask] > 0).any()) for image in images)
+        self.measured += sum(image.xyz is not None for image in images)
         if not images or not self.networks:
             return
         if self.protocol.reproject and self.role == "samples":
-            images = [_drawn_again(image, _gated(image, self.protocol, "samples")) for image in images]
-        masks = np.stack([_gated(image, self.protocol, self.role) for image in images])
+            images = [drawn_again(image, gated(image, self.protocol, "samples")) for image in images]
+        masks = np.stack([gated(image, self.protocol, self.role) for image in images])
         xyz = np.stack([image.points() for image in images]) * masks[..., None]
         for kind, network in self.networks.items():
             size = getattr(self.protocol.network(kind), "features", 0)
-            self.add_features(kind, _features(network, images, xyz, masks, size), keep)
+            self.add_features(kind, features(network, images, xyz, masks, size), keep)
 
     def add_features(self, kind: str, values: Array, keep: Iterable[bool]) -> None:
         """Take in features (B, D) of a network that ran elsewhere. Raises ValueError for NaN or another D."""
-        moments = self.moments.setdefault(kind, Moments(values.shape[1]))
-        moments.update(values)
+        if kind not in self.moments:  # on the network's device: a large covariance is slow to add to on a CPU
+            self.moments[kind] = Moments(values.shape[1], values.device if isinstance(values, Tensor) else "cpu")
+        self.moments[kind].update(values)
         kept = torch.as_tensor(values).cpu().float()[torch.tensor(list(keep), dtype=torch.bool)]
         free = self.protocol.keep - sum(map(len, self._kept.setdefault(kind, [])))
         self._kept[kind].append(kept[: max(free, 0)])
@@ -121,12 +132,22 @@ class Statistics:
         """Take in images for the bird's eye view and the beams only."""
         if not images:
             return
-        masks = np.stack([_gated(image, self.protocol, "bev") for image in images])
+        masks = np.stack([gated(image, self.protocol, "bev") for image in images])
         if self.bev:
             xyz = np.stack([image.points() for image in images]) * masks[..., None]
             self.bev.update(xyz.reshape(len(images), -1, 3))
         if self.beams:
             self.beams.update(np.stack([image.range for image in images]), masks)
+
+    def update_sets(self, images: Sequence[RangeImage]) -> None:
+        """Take in images for the measures of point sets only."""
+        sets = self.protocol.sets
+        if not sets:
+            return
+        for image in images:
+            xyz = (image.points() * gated(image, self.protocol, self.role)[..., None]).reshape(-1, 3) / sets.scale
+            chosen = xyz[farthest_points(xyz, sets.points, sets.clear)]
+            self._sets.append(torch.from_numpy(chosen.astype(np.float32))[None])
 
     def merge(self, other: Statistics) -> None:
         """Take in all that `other` has seen. Raises ValueError for another protocol, sensor, role or weights."""
@@ -135,12 +156,15 @@ class Statistics:
             wrong = next(i for i, (a, b) in enumerate(zip(own, its, strict=True)) if a != b)
             name = ("protocol", "sensor", "role", "weights", "networks")[wrong]
             raise ValueError(f"expected statistics of one {name}, found {own[wrong]!s:.100} and {its[wrong]!s:.100}")
-        self.count, self.lit = self.count + other.count, self.lit + other.lit
+        self.count, self.lit, self.measured = (
+            self.count + other.count, self.lit + other.lit, self.measured + other.measured
+        )  # fmt: skip
         self._digest = (self._digest + other._digest) % (1 << 128)
         for kind, moments in other.moments.items():
             self.moments[kind].merge(moments)
             free = self.protocol.keep - sum(map(len, self._kept[kind]))
             self._kept[kind].append(other.features(kind)[: max(free, 0)])
+        self._sets += other._sets
         if self.bev and other.bev:
             self.bev.merge(other.bev)
         if self.beams and other.beams:
@@ -148,7 +172,7 @@ class Statistics:
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything counted, by name."""
-        state = {"counts": torch.tensor([self.count, self.lit])}
+        state = {"counts": torch.tensor([self.count, self.lit, self.measured])}
         for kind, moments in self.moments.items():
             state |= {f"{kind}.moments.{name}": value.cpu() for name, value in moments.state().items()}
             state[f"{kind}.features"] = self.features(kind)
@@ -156,11 +180,13 @@ class Statistics:
         if self.beams:
             state["beams.pixels"] = torch.from_numpy(self.beams.pixels)
             state["beams.histogram"] = torch.from_numpy(self.beams.histogram)
+        if self.protocol.sets:
+            state["sets"] = torch.from_numpy(self.sets())
         return {name: value.contiguous() for name, value in state.items()}
 
     def restore(self, state: Mapping[str, Tensor], digest: str) -> None:
         """Fill a new object with what `tensors` and `digest` of another gave."""
-        self.count, self.lit = state["counts"].tolist()
+        self.count, self.lit, self.measured = state["counts"].tolist()
         self._digest = int(digest, 16)
         for kind in [name.removesuffix(".features") for name in state if name.endswith(".features")]:
             self.moments[kind] = Moments.from_state(_under(state, f"{kind}.moments."))
@@ -170,41 +196,22 @@ class Statistics:
         if self.beams:
             self.beams.pixels += state["beams.pixels"].numpy()
             self.beams.histogram += state["beams.histogram"].numpy()
+        if self.protocol.sets:
+            self._sets = [state["sets"]]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: all but the networks."""
+        return {**vars(self), "networks": {}}
+
+
+def hash_of(image: RangeImage) -> int:
+    """128 bits of range, reflectance and mask; the sum of those of a set is the same in any order."""
+    content = b"".join(np.ascontiguousarray(v).tobytes() for v in (image.range, image.reflectance, image.mask))
+    return int(blake2b(content, digest_size=16).hexdigest(), 16)
 
 
 def _under(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-
-def _gated(image: RangeImage, protocol: EvaluationProtocol, side: Side) -> np.ndarray:
-    """(H, W) bool: measured, and strictly within the protocol's limits where it gates this side."""
-    if side not in protocol.gated:
-        return image.mask
-    return image.mask & (image.range > protocol.near) & (image.range < protocol.far)
-
-
-def _drawn_again(image: RangeImage, mask: np.ndarray) -> RangeImage:
-    """The image of its own points, without the first of them (LiDARGen's program takes index 0 for empty)."""
-    scan = Scan(image.points()[mask], image.reflectance[mask])
-    drawn = project(scan, replace(image.sensor, min_range=0.0, max_range=float("inf")), "spherical")
-    if not len(scan) or drawn.xyz is None:
-        return drawn
-    return drawn.keep(~(drawn.xyz == scan.xyz[0]).all(axis=-1))
-
-
-def _features(
-    network: nn.Module, images: Sequence[RangeImage], xyz: np.ndarray, masks: np.ndarray, size: int
-) -> Tensor:
-    """(B, size) of the FRD or FPD; xyz (B, H, W, 3) metres with zeros outside the masks (B, H, W)."""
-    device = next(network.parameters()).device
-    if isinstance(network, PointNet):
-        return point_features(network, torch.from_numpy(xyz.reshape(len(xyz), -1, 3)).to(device))
-    if not isinstance(network, RangeNet):
-        raise ValueError(f"expected a RangeNet or PointNet, found {type(network).__name__}")
-    flat = [np.stack([image.range for image in images]), *np.moveaxis(xyz, -1, 0)]
-    flat.append(np.stack([image.reflectance for image in images]))
-    pixels = torch.from_numpy(np.stack(flat, axis=1).astype(np.float32)).to(device)
-    return frechet_features(network, pixels, torch.from_numpy(masks).to(device), size)
 
 
 def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str] | None = None) -> str:
@@ -227,7 +234,10 @@ def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str]
     unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()
+        mode = unfinished.stat().st_mode & 0o777
         save_file(tensors, unfinished, metadata)
+        unfinished.chmod(mode)  # safetensors lets nobody else read what it writes
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -248,16 +258,19 @@ def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> t
         raise ValueError(f"{path}: expected a file of statistics, found {error!s:.100}") from None
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: expected {FORMAT!r}, found {metadata.get('format')!r:.40}")
-    protocol = protocol or get_protocol(metadata["protocol"])
-    if metadata["definition"] != definition(protocol):
+    protocol = protocol or get_protocol(metadata.get("protocol", ""))
+    if metadata.get("definition") != definition(protocol):
         raise ValueError(f"{path}: expected statistics of {protocol.title} as defined here, found those of "
-                         f"{metadata['protocol']}, {metadata['definition']}")  # fmt: skip
+                         f"{metadata.get('protocol')}, {metadata.get('definition')}")  # fmt: skip
     if _content(tensors, metadata) != metadata.get("sha256"):
         raise ValueError(f"{path}: expected the content of SHA-256 {metadata.get('sha256')!s:.16}..., found another")
-    role: Any = metadata["role"]
-    sensor = from_dict(json.loads(metadata["sensor"]), str(path))
-    statistics = Statistics(protocol, sensor, role, weights=json.loads(metadata["weights"]))
-    statistics.restore(tensors, metadata["digest"])
+    try:
+        role: Any = metadata["role"]
+        sensor = from_dict(json.loads(metadata["sensor"]), str(path))
+        statistics = Statistics(protocol, sensor, role, weights=json.loads(metadata["weights"]))
+        statistics.restore(tensors, metadata["digest"])
+    except (KeyError, TypeError, RuntimeError) as error:  # made by other hands
+        raise ValueError(f"{path}: expected the fields of {FORMAT!r}, found other ones: {error!s:.80}") from None
     return statistics, metadata
 
 

@@ -5,6 +5,7 @@ colours; all of them are differentiable in the image.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,24 @@ SYM6 = (
     *(-0.021060292512300564, 0.04472490177066578, 0.0017677118642428036, -0.007800708325034148),
 )
 _MARGIN = len(SYM6) // 4  # pixels that the filters reach beyond the image
+
+
+class Dice(NamedTuple):
+    """The random numbers that an image's transforms are made from, of B images; rolled by `roll_dice`."""
+
+    gate: Tensor  # (B,8) in [0,1): a transform is applied where its number is below the probability
+    uniform: Tensor  # (B,5) in [0,1): flip along x, flip along y, whole-pixel shift x and y, inversion
+    normal: Tensor  # (B,5) ~ N(0,1): vertical scale, shift x and y, brightness, contrast
+
+
+def roll_dice(count: int, generator: torch.Generator) -> Dice:
+    """Dice of `count` images, on the device of the generator."""
+    device = generator.device
+    return Dice(
+        torch.rand(count, 8, generator=generator, device=device),
+        torch.rand(count, 5, generator=generator, device=device),
+        torch.randn(count, 5, generator=generator, device=device),
+    )
 
 
 class AdaptiveAugmentation(nn.Module):
@@ -41,10 +60,10 @@ class AdaptiveAugmentation(nn.Module):
         self.register_buffer("n_pred_cum", torch.zeros(1))
         self.register_buffer("Hz_fbank", octave_filters())  # official checkpoints hold it; the runs filter nothing
 
-    def forward(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Images (B,1,H,W) -> augmented images, same shape; `generator` on the device of `images`."""
-        affine = random_affine(images, self.p, generator)
-        return transform_colour(transform_geometry(images, affine), random_colour(images, self.p, generator))
+    def forward(self, images: Tensor, dice: Dice) -> Tensor:
+        """Images (B,1,H,W) -> augmented images, same shape; an image's own dice decide on it."""
+        affine = random_affine(images, self.p, dice)
+        return transform_colour(transform_geometry(images, affine), random_colour(images, self.p, dice))
 
     @torch.no_grad()
     def observe(self, logits_real: Tensor) -> None:
@@ -161,15 +180,15 @@ def transform_colour(images: Tensor, colour: Tensor) -> Tensor:
     return images * row[:, :3].sum(1).view(-1, 1, 1, 1) + row[:, 3].view(-1, 1, 1, 1)
 
 
-def random_affine(images: Tensor, p: Tensor, generator: torch.Generator | None = None) -> Tensor:
+def random_affine(images: Tensor, p: Tensor, dice: Dice) -> Tensor:
     """Flips, whole-pixel shift, vertical scaling, shift, each with probability p, for images (B,1,H,W): (B,3,3)."""
     batch, _, height, width = images.shape
     size = images.new_tensor([width, height])
-    draw = _Draws(images, p, generator)
-    flip_x, flip_y = (1 - 2 * draw.gated((draw.uniform(1) < 0.5).to(images.dtype), 0.0) for _ in range(2))
-    whole = draw.gated(((draw.uniform(2) * 2 - 1) * 0.125 * size).round(), 0.0)
-    scale = draw.gated(torch.exp2(draw.normal(1) * 0.2), 1.0)
-    shift = draw.gated(draw.normal(2) * 0.125 * size, 0.0)
+    gate, uniform, normal = (part.to(images).split(1, dim=1) for part in dice)
+    flip_x, flip_y = (1 - 2 * torch.where(gate[i] < p, (uniform[i] < 0.5).to(images), 0.0) for i in (0, 1))
+    whole = torch.where(gate[2] < p, ((torch.cat(uniform[2:4], 1) * 2 - 1) * 0.125 * size).round(), 0.0)
+    scale = torch.where(gate[3] < p, torch.exp2(normal[0] * 0.2), 1.0)
+    shift = torch.where(gate[4] < p, torch.cat(normal[1:3], 1) * 0.125 * size, 0.0)
     one = torch.ones_like(scale)
     flips = torch.cat([flip_x, flip_y], 1)
     scales = torch.cat([one, scale], 1)
@@ -180,32 +199,14 @@ def random_affine(images: Tensor, p: Tensor, generator: torch.Generator | None =
     return affine
 
 
-def random_colour(images: Tensor, p: Tensor, generator: torch.Generator | None = None) -> Tensor:
+def random_colour(images: Tensor, p: Tensor, dice: Dice) -> Tensor:
     """Brightness, contrast and inversion, each with probability p: (B,4,4). Hue and saturation leave grey as it is."""
-    draw = _Draws(images, p, generator)
-    brightness = draw.gated(draw.normal(1) * 0.2, 0.0)
-    contrast = draw.gated(torch.exp2(draw.normal(1) * 0.5), 1.0)
-    flip = draw.gated((draw.uniform(1) < 0.5).to(images.dtype), 0.0)
+    gate, uniform, normal = (part.to(images).split(1, dim=1) for part in dice)
+    brightness = torch.where(gate[5] < p, normal[3] * 0.2, 0.0)
+    contrast = torch.where(gate[6] < p, torch.exp2(normal[4] * 0.5), 1.0)
+    flip = torch.where(gate[7] < p, (uniform[4] < 0.5).to(images), 0.0)
     grey = images.new_tensor([1.0, 1.0, 1.0, 0.0]) / math.sqrt(3)
     mirror = torch.eye(4, dtype=images.dtype, device=images.device) - 2 * torch.outer(grey, grey) * flip[:, :, None]
     colour = torch.diag_embed(torch.cat([contrast.expand(-1, 3), torch.ones_like(contrast)], 1))
     colour[:, :3, 3] = contrast * brightness
     return mirror @ colour
-
-
-class _Draws:
-    """Random numbers per image, and the gate that lets a transform through with probability p."""
-
-    def __init__(self, images: Tensor, p: Tensor, generator: torch.Generator | None):
-        self.images, self.p, self.generator = images, p, generator
-
-    def uniform(self, count: int) -> Tensor:
-        shape = (len(self.images), count)
-        return torch.rand(shape, generator=self.generator, dtype=self.images.dtype, device=self.images.device)
-
-    def normal(self, count: int) -> Tensor:
-        shape = (len(self.images), count)
-        return torch.randn(shape, generator=self.generator, dtype=self.images.dtype, device=self.images.device)
-
-    def gated(self, values: Tensor, otherwise: float) -> Tensor:
-        return torch.where(self.uniform(1) < self.p, values, otherwise)

@@ -4,15 +4,21 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.models.efficient_unet import EfficientUNet
-from lidarsynth.models.interpolation import fill_in
+from lidarsynth.models.interpolation import fill_in, nearest_along_axes
+
+CANDIDATES = 6  # interpolation, left, right, above, below, nothing returned
 
 
 class ConditionalUNet(nn.Module):
-    """Feeds `[x_t, known, mask, fill_in(known, mask)]` to a U-Net and adds the interpolation to what it returns.
+    """Feeds `[x_t, known, mask, fill_in(known, mask)]` to a U-Net, whose output corrects what is known of the pixel.
 
-    `unet` takes four times as many channels as it gives. Its last layer starts at zero, so an untrained network returns
-    the interpolation of the known pixels; a trained one predicts what interpolation misses, and all of x_0 where
-    nothing is known.
+    `unet` takes four times as many channels as it gives, C. It corrects the interpolation of the known pixels. If it
+    gives C + 6 C channels, the other 6 C choose, by a softmax per channel and pixel, what is corrected: the
+    interpolation, one of the nearest known values (left, right, above, below), or -1, nothing returned; so that an edge
+    is where one candidate gives way to another, and not a slope between them.
+
+    Its last layer starts at zero, so an untrained network returns (nearly, with candidates) the interpolation of the
+    known pixels; where nothing is known it predicts all of x_0.
 
     Example:
         >>> unet = EfficientUNet(in_channels=8, resolution=(64, 1024), base_channels=48, stem=(2, 4))
@@ -21,9 +27,11 @@ class ConditionalUNet(nn.Module):
 
     def __init__(self, unet: EfficientUNet):
         super().__init__()
-        if unet.in_channels != 4 * unet.out_channels:
+        channels = unet.in_channels // 4
+        if unet.in_channels % 4 or unet.out_channels not in (channels, channels * (1 + CANDIDATES)):
             raise ValueError(
-                f"unet must have in_channels = 4 * out_channels = {4 * unet.out_channels}, got {unet.in_channels}"
+                f"unet must have in_channels = 4 C and out_channels = C or {1 + CANDIDATES} C, "
+                f"got {unet.in_channels} and {unet.out_channels}"
             )
         self.unet = unet
 
@@ -39,7 +47,22 @@ class ConditionalUNet(nn.Module):
         else:
             known, mask = _check(x_t, known, mask)
             fill = fill_in(known, mask)
-        return self.unet(torch.cat([x_t, known, mask, fill], dim=1), log_snr) + fill
+        output = self.unet(torch.cat([x_t, known, mask, fill], dim=1), log_snr)
+        if self.unet.out_channels == x_t.shape[1]:
+            return output + fill
+        correction, scores = output.float().split([x_t.shape[1], output.shape[1] - x_t.shape[1]], dim=1)
+        return correction + _chosen(scores.unflatten(1, (CANDIDATES, x_t.shape[1])), known, mask, fill)
+
+
+def _chosen(scores: Tensor, known: Tensor, mask: Tensor, fill: Tensor) -> Tensor:
+    """Mean (B,C,H,W) of the candidates by `scores` (B,6,C,H,W); 0 where a channel has no known pixel."""
+    values, found = nearest_along_axes(known, mask)
+    some = mask.flatten(2).any(2)[:, :, None, None].expand(known.shape)
+    candidates = torch.stack([fill, *values, torch.full_like(fill, -1)], dim=1)
+    possible = torch.stack([torch.ones_like(some), *found, some], dim=1)
+    prior = scores.new_tensor([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])[:, None, None, None]
+    weights = (scores + prior).masked_fill(~possible, -torch.inf).softmax(dim=1)
+    return (weights * candidates).sum(dim=1)
 
 
 def _check(x_t: Tensor, known: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -70,11 +70,12 @@ class SynthesisNetwork(nn.Module):
 def unshift(x: Tensor, shift: Tensor) -> Tensor:
     """Turns maps (B,C,H,W) by `shift` (B,) of a turn towards smaller columns, bilinear; DUSty v2 in training."""
     width = x.shape[3]
-    theta = torch.eye(2, 3, dtype=x.dtype, device=x.device).repeat(len(x), 1, 1)
+    theta = torch.eye(2, 3, device=x.device).repeat(len(x), 1, 1)
     theta[:, 0, 2] = shift
-    doubled = torch.cat([x, x], dim=3)
-    grid = F.affine_grid(theta, list(doubled.shape), align_corners=False)
-    return sample_bilinear(doubled, grid)[..., :width]
+    doubled = torch.cat([x, x], dim=3).float()
+    with torch.autocast(x.device.type, enabled=False):  # half precision cannot tell neighbouring columns
+        grid = F.affine_grid(theta, list(doubled.shape), align_corners=False)
+        return sample_bilinear(doubled, grid)[..., :width]
 
 
 def _mapping_layer(in_channels: int, out_channels: int) -> nn.Sequential:
@@ -99,6 +100,7 @@ class Generator(nn.Module):
         style_channels: int = 512,
         base_channels: int = 32,
         max_channels: int = 512,
+        temperature: float = 1.0,  # of the ray-drop
     ):
         super().__init__()
         _check_multiple(resolution)
@@ -106,7 +108,7 @@ class Generator(nn.Module):
             PixelNorm(), _mapping_layer(latent_channels, style_channels), _mapping_layer(style_channels, style_channels)
         )
         self.synthesis_network = SynthesisNetwork(style_channels, base_channels, max_channels, resolution)
-        self.measurement_model = RayDrop()
+        self.measurement_model = RayDrop(temperature=temperature)
         self.register_buffer("w_avg", torch.zeros(1, style_channels))
 
     def forward(

@@ -63,6 +63,7 @@ class Generator(nn.Module):
         max_channels: int = 512,
         raydrop: bool = False,
         bounded: bool = False,  # tanh on the image: the IROS 2021 release
+        temperature: float = 1.0,  # of the ray-drop
     ):
         super().__init__()
         kernel = _coarsest(resolution)
@@ -73,7 +74,7 @@ class Generator(nn.Module):
             blocks.append(nn.Sequential(Pad(1, "reflect"), _double(before, after, False), FusedLeakyReLU(after)))
         heads = ("image", "raydrop_logit") if raydrop else ("image",)
         self.synthesis_network = nn.Sequential(*blocks, _Heads(widths[-1], heads, bounded))
-        self.measurement_model = RayDrop() if raydrop else None
+        self.measurement_model = RayDrop(temperature=temperature) if raydrop else None
         self.register_buffer("w_avg", torch.zeros(1, latent_channels))
 
     def forward(self, z: Tensor, uniform: Tensor | None = None, psi: float = 1.0) -> GeneratedImages:

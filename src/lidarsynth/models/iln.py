@@ -133,19 +133,19 @@ class ILN(nn.Module):
     iln_0d, iln_1d and iln_2d with 1,219,649, 1,244,673 and 1,269,697 parameters.
     """
 
-    def __init__(self, depth: int = 1, heads: int = 8, channels: int = 64):
+    def __init__(self, depth: int = 1, heads: int = 8, channels: int = 64, blocks: int = 16, dropout: float = 0.1):
         super().__init__()
         if channels % heads:
             raise ValueError(f"heads must divide {channels} channels, got {heads}")
-        self.encoder = Encoder(channels)
-        self.attention = NeighbourWeights(channels, depth, heads)
+        self.encoder = Encoder(channels, blocks)
+        self.attention = NeighbourWeights(channels, depth, heads, dropout)
 
     def forward(self, low: Tensor, queries: Tensor) -> Tensor:
         return self.decode(low, self.encode(low), queries)
 
     def encode(self, low: Tensor) -> Tensor:
-        """Features (B,C,H,W) of ranges (B,1,H,W)."""
-        return self.encoder(low)
+        """Features (B,C,H,W) of ranges (B,1,H,W), float32 under autocast too: places among them need it."""
+        return self.encoder(low).float()
 
     def decode(self, low: Tensor, features: Tensor, queries: Tensor) -> Tensor:
         """Ranges (B,Q) at queries (B,Q,2), from ranges (B,1,H,W) and their features."""
@@ -160,17 +160,17 @@ class LIIF(nn.Module):
     is not bounded. 3x3 unfolding of features and cell decoding, both off in the published configuration, are left out.
     """
 
-    def __init__(self, channels: int = 64, hidden: int = 256):
+    def __init__(self, channels: int = 64, hidden: int = 256, blocks: int = 16):
         super().__init__()
-        self.encoder = Encoder(channels)
+        self.encoder = Encoder(channels, blocks)
         self.imnet = Perceptron((channels + 2, hidden, hidden, hidden, hidden, 1))
 
     def forward(self, low: Tensor, queries: Tensor) -> Tensor:
         return self.decode(low, self.encode(low), queries)
 
     def encode(self, low: Tensor) -> Tensor:
-        """Features (B,C,H,W) of ranges (B,1,H,W)."""
-        return self.encoder(low)
+        """Features (B,C,H,W) of ranges (B,1,H,W), float32 under autocast too: places among them need it."""
+        return self.encoder(low).float()
 
     def decode(self, low: Tensor, features: Tensor, queries: Tensor) -> Tensor:
         """Ranges (B,Q) at queries (B,Q,2), from ranges (B,1,H,W) and their features."""

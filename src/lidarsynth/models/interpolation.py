@@ -4,7 +4,7 @@ Images are equirectangular: the width is circular, the height has ends. None of 
 """
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 METHODS = ("nearest", "bilinear", "bicubic")
@@ -44,6 +44,18 @@ def interpolate(known: Tensor, mask: Tensor, method: str = "bilinear") -> Tensor
     return _nearest(known, mask) if method == "nearest" else fill_in(known, mask)
 
 
+class Interpolation(nn.Module):
+    """`interpolate` by one method as a module: without parameters, there is nothing to learn."""
+
+    def __init__(self, method: str):
+        super().__init__()
+        _check_method(method)
+        self.method = method
+
+    def forward(self, known: Tensor, mask: Tensor) -> Tensor:
+        return interpolate(known, mask, self.method)
+
+
 def resize_rows(x: Tensor, height: int, method: str = "bilinear", alignment: str = "half_pixel") -> Tensor:
     """Enlarges (B,C,h,W) to (B,C,height,W), as the protocols in print do it.
 
@@ -76,6 +88,35 @@ def sample_queries(x: Tensor, queries: Tensor, method: str = "bilinear") -> Tens
     _check_method(method)
     grid = queries.flip(-1).expand(len(x), 1, -1, -1)
     return F.grid_sample(x, grid, mode=method, padding_mode="border", align_corners=False)[:, :, 0]
+
+
+@torch.no_grad()
+def nearest_along_axes(known: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest known pixel to the left, to the right, above and below each pixel, itself where it is known.
+
+    `known` and `mask` (B,C,H,W) as in `fill_in`. Returns values (4,B,C,H,W), 0 where there is none, and whether there
+    is one, bool of that shape. Left and right go around the ring. Raises ValueError if the shapes differ.
+    """
+    known, mask = _check(known, mask)
+    upright = [tensor.transpose(2, 3).contiguous() for tensor in (known, mask)]
+    left, right = _nearest_sides(known, mask, ring=True)
+    above, below = ((v.transpose(2, 3), f.transpose(2, 3)) for v, f in _nearest_sides(*upright, ring=False))
+    values, found = zip(left, right, above, below, strict=True)
+    return torch.stack(values), torch.stack(found)
+
+
+def _nearest_sides(known: Tensor, mask: Tensor, ring: bool) -> list[tuple[Tensor, Tensor]]:
+    """Values and whether there is one, of the nearest known pixel before and after along the last axis."""
+    size = known.shape[-1]
+    _, before, after = _sides(mask)
+    if ring:
+        before = torch.where(before < 0, before[..., -1:], before)
+        after = torch.where(after >= size, after[..., :1], after)
+    sides = []
+    for place in (before, after):
+        found = (place >= 0) & (place < size)
+        sides.append((known.gather(-1, place.clamp(0, size - 1).long()) * found, found))
+    return sides
 
 
 def _fill_cross(known: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

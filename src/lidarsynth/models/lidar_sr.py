@@ -5,7 +5,7 @@ R2DM's table. They have the same layers and differ in arithmetic, so that weight
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -202,7 +202,13 @@ def _he_normal(module: nn.Module) -> None:
 
 
 @torch.no_grad()
-def mc_dropout(network: LidarSR, low: Tensor, rng: torch.Generator, passes: int = 50) -> tuple[Tensor, Tensor]:
+def mc_dropout(
+    network: LidarSR,
+    low: Tensor,
+    rng: torch.Generator,
+    passes: int = 50,
+    on_pass: Callable[[], object] | None = None,  # called after each
+) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation (over passes, not unbiased), (B,1,H,W) each, of forward(low) under dropout.
 
     The network must be in evaluation mode, because batch normalisation uses its running statistics (LiDAR-SR III-D).
@@ -211,8 +217,13 @@ def mc_dropout(network: LidarSR, low: Tensor, rng: torch.Generator, passes: int 
     if network.training or passes < 1:
         mode = "training" if network.training else "evaluation"
         raise ValueError(f"expected a network in evaluation mode and at least 1 pass, got {mode} mode and {passes}")
-    outputs = torch.stack([network(low, network.draw_masks(low, rng)) for _ in range(passes)])
-    return outputs.mean(0), outputs.std(0, correction=0)
+    outputs = []
+    for _ in range(passes):
+        outputs.append(network(low, network.draw_masks(low, rng)))
+        if on_pass is not None:
+            on_pass()
+    found = torch.stack(outputs)
+    return found.mean(0), found.std(0, correction=0)
 
 
 def remove_uncertain(mean: Tensor, std: Tensor, threshold: float = 0.03) -> Tensor:

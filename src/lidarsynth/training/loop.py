@@ -97,6 +97,8 @@ def learning_rate(training: Training, step: int) -> float:
 DECAYS: dict[str, Callable[[float], float]] = {  # factor of the rate after a share of the steps behind the warm-up
     "cosine": lambda progress: 0.5 * (1 + math.cos(math.pi * progress)),  # R2DM's schedule
     "constant": lambda progress: 1.0,
+    "inverse": lambda progress: 1 / (1 + progress),  # Keras' decay of 1e-5 per step, over 100,000 steps (LiDAR-SR)
+    "halving": lambda progress: 0.5 ** min(4, int(5 * progress)),  # after each fifth of the steps (ILN)
 }
 
 
@@ -207,7 +209,7 @@ def _step(
 
 
 def _turn(
-    accelerator: Accelerator, turn: _Turn, passes: list[Any], rate: float, clip_norm: float
+    accelerator: Accelerator, turn: _Turn, passes: list[Any], rate: float, clip_norm: float | None
 ) -> tuple[dict[str, float], float]:
     """Clipped gradients of one phase for one step's global batch; the mean of each part of its loss, and their norm."""
     sums: dict[str, Tensor] = {}
@@ -224,7 +226,8 @@ def _turn(
     total = accelerator.reduce(torch.stack([*sums.values()]), reduction="sum")
     assert isinstance(total, Tensor)
     parameters = [p for group in turn.optimizer.param_groups for p in group["params"]]
-    norm = float(accelerator.clip_grad_norm_(parameters, clip_norm))  # type: ignore[arg-type]
+    limit = math.inf if clip_norm is None else clip_norm
+    norm = float(accelerator.clip_grad_norm_(parameters, limit))  # type: ignore[arg-type]
     parts = {name: (float(part[0]), float(part[1])) for name, part in zip(sums, total, strict=True)}
     mean = sum(value for value, _ in parts.values()) / sum(count for _, count in parts.values())
     return {"loss": mean, **{name: value / count for name, (value, count) in parts.items() if count}}, norm

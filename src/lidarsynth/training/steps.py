@@ -84,7 +84,7 @@ def completion_loss(
     """Mean absolute error (b,) of the pixels that are not `known` (b, 2, H, W), in code and, of range, in metres too.
 
     The absolute error has the median as its optimum, which is the same in metres and in any depth code; in code the
-    near pixels weigh most, in metres, here per 20 m, the far ones.
+    near pixels weigh most, in metres, here per 10 m, the far ones.
     """
     mask = known.to(x_0)
     _, alpha, sigma = denoiser.schedule.at(t, x_0)
@@ -92,7 +92,7 @@ def completion_loss(
     error = (x_0_hat - x_0).abs()
     sensor, codec = build_sensor(experiment), experiment.data.codec
     metres = (_metres(x_0_hat[:, :1], sensor, codec) - _metres(x_0[:, :1], sensor, codec)).abs()
-    return masked_mean(error + torch.cat([metres / 20, torch.zeros_like(metres)], dim=1), 1 - mask)
+    return masked_mean(error + torch.cat([metres / 10, torch.zeros_like(metres)], dim=1), 1 - mask)
 
 
 def _metres(code: Tensor, sensor: Sensor, codec: str) -> Tensor:

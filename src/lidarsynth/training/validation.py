@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -30,6 +31,8 @@ def judge_diffusion(experiment: Experiment, network: nn.Module, images: Sequence
 def fixed_losses(experiment: Experiment, network: nn.Module, x_0: Tensor, batch_size: int = 4) -> dict[str, float]:
     """Unweighted loss per noise level of x_0 (n, 2, H, W), by name; the noise is the same in every call.
 
+    The squared error of a score weighs sigma^2, as in its training.
+
     A network that is told the known pixels is also judged on completing three of four beams (mean absolute error of the
     code in [-1, 1]).
     """
@@ -46,10 +49,10 @@ def fixed_losses(experiment: Experiment, network: nn.Module, x_0: Tensor, batch_
 
 
 def _losses(experiment: Experiment, denoiser: Denoiser, x_0: Tensor, eps: Tensor) -> dict[str, Tensor]:
-    losses = {}
+    losses, gamma = {}, math.inf if denoiser.kind == "score" else None
     for time in TIMES:
         t = x_0.new_full((len(x_0),), time)
-        losses[f"t_{time}"] = denoiser.loss(x_0, t, eps, loss=experiment.diffusion.loss, gamma=None)
+        losses[f"t_{time}"] = denoiser.loss(x_0, t, eps, loss=experiment.diffusion.loss, gamma=gamma)
     if experiment.model.network == "conditional-unet":
         known = torch.zeros_like(x_0)
         known[:, :, ::EVERY] = 1

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
 from lidarsynth.data.synthetic import hdl64e
 from lidarsynth.data.synthetic.layout import build
+from lidarsynth.data.synthetic.materials import LABEL
 from lidarsynth.data.synthetic.raycast import Caster
 from lidarsynth.data.synthetic.sensor_model import Returns, sense
-from lidarsynth.data.synthetic.world import POSES, World, visible
+from lidarsynth.data.synthetic.world import POSES, THING, World, visible
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 
@@ -23,14 +25,24 @@ class SyntheticStreets:
     seed    any integer >= 0; streets of different seeds are unrelated
     length  number of scans; scan i does not depend on it
     sensor  beams, offsets, range limits, columns and mounting height
+    without words of SemanticKITTI classes, such as `car`: things of these are taken away, all else stays where it is
 
     Sixteen consecutive scans are sixteen places in one world; reading in order builds each world once.
-    Raises IndexError beyond the length, ImportError naming the extra when embreex is missing.
+    Raises IndexError beyond the length, ImportError naming the extra when embreex is missing, ValueError for others.
     """
 
-    def __init__(self, seed: int = 0, length: int = 1000, sensor: Sensor = SENSORS["hdl-64e-kitti"]):
+    def __init__(
+        self,
+        seed: int = 0,
+        length: int = 1000,
+        sensor: Sensor = SENSORS["hdl-64e-kitti"],
+        without: tuple[str, ...] = (),
+    ):
         if seed < 0 or length < 1:
             raise ValueError(f"expected seed >= 0 and length >= 1, got seed {seed} and length {length}")
+        if unknown := [word for word in without if word not in LABEL]:
+            raise ValueError(f"expected classes of {', '.join(LABEL)}, found {unknown[0]!r}")
+        self.without = without
         self.seed = seed
         self.length = length
         self.sensor = sensor
@@ -76,6 +88,7 @@ class SyntheticStreets:
     def _world(self, number: int) -> tuple[World, Caster]:
         if number not in self._worlds:
             world = visible(build(np.random.default_rng((self.seed, number))), self.sensor)
+            world = _emptied(world, [LABEL[word] for word in self.without])
             if len(self._worlds) >= 2:
                 self._worlds.pop(next(iter(self._worlds)))
             self._worlds[number] = (world, Caster(world.corners))
@@ -105,6 +118,13 @@ class SyntheticStreets:
             image[seen] = np.where(kept, values, 0)
             whole.append(image)
         return Returns(*whole), rays
+
+
+def _emptied(world: World, labels: list[int]) -> World:
+    """The world with the things of these labels shrunk to a point below it; triangles keep their numbers."""
+    gone = (world.kind == THING) & np.isin(world.label, labels)
+    below = np.array([0, 0, -1000], np.float32)
+    return replace(world, corners=np.where(gone[:, None, None], below, world.corners)) if gone.any() else world
 
 
 @lru_cache(maxsize=4)

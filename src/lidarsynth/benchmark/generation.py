@@ -1,0 +1,128 @@
+"""Generation: every method's set of new scans is compared with one set of measured ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidarsynth.benchmark.abilities import generation_evaluations, has_reflectance
+from lidarsynth.benchmark.config import Generation, GenerationMethod, protocols_of
+from lidarsynth.benchmark.contest import Contest
+from lidarsynth.benchmark.published import published
+from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
+from lidarsynth.benchmark.sources import located
+from lidarsynth.benchmark.store import Seconds, Store
+from lidarsynth.evaluation import evaluate
+from lidarsynth.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.lidar.depth import from_x_0
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.metrics.protocols import get_protocol
+from lidarsynth.metrics.statistics import definition
+from lidarsynth.scan_model import ScanModel
+
+Draw = Callable[[int, int], list[RangeImage]]  # seed of the first scan, how many -> scans
+DECIDING = ("noise", "steps", "sampler")  # keys of a method that decide its scans
+
+
+def drawer(method: GenerationMethod, model: ScanModel | None, sensor: Sensor) -> Draw:
+    """What makes new scans: a model with the method's settings, or noise as `sensor` would see it."""
+    if model is None:
+        return lambda seed, count: [noise(sensor, seed + i) for i in range(count)]
+    given: dict[str, Any] = {key: vars(method)[key] for key in ("steps", "sampler") if vars(method)[key] is not None}
+
+    def draw(seed: int, count: int) -> list[RangeImage]:
+        images = model.generate(count, seed=seed, batch_size=count, **given)
+        if has_reflectance(model):
+            return images
+        return [replace(image, reflectance=np.zeros_like(image.reflectance)) for image in images]
+
+    return draw
+
+
+def noise(sensor: Sensor, seed: int) -> RangeImage:
+    """x_1 ~ N(0, I), clamped to [-1, 1], as a scan: what sampling starts from, and the worst a table can show."""
+    generator = torch.Generator().manual_seed(seed)
+    return from_x_0(torch.randn(2, sensor.height, sensor.width, generator=generator), sensor)
+
+
+def generation_row(
+    contest: Contest, config: Generation, group: str, method: GenerationMethod, reference: ImageSet, sensor: Sensor
+) -> Row:
+    """Make the scans and judge them; of a method that cannot, a row with the reason."""
+    model, word = contest.model(method.model), method.samples or method.held_out
+    deciding = contest.settings(method, DECIDING) | {"seed": config.seed}
+    if word:
+        deciding = {"scans": word, "held out": method.held_out is not None}
+    if method.noise:
+        deciding |= {"sensor": sensor.to_dict()}
+    row = Row(method.name, group, deciding, floor=method.noise or method.held_out is not None)
+    store = contest.store(word or method.model or "noise", deciding)
+    count, evaluations = method.count or config.count, None
+    image = store.image
+    if word:
+        samples = located(word, contest.folder, config.sensor, contest.on_images)
+        made = image_set(samples)
+        own = sensor_of(made.item(0), sensor)
+        count, image = len(made), lambda i: made.image(i, own, "auto")
+    else:
+        try:
+            evaluations, _ = timed(lambda: generation_evaluations(model, method) if model else None)
+            _make(contest, method, drawer(method, model, sensor), store, count, config.seed)
+        except Declined as reason:
+            return replace(row, reason=str(reason))
+        samples = store.folder
+    kept = samples if word or store.count() == count else [store.image(i) for i in range(count)]
+    return replace(
+        row,
+        count=count,
+        reports={name: _judged(contest, config, name, kept, reference, store) for name in protocols_of(config)},
+        seconds=() if word or method.noise else store.seconds(count),
+        evaluations=evaluations,
+        published={name: published(name, method.published, reference.names, "") for name in protocols_of(config)},
+        image=image,
+    )
+
+
+def _make(contest: Contest, method: GenerationMethod, draw: Draw, store: Store, count: int, seed: int) -> None:
+    """Scans of any number depend on seed + number only, so that more of them go on where fewer ended."""
+
+    def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
+        return timed(lambda: draw(seed + numbers.start, len(numbers)))
+
+    batch = 1 if contest.device == "cpu" else contest.batch_size  # on a CPU larger ones are no faster
+    fill_store(store, dict.fromkeys(range(count), ""), make, batch, contest.progress(method.name, count))
+
+
+def _judged(
+    contest: Contest,
+    config: Generation,
+    name: str,
+    samples: Path | Sequence[RangeImage],
+    reference: ImageSet,
+    store: Store,
+) -> dict[str, Any]:
+    """A protocol's report; one that lacks a network is made again, since it may be there the next time."""
+    protocol = get_protocol(name)
+
+    def judge() -> dict[str, Any]:
+        try:
+            report = evaluate(samples, reference.source, name, config.sensor, config.seed,
+                              device=contest.device, on_images=contest.on_images)  # fmt: skip
+        except ValueError as error:
+            return {"reason": str(error)}
+        return report.to_dict()
+
+    if not isinstance(samples, Path):
+        return judge()
+
+    def final(report: dict[str, Any]) -> bool:
+        return "values" in report and all(report["values"][r.name]["value"] is not None for r in protocol.rows)
+
+    key = [definition(protocol), image_set(samples).stamp, reference.stamp, config.seed, config.sensor]
+    return store.report(key, judge, final)

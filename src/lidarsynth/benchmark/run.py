@@ -1,0 +1,152 @@
+"""The verb `benchmark`: a file says which methods meet on which scans; tables, numbers and pictures come out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from lidarsynth.benchmark.config import Generation, Upsampling, protocols_of, read_config, rows
+from lidarsynth.benchmark.contest import Contest, Load, open_contest
+from lidarsynth.benchmark.drawings import plotter, save_scores, side_by_side, with_classes, with_labels_of
+from lidarsynth.benchmark.generation import generation_row
+from lidarsynth.benchmark.published import PUBLISHED, why_not
+from lidarsynth.benchmark.record import record_of
+from lidarsynth.benchmark.rows import Row
+from lidarsynth.benchmark.sources import corrupted, located
+from lidarsynth.benchmark.store import write_text
+from lidarsynth.benchmark.tables import page
+from lidarsynth.benchmark.upsampling import Problem, upsampling_row
+from lidarsynth.gathering import OnImages
+from lidarsynth.image_sets import image_set, sensor_of
+from lidarsynth.lidar.render import save_png
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.metrics.pairs import classes_of
+from lidarsynth.metrics.protocols import R2DM_UPSAMPLING, get_protocol
+from lidarsynth.metrics.reconstruction import reconstruction_errors
+
+RESULTS, TABLE, FIGURE, SCORES = "results.json", "table.md", "figure.png", "scores.png"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the methods were found to be.
+
+    about     what was compared with what, for people
+    data      the same for programs: source, names, hash
+    pictures  caption -> one scan, by every method
+    note      whose classes give the points their colours
+    """
+
+    rows: Sequence[Row]
+    about: Mapping[str, str]
+    data: Mapping[str, Any]
+    pictures: Mapping[str, RangeImage]
+    note: str = ""
+
+
+def benchmark(
+    kind: str,
+    config: str | Path,
+    out: str | Path,
+    load: Load,
+    data: str | None = None,
+    classes: Path | None = None,
+    seed: int | None = None,
+    device: str = "cpu",
+    batch_size: int = 1,
+    on_images: OnImages = None,
+    command: str = "",
+) -> str:
+    """Run a benchmark's file: results.json, table.md and figure.png in `out`; returns the page of tables.
+
+    kind     upsampling | generation, where several numbers of steps also give scores.png
+    load     word of the file -> model, such as `lidarsynth.load`
+    data     replaces the file's data or reference, and `seed` its seed
+    classes  a RangeNet, for semantic scores and for the colours of points
+    command  to be told in the results
+
+    Scans stay in `out`, so that the same call goes on where it was stopped, and a new row is added to old ones. Raises
+    ValueError in one line; a method that cannot do what is asked for is a row without numbers instead.
+    """
+    settings, out = read_config(kind, config, data, seed), Path(out)
+    several = any(isinstance(method.steps, tuple) and len(method.steps) > 1 for method in settings.method)
+    draws_scores = kind == "generation" and several
+    if draws_scores:
+        plotter()  # its lack is told now, not after hours
+    contest = open_contest(settings, out, load, classes, device, batch_size, on_images)
+    out.mkdir(parents=True, exist_ok=True)
+    outcome = upsampling(contest, settings) if isinstance(settings, Upsampling) else generation(contest, settings)
+    names = protocols_of(settings)
+    text = page(settings.title, command, outcome.rows, names, outcome.about)
+    write_text(out / RESULTS, record_of(kind, settings, contest, outcome.rows, outcome.data, command))
+    save_png(out / FIGURE, side_by_side(outcome.pictures, settings.title, outcome.note))
+    if draws_scores:
+        save_scores(out / SCORES, outcome.rows, names, settings.title)
+    write_text(out / TABLE, text)
+    return text
+
+
+def upsampling(contest: Contest, config: Upsampling) -> Outcome:
+    """Every method fills the same scans. Raises ValueError for data that cannot be used."""
+    data = corrupted(config, contest.folder, contest.on_images)
+    problem = Problem(config, data, data.stamps(contest.progress("read", len(data))), data.shown(config.figure))
+    found = [upsampling_row(contest, problem, group, method) for group, method in rows(config.method)]
+    (_, known), sensor = data[problem.shown], data.sensor
+    about = {
+        "scans": f"{len(data)} of {config.data}, {sensor.name}, {sensor.height} x {sensor.width}",
+        "hidden": f"{config.corruption}, {1 - known.mean():.0%} of the pixels",
+        "seed": str(config.seed),
+    }
+    for name in protocols_of(config):
+        told = why_not(name, data.names, config.corruption)
+        about["published"] = told or f"in parentheses, {PUBLISHED[name].source}" if name in PUBLISHED else "none"
+    record = {"source": data.images.source, "names": list(data.names), "sensor": sensor.name, "scans": len(data),
+              "sha256": sha256("".join(problem.stamps.values()).encode()).hexdigest()}  # fmt: skip
+    return Outcome(found, about, record, *_filled_pictures(contest, problem, found))
+
+
+def _filled_pictures(contest: Contest, problem: Problem, found: Sequence[Row]) -> tuple[dict[str, RangeImage], str]:
+    number = problem.shown
+    truth, known = problem.data[number]
+    pictures = {f"input, {problem.config.corruption}": truth.keep(known)}
+    for row in found:
+        if row.image:
+            image = row.image(number)
+            error = reconstruction_errors(image, truth, ~known).range_mae
+            pictures[f"{row.name}: hidden range MAE {error:.2f} m"] = image
+    return _coloured(contest, pictures | {"truth": truth}, truth)
+
+
+def _coloured(
+    contest: Contest, pictures: dict[str, RangeImage], truth: RangeImage | None = None
+) -> tuple[dict[str, RangeImage], str]:
+    """With the classes that a RangeNet sees, else those of the truth where it has labels, else as they are."""
+    width = next(iter(pictures.values())).sensor.width
+    network = classes_of(contest.judges(R2DM_UPSAMPLING.name, width).networks)
+    if network is not None:
+        return {caption: with_classes(image, network) for caption, image in pictures.items()}, "classes by RangeNet"
+    if truth is not None and truth.label is not None:
+        labelled = {caption: with_labels_of(image, truth) for caption, image in pictures.items()}
+        return labelled, "the truth's class at the same pixel, grey where the truth has no return"
+    return pictures, ""
+
+
+def generation(contest: Contest, config: Generation) -> Outcome:
+    """Every method's scans meet the same reference. Raises ValueError for a reference that cannot be used."""
+    reference = image_set(located(config.reference, contest.folder, config.sensor, contest.on_images))
+    first = get_protocol(protocols_of(config)[0])
+    sensor = sensor_of(reference.item(0), get_sensor(config.sensor or first.sensor))
+    found = [generation_row(contest, config, group, method, reference, sensor) for group, method in rows(config.method)]
+    about = {
+        "reference": f"{len(reference)} of {config.reference}, {sensor.name}, {sensor.height} x {sensor.width}",
+        "seed": str(config.seed),
+    }
+    shown = min(config.figure, len(reference) - 1)
+    pictures = {"reference": reference.image(shown, sensor, "auto")}
+    pictures |= {r.name: r.image(min(config.figure, r.count - 1)) for r in found if r.image and r.count}
+    record = {"source": reference.source, "scans": len(reference), "sensor": sensor.name, "stamp": reference.stamp}
+    return Outcome(found, about, record, *_coloured(contest, pictures))

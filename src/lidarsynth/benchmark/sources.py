@@ -1,0 +1,101 @@
+"""Where a benchmark's images come from: a path, synthetic streets that are cast once, or the shipped scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+
+from lidarsynth.benchmark.config import Upsampling, protocols_of
+from lidarsynth.data.sources import SYNTHETIC, cache_synthetic
+from lidarsynth.gathering import OnImages
+from lidarsynth.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.lidar.projection import PROJECTIONS
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.metrics.protocols import get_protocol
+
+STREET = "street"  # the scan that comes with the package
+
+
+def located(word: str, folder: Path, sensor: str | None = None, on_images: OnImages = None) -> Path:
+    """The file, folder or cache of a word of a benchmark's file.
+
+    `synthetic:COUNT:SEED` is cast into a cache below `folder`, which goes on where it was stopped. Raises ValueError.
+    """
+    if word == STREET:
+        return Path(__file__).parents[1] / "shipped" / "street.npz"
+    if not word.startswith("synthetic:"):
+        return Path(word).expanduser()
+    numbers = word.split(":")[1:]
+    if len(numbers) != 2 or not all(n.isdecimal() for n in numbers) or not int(numbers[0]):
+        raise ValueError(f"expected synthetic:COUNT:SEED, such as synthetic:64:777, found {word!r}")
+    count, seed = map(int, numbers)
+    cache = folder / f"streets-{count}-{seed}{f'-{Path(sensor).stem}' if sensor else ''}"
+    for done, total in cache_synthetic(cache, count, sensor or SYNTHETIC, seed=seed):
+        if on_images:
+            on_images("streets", done, total)
+    return cache
+
+
+@dataclass(frozen=True)
+class Corrupted:
+    """Measured images of which a part is hidden: `len(data)`, `data[i] -> (truth, known (H, W) bool)`."""
+
+    images: ImageSet
+    sensor: Sensor
+    projection: str
+    recipe: str
+    seed: int
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: int) -> tuple[RangeImage, np.ndarray]:
+        truth = self.images.image(i, self.sensor, self.projection)
+        known = corrupt(truth, self.recipe, self.seed + i)
+        if known.all():
+            raise ValueError(f"expected a corruption that hides at least one pixel, found {self.recipe!r}")
+        return truth, known
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the images, `sequence/frame` where they are of a cache."""
+        return self.images.names[: self.count]
+
+    def stamps(self, on_image: Callable[[int], object] | None = None) -> dict[int, str]:
+        """What is told and what is to be found, scan by scan: 16 hex digits of the truth and the known pixels."""
+        found = {}
+        for i in range(len(self)):
+            truth, known = self[i]
+            content = [np.ascontiguousarray(v).tobytes() for v in (truth.range, truth.reflectance, truth.mask, known)]
+            found[i] = blake2b(b"".join(content), digest_size=8).hexdigest()
+            if on_image:
+                on_image(i + 1)
+        return found
+
+    def shown(self, number: int | None) -> int:
+        """The scan of the figure: the given one, or the first with labels of the first hundred, or the first."""
+        if number is not None:
+            return number
+        return next((i for i in range(min(len(self), 100)) if self[i][0].label is not None), 0)
+
+
+def corrupted(config: Upsampling, folder: Path, on_images: OnImages = None) -> Corrupted:
+    """The images of an upsampling benchmark. Raises ValueError."""
+    if config.projection not in PROJECTIONS:
+        raise ValueError(f"projection: expected one of {', '.join(PROJECTIONS)}, found {config.projection!r}")
+    images = image_set(located(config.data, folder, config.sensor, on_images))
+    sensor = get_sensor(config.sensor or get_protocol(protocols_of(config)[0]).sensor)
+    count = min(config.images or len(images), len(images))
+    if config.figure is not None and config.figure >= count:
+        raise ValueError(f"figure: expected the number of one of {count} images, 0 to {count - 1}, "
+                         f"found {config.figure}")  # fmt: skip
+    return Corrupted(
+        images, sensor_of(images.item(0), sensor), config.projection, config.corruption, config.seed, count
+    )

@@ -1,0 +1,120 @@
+"""Upsampling and completion: every method fills the same hidden pixels of the same scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lidarsynth.benchmark.abilities import completion_evaluations, has_reflectance
+from lidarsynth.benchmark.config import Upsampling, UpsamplingMethod, protocols_of
+from lidarsynth.benchmark.contest import Contest
+from lidarsynth.benchmark.published import published
+from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
+from lidarsynth.benchmark.sources import Corrupted
+from lidarsynth.benchmark.store import Seconds, Store
+from lidarsynth.interpolation_model import interpolated
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.metrics.pairs import Pairs, classes_of
+from lidarsynth.metrics.protocols import get_protocol
+from lidarsynth.metrics.reconstruction import reconstruction_errors
+from lidarsynth.metrics.statistics import definition
+from lidarsynth.scan_model import ScanModel
+
+Fill = Callable[[RangeImage, np.ndarray, int], RangeImage]  # image without the hidden pixels, known (H, W), seed
+ERRORS = ("range MAE", "reflectance MAE", "hidden range MAE", "hidden reflectance MAE")  # of each scan
+DECIDING = ("interpolation", "method", "steps", "resamples", "sampler")  # keys of a method that decide its scans
+
+
+def filler(method: UpsamplingMethod, model: ScanModel | None) -> Fill:
+    """What fills a scan: an interpolation, or a model with the method's settings."""
+    if model is None:
+        return lambda before, known, seed: interpolated(before, known, method.interpolation or "")
+    given: dict[str, Any] = {key: vars(method)[key] for key in DECIDING if vars(method)[key] is not None}
+
+    def fill(before: RangeImage, known: np.ndarray, seed: int) -> RangeImage:
+        filled = replace(model.complete(before, known, seed=seed, **given), sensor=before.sensor)
+        return filled if has_reflectance(model) else replace(filled, reflectance=np.zeros_like(filled.reflectance))
+
+    return fill
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What all methods are given.
+
+    stamps  of every scan, see `Corrupted.stamps`
+    shown   number of the scan in the figure, which slow methods fill too
+    """
+
+    config: Upsampling
+    data: Corrupted
+    stamps: dict[int, str]
+    shown: int
+
+
+def upsampling_row(contest: Contest, problem: Problem, group: str, method: UpsamplingMethod) -> Row:
+    """Fill the scans and judge them; of a method that cannot, a row with the reason."""
+    config, data, stamps = problem.config, problem.data, problem.stamps
+    model, count = contest.model(method.model), min(method.images or len(data), len(data))
+    deciding = contest.settings(method, DECIDING) | {"corruption": config.corruption, "seed": config.seed}
+    row = Row(method.name, group, deciding)
+    store = contest.store(method.model or method.interpolation or "", deciding)
+    fill = filler(method, model)
+
+    def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
+        truth, known = data[numbers.start]
+        before = truth.keep(known)
+        filled, seconds = timed(lambda: fill(before, known, config.seed + numbers.start))
+        return [filled], seconds
+
+    try:
+        evaluations, _ = timed(lambda: completion_evaluations(model, method) if model else 0)
+        needed = {i: stamp for i, stamp in stamps.items() if i < count or i == problem.shown}
+        fill_store(store, needed, make, on_done=contest.progress(method.name, len(needed)))
+    except Declined as reason:
+        return replace(row, reason=str(reason))
+    word = method.published or method.interpolation
+    judged = {name: _judged(contest, name, data, store, list(stamps.values())[:count]) for name in protocols_of(config)}
+    return replace(
+        row,
+        count=count,
+        reports={name: found["report"] for name, found in judged.items()},
+        errors=next(iter(judged.values()))["errors"],
+        seconds=store.seconds(count),
+        evaluations=evaluations,
+        remark=_remark(method.name, model, data),
+        published={name: published(name, word, data.names, config.corruption) for name in judged},
+        image=store.image,
+    )
+
+
+def _judged(contest: Contest, name: str, data: Corrupted, store: Store, stamps: Sequence[str]) -> dict[str, Any]:
+    """A protocol's report, and the errors of each scan."""
+    protocol, judges = get_protocol(name), contest.judges(name, data.sensor.width)
+
+    def judge() -> dict[str, Any]:
+        pairs, errors = Pairs(protocol, classes_of(judges.networks)), []
+        for i in range(len(stamps)):
+            truth, known = data[i]
+            pairs.update([store.image(i)], [truth])
+            hidden = reconstruction_errors(store.image(i), truth, ~known)
+            errors.append([pairs.errors[-1].range_mae, pairs.errors[-1].reflectance_mae,
+                           hidden.range_mae, hidden.reflectance_mae])  # fmt: skip
+            if contest.on_images:
+                contest.on_images("judge", i + 1, len(stamps))
+        report = pairs.report(judges.missing, judges.weights).to_dict()
+        columns = dict(zip(ERRORS, map(list, zip(*errors, strict=True)), strict=True))
+        return {"report": report, "errors": {k: v for k, v in columns.items() if pairs.lit or "reflectance" not in k}}
+
+    key = [definition(protocol), list(stamps), judges.weights]
+    return store.report(key, judge)
+
+
+def _remark(name: str, model: ScanModel | None, data: Corrupted) -> str:
+    """Images of another sensor are filled all the same, row by row."""
+    if model is None or model.sensor.elevations == data.sensor.elevations:
+        return ""
+    return f"{name} learned images of {model.sensor.name}, these are of {data.sensor.name}: other beams"

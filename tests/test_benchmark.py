@@ -1,0 +1,549 @@
+"""Benchmarks: tables from a file, going on after a stop, cells where nothing can be said, and how they refuse."""
+
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from networks import trained
+from PIL import Image
+
+import lidarsynth as ls
+from lidarsynth import build
+from lidarsynth.benchmark import drawings, run
+from lidarsynth.benchmark.config import read_config, rows
+from lidarsynth.benchmark.published import PUBLISHED, published, why_not
+from lidarsynth.benchmark.rows import Row
+from lidarsynth.benchmark.run import benchmark
+from lidarsynth.benchmark.store import Seconds
+from lidarsynth.benchmark.tables import Column, table
+from lidarsynth.cli import main
+from lidarsynth.data.dataset import CachedImages, write_cache
+from lidarsynth.interpolation_model import interpolated
+from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.metrics.protocols import R2DM_UPSAMPLING
+from lidarsynth.metrics.rangenet import RangeNet
+from lidarsynth.metrics.reconstruction import reconstruction_errors
+from lidarsynth.presets import preset
+
+REPO_ROOT = Path(__file__).resolve().parents[1]
+SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
+METHODS = '[[method]]\nname = "bilinear"\ninterpolation = "bilinear"\n'
+
+
+def street(seed: int, sensor: Sensor = SENSOR, labelled: bool = False) -> RangeImage:
+    """A road between walls at some distance, with ray-drop; class 9 below, 13 beside."""
+    rng = np.random.default_rng(seed)
+    rays = sensor.directions()
+    with np.errstate(divide="ignore"):
+        road = np.where(rays[..., 2] < 0, -1.7 / rays[..., 2], np.inf)
+        wall = rng.uniform(5, 12) / np.abs(rays[..., 1])
+    distance = np.minimum(road, wall)
+    mask = (distance < 60) & (distance > 2) & (rng.random(distance.shape) < 0.9)
+    reflectance = rng.random(distance.shape).astype(np.float32) * mask
+    label = np.where(road < wall, 9, 13) * mask if labelled else None
+    return RangeImage(np.where(mask, distance, 0).astype(np.float32), reflectance, mask, sensor, label)
+
+
+def stored(folder: Path, images: list[RangeImage], sequence: str = "") -> Path:
+    """A cache of the images."""
+    names = {"name": lambda i: ("", sequence, f"{i}.bin")} if sequence else {}
+    for _ in write_cache(folder, images.__getitem__, len(images), images[0].sensor, {"name": "streets"}, **names):
+        pass
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def figures() -> None:
+    """For tests that look at figure.png, which takes longer than all the rest."""
+
+
+@pytest.fixture(autouse=True)
+def no_figures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "figures" not in request.fixturenames:
+        monkeypatch.setattr(run, "side_by_side", lambda *_: np.zeros((1, 1, 3), np.uint8))
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return stored(tmp_path / "data", [street(i) for i in range(4)])
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model folder of the preset `tiny`, 16 x 64 pixels."""
+    experiment = preset("tiny")
+    return build.save(tmp_path_factory.mktemp("model"), experiment, trained(experiment))
+
+
+@dataclass
+class Counted:
+    """A model that counts what it is asked for, and stops the program at a call where it is told to."""
+
+    model: Any
+    network_word: str = ""
+    stop_at: int = -1
+    calls: list[int] = field(default_factory=list)  # seeds
+
+    @property
+    def network(self) -> torch.nn.Module:
+        return self.model.network
+
+    @property
+    def sensor(self) -> Sensor:
+        return self.model.sensor
+
+    @property
+    def experiment(self):
+        own = self.model.experiment
+        return replace(own, model=replace(own.model, network=self.network_word or own.model.network))
+
+    def _count(self, seed: int) -> None:
+        if len(self.calls) == self.stop_at:
+            raise KeyboardInterrupt
+        self.calls.append(seed)
+
+    def generate(self, n=1, steps=None, seed=0, sampler=None, batch_size=4):
+        self._count(seed)
+        return self.model.generate(n, steps, seed, sampler, batch_size)
+
+    def complete(self, scan, known, method="auto", steps=None, resamples=10, sampler=None, seed=0):
+        self._count(seed)
+        return self.model.complete(scan, known, method, steps, resamples, sampler, seed)
+
+    def evaluations(self, method="auto", steps=None, resamples=10):
+        return self.model.evaluations(method, steps, resamples)
+
+    def generation_steps(self, steps=None, sampler=None):
+        return self.model.generation_steps(steps, sampler)
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def results(out: Path) -> dict[str, dict[str, Any]]:
+    """Row's name -> what results.json says of it; the file has no NaN."""
+
+    def refuse(word: str) -> float:
+        raise AssertionError(f"{word} in results.json")
+
+    told = json.loads((out / "results.json").read_text(), parse_constant=refuse)
+    return {row["name"]: row for row in told["methods"]}
+
+
+def cells(text: str, heading: str = "") -> Iterator[list[str]]:
+    """The rows of the first table after a heading, the head first."""
+    for line in text.partition(heading)[2].splitlines():
+        if line.startswith("|") and not line.startswith("|---"):
+            yield [cell.strip() for cell in line.strip("|").split("|")]
+        elif line.startswith("##"):
+            return
+
+
+def no_model(word: str) -> Any:
+    raise AssertionError(f"nobody asked for {word}")
+
+
+def cached(folder: Path) -> list[RangeImage]:
+    images = CachedImages(folder)
+    return [images[i] for i in range(len(images))]
+
+
+def picture(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+# upsampling
+
+
+def test_interpolations_are_judged_as_by_hand(data: Path, tmp_path: Path, figures: None):
+    near = '[[method]]\nname = "near"\ninterpolation = "nearest"\n'
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{near}{METHODS}')
+    text = benchmark("upsampling", config, tmp_path / "out", no_model, command="the command")
+    found = results(tmp_path / "out")
+    for name, word in (("near", "nearest"), ("bilinear", "bilinear")):
+        for i, truth in enumerate(cached(data)):
+            known = corrupt(truth, "beams:4")
+            errors = reconstruction_errors(interpolated(truth.keep(known), known, word), truth, ~known)
+            assert found[name]["errors of each scan"]["hidden range MAE"][i] == pytest.approx(errors.range_mae)
+        value = found[name]["reports"]["r2dm-upsampling-2024"]["values"]["range MAE"]["value"]
+        assert value == pytest.approx(np.mean(found[name]["errors of each scan"]["range MAE"]))
+        assert found[name]["count"] == 4 and found[name]["evaluations"] == 0
+    head, *body = cells(text, "## r2dm-upsampling-2024 v1")
+    assert body[0][head.index("IoU, %")] == "N/A" and "- N/A, IoU, %, IoU weighted, %: no weights of rangenet" in text
+    column = [row[head.index("hidden range MAE, m")] for row in body]
+    assert sorted(column, key=lambda cell: float(cell.strip("*")))[0].startswith("**")
+    assert sum("*" in cell for cell in column) == 1
+    assert "the command" in text and text == (tmp_path / "out" / "table.md").read_text()
+    assert picture(tmp_path / "out" / "figure.png").shape[1] > 2000
+    told = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert told["data"]["scans"] == 4 and told["versions"]["torch"] and told["machine"]["cores"] > 0
+    assert not (tmp_path / "out" / "scores.png").exists()
+
+
+MODELS = """
+[[method]]
+name = "tiny"
+model = "tiny"
+steps = [1, 3]
+[[method]]
+name = "painted"
+model = "tiny"
+method = "repaint"
+steps = 2
+resamples = 2
+images = 2
+"""
+
+
+def test_models_give_a_row_per_number_of_steps_and_slow_ones_a_table_of_their_own(data: Path, tiny: Path, tmp_path):
+    config = written(tmp_path / "b.toml", f'data = "{data}"\nfigure = 3\n{METHODS}{MODELS}')
+    text = benchmark("upsampling", config, tmp_path / "out", lambda word: ls.load(tiny))
+    found = results(tmp_path / "out")
+    assert list(found) == ["bilinear", "tiny, 1 step", "tiny, 3 steps", "painted"]
+    assert [row["evaluations"] for row in found.values()] == [0, 1, 3, 3]
+    assert [row["count"] for row in found.values()] == [4, 4, 4, 2]
+    model, truths = ls.load(tiny), cached(data)
+    known = corrupt(truths[2], "beams:4")
+    filled = model.complete(truths[2].keep(known), known, steps=3, seed=2)
+    error = reconstruction_errors(filled, truths[2]).range_mae
+    assert found["tiny, 3 steps"]["errors of each scan"]["range MAE"][2] == pytest.approx(error)
+    assert len(found["painted"]["seconds per scan"]["wall"]["each"]) == 2, "scan 3 is for the figure only"
+    head, *body = cells(text, "## The first 2 scans only")
+    assert len(body) == 4 and "scans" not in head
+    bilinear = found["bilinear"]["errors of each scan"]["range MAE"]
+    assert float(body[0][1].strip("*")) == pytest.approx(np.mean(bilinear[:2]), abs=6e-4)
+    _, *body = cells(text, "## r2dm")
+    assert "**" not in "".join(body[3]), "two scans are not compared with four"
+
+
+def test_a_stopped_benchmark_goes_on_and_changed_settings_begin_anew(data: Path, tiny: Path, tmp_path: Path):
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n[[method]]\nname="m"\nmodel="x"\nsteps=1\n')
+    stopped, again = Counted(ls.load(tiny), stop_at=2), Counted(ls.load(tiny))
+    with pytest.raises(KeyboardInterrupt):
+        benchmark("upsampling", config, tmp_path / "out", lambda word: stopped)
+    assert stopped.calls == [0, 1] and not (tmp_path / "out" / "results.json").exists()
+    kept = {path: path.read_text() for path in (tmp_path / "out").rglob("00000[01].json")}
+    first = benchmark("upsampling", config, tmp_path / "out", lambda word: again)
+    assert again.calls == [2, 3]
+    assert kept == {path: path.read_text() for path in kept}, "what a scan took stays what it took"
+    seconds = results(tmp_path / "out")["m"]["seconds per scan"]["wall"]["each"]
+    assert seconds[:2] == [json.loads(text)["seconds"]["wall"] for _, text in sorted(kept.items())]
+    assert benchmark("upsampling", config, tmp_path / "out", lambda word: again) == first and len(again.calls) == 2
+    whole = tmp_path / "whole"
+    benchmark("upsampling", config, whole, lambda word: Counted(ls.load(tiny)))
+    assert results(whole)["m"]["errors of each scan"] == results(tmp_path / "out")["m"]["errors of each scan"]
+    broken = next((tmp_path / "out").rglob("000001.npz"))
+    broken.unlink()
+    benchmark("upsampling", config, tmp_path / "out", lambda word: again)
+    assert again.calls == [2, 3, 1]
+    benchmark("upsampling", config, tmp_path / "out", lambda word: again, seed=7)
+    assert again.calls[3:] == [7, 8, 9, 10]
+    stored(tmp_path / "other", [street(i) for i in (0, 9, 2, 3)])
+    benchmark("upsampling", config, tmp_path / "out", lambda word: again, data=str(tmp_path / "other"))
+    assert again.calls[7:] == [1], "only the scan that is another one is filled anew"
+
+
+def test_rows_that_cannot_be_are_told(data: Path, tiny: Path, tmp_path: Path):
+    small = stored(tmp_path / "small", [street(0, SENSOR.resized(width=32))])
+    config = written(tmp_path / "b.toml", f'data = "{small}"\n[[method]]\nname="tiny"\nmodel="tiny"\n{METHODS}')
+    text = benchmark("upsampling", config, tmp_path / "out", lambda word: ls.load(tiny))
+    assert "- N/A, tiny: expected an image of 16 x 64, found (16, 32)" in text
+    assert results(tmp_path / "out")["tiny"]["reports"] == {}
+    config = written(tmp_path / "c.toml", f'data = "{data}"\n[[method]]\nname="range only"\nmodel="tiny"\nsteps=1\n')
+    text = benchmark("upsampling", config, tmp_path / "out", lambda word: Counted(ls.load(tiny), "iln"))
+    found = results(tmp_path / "out")["range only"]
+    assert list(found["errors of each scan"]) == ["range MAE", "hidden range MAE"]
+    values = found["reports"]["r2dm-upsampling-2024"]["values"]
+    assert values["reflectance MAE"] == {"value": None, "unit": "", "reason": "the samples have no reflectance"}
+    assert values["range MAE"]["value"] > 0
+
+    class Broken(Counted):
+        def complete(self, scan, known, **options):
+            filled = self.model.complete(scan, known)
+            return replace(filled, range=filled.range * np.float32("nan"))
+
+    text = benchmark("upsampling", config, tmp_path / "nan", lambda word: Broken(ls.load(tiny)))
+    assert "- N/A, range only: scan 0: expected finite numbers, found NaN or infinity" in text
+
+
+def test_classes_judge_and_colour(tmp_path: Path, figures: None):
+    data = stored(tmp_path / "data", [street(i) for i in range(2)])
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
+    network = RangeNet(21).eval()
+    (tmp_path / "net").mkdir()
+    for name, part in (("backbone", network.backbone), ("segmentation_decoder", network.decoder)):
+        torch.save(part.state_dict(), tmp_path / "net" / name)
+    torch.save(network.head.state_dict(), tmp_path / "net" / "segmentation_head")
+    sensor = {"img_means": [12.12, 10.88, 0.23, -1.04, 0.21], "img_stds": [12.32, 11.47, 6.91, 0.86, 0.16]}
+    inputs = {"range": True, "xyz": True, "remission": True}
+    encoder = {"extra": {"layers": 21}, "OS": 32, "input_depth": inputs}
+    settings = {"backbone": encoder, "dataset": {"sensor": sensor}}
+    (tmp_path / "net" / "arch_cfg.yaml").write_text(json.dumps(settings))
+    benchmark("upsampling", config, tmp_path / "out", no_model, classes=tmp_path / "net")
+    report = results(tmp_path / "out")["bilinear"]["reports"]["r2dm-upsampling-2024"]
+    assert 0 <= report["values"]["IoU"]["value"] <= 100 and len(report["hashes"]["rangenet"]) == 64
+    image = drawings.with_classes(street(0), network)
+    assert image.label is not None and not image.label[~image.mask].any()
+
+
+def test_the_figure_shows_a_labelled_scan_in_the_colours_of_its_classes(tmp_path: Path, figures: None):
+    truth = street(5, labelled=True)
+    data = stored(tmp_path / "data", [street(4), truth])
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
+    benchmark("upsampling", config, tmp_path / "out", no_model)
+    colours = picture(tmp_path / "out" / "figure.png").reshape(-1, 3).astype(int)
+    assert ((colours[:, 0] > 200) & (colours[:, 1] < 20) & (colours[:, 2] > 200)).sum() > 200, "the road is magenta"
+    shifted = drawings.with_labels_of(replace(truth, mask=np.ones_like(truth.mask), label=None), truth)
+    assert (shifted.label[truth.mask] == truth.label[truth.mask]).all() and not shifted.label[~truth.mask].any()
+
+
+# published values
+
+
+def test_published_values_stand_only_beside_the_papers_data(tmp_path: Path):
+    drives = ("2013_05_28_drive_0000_sync/1", "2013_05_28_drive_0002_sync/2")
+    name = "r2dm-upsampling-2024"
+    assert published(name, "nearest", drives, "beams:4") == {"range MAE": 2.083, "reflectance MAE": 0.106, "IoU": 18.78}
+    assert "reflectance MAE" not in published(name, "ILN", drives, "beams:4")
+    assert published(name, "nearest", (*drives, "street/3"), "beams:4") == {}
+    assert published(name, "nearest", drives, "beams:2") == {} == published("bev-1", "nearest", drives, "beams:4")
+    assert "other scans" in why_not(name, ("street/3",), "beams:4") and "beams:2" in why_not(name, drives, "beams:2")
+    assert {row for values in PUBLISHED[name].methods.values() for row in values} <= {
+        row.name for row in R2DM_UPSAMPLING.rows
+    }
+    data = stored(tmp_path / "data", [street(0)], "2013_05_28_drive_0002_sync")
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
+    text = benchmark("upsampling", config, tmp_path / "out", no_model)
+    head, row = cells(text, "## r2dm")
+    assert row[head.index("range MAE, m")].endswith("(2.110)") and row[head.index("IoU, %")] == "N/A (18.17)"
+    assert "KITTI-360 test" in text
+
+
+def test_the_best_is_bold_bounds_and_fewer_scans_take_no_part():
+    def row(name: str, value: float | None, count: int = 4, floor: bool = False) -> Row:
+        report = {"values": {"x": {"value": value}}}
+        return Row(name, name, {}, count, {"p": report}, seconds=[Seconds(1, 2)], floor=floor)
+
+    found = [row("a", 3.0), row("b|c", 2.0), row("few", 1.0, 2), row("floor", 0.5, 9, True), row("none", None)]
+    lower = Column("x", lambda row: row.value("p", "x"), 1)
+    lines = table(found, [lower, replace(lower, rank=lambda value: -value)])
+    assert lines[2:] == [
+        "| a | 4 | 3.0 | **3.0** |",
+        "| b\\|c | 4 | **2.0** | 2.0 |",
+        "| few | 2 | 1.0 | 1.0 |",
+        "| floor | 9 | 0.5 | 0.5 |",
+        "| none | 4 | N/A | N/A |",
+    ]
+    assert "**" not in "".join(table(found[:1], [lower])), "alone nobody is best"
+
+
+# generation
+
+GENERATION = """
+reference = "{reference}"
+count = {count}
+[[method]]
+name = "others"
+held_out = "{other}"
+[[method]]
+name = "tiny"
+model = "tiny"
+steps = [1, 2]
+[[method]]
+name = "heun"
+model = "tiny"
+steps = 2
+sampler = "heun"
+[[method]]
+name = "noise"
+noise = true
+"""
+
+
+@pytest.fixture
+def generation(data: Path, tmp_path: Path) -> Path:
+    other = stored(tmp_path / "other", [street(i) for i in range(10, 14)])
+    return written(tmp_path / "g.toml", GENERATION.format(reference=data, other=other, count=3))
+
+
+def test_generation_ranks_the_floor_the_model_and_noise(generation: Path, tiny: Path, tmp_path: Path, data: Path):
+    model = Counted(ls.load(tiny))
+    text = benchmark("generation", generation, tmp_path / "out", lambda word: model)
+    found = results(tmp_path / "out")
+    assert list(found) == ["others", "tiny, 1 step", "tiny, 2 steps", "heun", "noise"]
+    assert [row["count"] for row in found.values()] == [4, 3, 3, 3, 3]
+    assert [row["evaluations"] for row in found.values()] == [None, 1, 2, 4, None]
+    assert [row["floor"] for row in found.values()] == [True, False, False, False, True]
+    jsd = {name: row["reports"]["bev-1"]["values"]["JSD x1e2"]["value"] for name, row in found.items()}
+    assert jsd["others"] < min(value for name, value in jsd.items() if name != "others")
+    expected = ls.evaluate(ls.load(tiny).generate(3, steps=2), data, "bev-1").values["JSD x1e2"]
+    assert jsd["tiny, 2 steps"] == pytest.approx(expected, rel=1e-4)
+    assert found["noise"]["seconds per scan"] is None and "bev-1 v1 judges 10,000 samples" in text
+    assert picture(tmp_path / "out" / "scores.png").size and picture(tmp_path / "out" / "figure.png").size
+    calls = len(model.calls)
+    assert calls == 9
+    more = written(tmp_path / "more.toml", generation.read_text().replace("count = 3", "count = 5"))
+    benchmark("generation", more, tmp_path / "out", lambda word: model)
+    assert model.calls[calls:] == [3, 4, 3, 4, 3, 4], "more scans are added to those that are there"
+    assert benchmark("generation", generation, tmp_path / "out", lambda word: model) == text, "and fewer are fewer"
+
+
+def test_samples_of_others_compete_and_other_sizes_are_told(generation: Path, data: Path, tiny: Path, tmp_path: Path):
+    odd = stored(tmp_path / "odd", [street(i, SENSOR.resized(width=48)) for i in range(4)])
+    config = generation.read_text().replace("count = 3", "count = 4")
+    config += f'[[method]]\nname = "odd"\nsamples = "{odd}"\n[[method]]\nname = "same"\nsamples = "{data}"\n'
+    text = benchmark("generation", written(generation, config), tmp_path / "out", lambda word: ls.load(tiny))
+    found = results(tmp_path / "out")
+    assert found["same"]["reports"]["bev-1"]["values"]["JSD x1e2"]["value"] == pytest.approx(0, abs=1e-4)
+    assert not found["same"]["floor"]
+    head, *body = cells(text, "## bev-1")
+    table_of = {row[0]: row for row in body}
+    assert table_of["same"][head.index("JSD x1e2")].startswith("**")
+    assert table_of["odd"][2:] == ["N/A"] * 6
+    assert "expected a reference of the samples' 16 x 48 pixels or a multiple, found 16 x 64" in text
+
+
+def test_range_only_models_have_no_feature_distance(generation: Path, tiny: Path, tmp_path: Path):
+    config = written(
+        generation, generation.read_text().replace("count = 3", 'count = 3\nprotocol = ["bev-1", "r2dm-2024"]')
+    )
+    text = benchmark("generation", config, tmp_path / "out", lambda word: Counted(ls.load(tiny), "dusty-v2"))
+    assert "## r2dm-2024 v1" in text and "## bev-1 v1" in text
+    for path in (tmp_path / "out" / "scans").glob("tiny-*/*.npz"):
+        assert not ls.read_image(path).reflectance.any()
+    values = results(tmp_path / "out")["heun"]["reports"]["r2dm-2024"]["values"]
+    assert values["FRD"]["value"] is None and values["FRD"]["reason"]
+
+
+def test_streets_are_cast_once(tmp_path: Path):
+    pytest.importorskip("embreex")
+    told: list[str] = []
+    config = written(tmp_path / "g.toml", '[[method]]\nname = "noise"\nnoise = true\n')
+    times = set()
+    for _ in range(2):
+        benchmark("generation", config, tmp_path / "out", no_model, data="synthetic:2:5",
+                  on_images=lambda what, done, total: told.append(what))  # fmt: skip
+        times.add((tmp_path / "out" / "streets-2-5" / "0000000.npy").stat().st_mtime_ns)
+    assert "streets" in told and len(times) == 1
+    with pytest.raises(
+        ValueError, match="expected synthetic:COUNT:SEED, such as synthetic:64:777, found 'synthetic:2'"
+    ):
+        benchmark("generation", config, tmp_path / "out", no_model, data="synthetic:2")
+
+
+# files and refusals
+
+GOOD = 'data = "street"\n' + METHODS
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("data = ", "expected a benchmark in TOML"),
+        ('data = "street"\n', r"expected at least one \[\[method\]\]"),
+        ('method = 3\ndata = "street"\n', r"expected at least one \[\[method\]\], found 3"),
+        (METHODS, "expected the field data"),
+        ('seeds = 1\n' + GOOD, r"expected the fields .*'seed'.*, found \['seeds'\]"),
+        ('seed = "1"\n' + GOOD, r"seed: expected int, found '1'"),
+        ("seed = -1\n" + GOOD, r"seed: expected whole numbers of at least 0, found -1"),
+        ("images = 0\n" + GOOD, r"images: expected whole numbers of at least 1, found 0"),
+        ("figure = 4\n" + GOOD, "figure: expected the number of one of 1 images, 0 to 0, found 4"),
+        ('corruption = "beams:99"\n' + GOOD, "beams expects whole numbers"),
+        ('corruption = "beams:1"\n' + GOOD, "expected a corruption that hides at least one pixel"),
+        ('protocol = "r2dm"\n' + GOOD, "expected a protocol of"),
+        ('protocol = "bev-1"\n' + GOOD, "protocol: expected one that compares image by image, found bev-1"),
+        ('sensor = "x"\n' + GOOD, "expected a sensor of"),
+        ('projection = "x"\n' + GOOD, "projection: expected one of auto, spherical, unfolding, found 'x'"),
+        (GOOD + "step = 4\n", r"method 1: expected the fields .*, found \['step'\]"),
+        (GOOD + "steps = 4\n", "method 'bilinear'.steps: expected it with a model, found it with interpolation"),
+        (GOOD + METHODS, "expected a name of its own for every row, found 'bilinear' twice"),
+        (GOOD.replace('"bilinear"\n', '"linear"\n'), "interpolation: expected one of nearest, bilinear"),
+        (GOOD + 'model = "x"\n', "expected one of interpolation, model, found interpolation and model"),
+        (GOOD + '[[method]]\nname = "x"\n', "method 'x': expected one of interpolation, model, found none"),
+        (GOOD + '[[method]]\ninterpolation = "nearest"\n', "method 2: expected the field name"),
+        (GOOD + '[[method]]\nname="x"\nmodel="x"\nsteps=[]\n', r"steps: expected whole .* 1, found \(\)"),
+        (GOOD + '[[method]]\nname="x"\nmodel="x"\nsteps=[1, 0]\n', r"steps: expected .* at least 1, found \(1, 0\)"),
+        (GOOD + '[[method]]\nname="x"\nmodel="x"\nsteps="4"\n', "method 2.steps: expected .*, found '4'"),
+        (GOOD.replace("street", "nowhere"), "nowhere: expected a cache, or samples"),
+    ],
+)  # fmt: skip
+def test_files_that_cannot_be_used_are_refused_in_one_line(text: str, message: str, tmp_path: Path):
+    config = written(tmp_path / "b.toml", text)
+    with pytest.raises(ValueError, match=message) as error:
+        benchmark("upsampling", config, tmp_path / "out", no_model)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out" / "table.md").exists()
+
+
+def test_a_generation_takes_one_source_per_row_and_only_its_own_keys(tmp_path: Path):
+    head = 'reference = "street"\n[[method]]\nname = "a"\n'
+    for body, message in (
+        ("noise = true\nsteps = 2\n", "steps: expected it with a model, found it with noise"),
+        ('samples = "x"\ncount = 2\n', "count: expected it with a model, found it with samples"),
+        ('noise = true\nheld_out = "x"\n', "expected one of model, samples, held_out, noise, found held_out and noise"),
+        ('interpolation = "nearest"\n', r"found \['interpolation'\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_config("generation", written(tmp_path / "g.toml", head + body))
+    with pytest.raises(ValueError, match="expected a readable file"):
+        read_config("generation", tmp_path / "nothing.toml")
+    replaced = read_config("generation", written(tmp_path / "g.toml", head + "noise = true\n"), data="x", seed=3)
+    assert (replaced.reference, replaced.seed) == ("x", 3)
+
+
+def test_a_model_that_is_none_is_told_before_the_first_scan(data: Path, tmp_path: Path):
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}[[method]]\nname="x"\nmodel="no-such-model"\n')
+    with pytest.raises(ValueError, match="no-such-model: expected shipped weights"):
+        benchmark("upsampling", config, tmp_path / "out", ls.load)
+    assert not (tmp_path / "out").exists()
+
+
+def test_curves_need_matplotlib_and_say_so_first(generation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"pip install 'lidarsynth\[viz\]'"):
+        benchmark("generation", generation, tmp_path / "out", no_model)
+
+
+def test_the_verb_writes_and_refuses(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    config = written(tmp_path / "b.toml", GOOD)
+    words = ["benchmark", "upsampling", str(config), "--data", str(data), "--out", str(tmp_path / "out"), "--seed", "3"]
+    main(words)
+    told = capsys.readouterr().out
+    command = json.loads((tmp_path / "out" / "results.json").read_text())["command"]
+    assert sorted(shlex.split(command)) == sorted(["lidarsynth", *words]) and command in told
+    assert f"wrote {tmp_path / 'out'}/ with results.json, table.md, figure.png" in told
+    for wrong in (["--seed", "-1"], ["--data", "nowhere"], ["--classes", "nowhere"], ["--batch-size", "0"]):
+        with pytest.raises(SystemExit) as end:
+            main(["benchmark", "upsampling", str(config), "--out", str(tmp_path / "no"), *wrong])
+        assert end.value.code == 2 and len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", ["upsampling", "generation"])
+def test_the_examples_run(kind: str, data: Path, tmp_path: Path):
+    text = (REPO_ROOT / "examples" / f"benchmark_{kind}.toml").read_text()
+    assert [method for _, method in rows(read_config(kind, written(tmp_path / "whole.toml", text)).method)]
+    smaller = {r"steps = 32\b": "steps = 1", r"steps = \[[0-9, ]*\]": "steps = [1, 2]", r"count = \d+": "count = 2",
+               r'held_out = ".*"': f'held_out = "{data}"'}  # fmt: skip
+    for pattern, small in smaller.items():
+        text = re.sub(pattern, small, text)
+    shown = {"upsampling": None, "generation": "street"}[kind]  # as they are, but for the streets, which take an extra
+    table_of = benchmark(kind, written(tmp_path / "b.toml", text), tmp_path / "out", ls.load, data=shown)
+    names = [row[0] for row in cells(table_of, "## ")]
+    assert "default, 1 step" in names and len(names) == {"upsampling": 7, "generation": 5}[kind]

@@ -1,0 +1,340 @@
+"""What a GanModel does, and how official checkpoints of GANs become one."""
+
+import json
+import math
+import sys
+import types
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+import lidarsynth
+from lidarsynth.build import build_network, build_sensor, save
+from lidarsynth.cli import main
+from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.gan_model import GanModel
+from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.lidar.depth import decode, encode
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.loading import assemble
+from lidarsynth.metrics.evaluate import results_of
+from lidarsynth.metrics.pairs import Pairs
+from lidarsynth.metrics.protocols import R2DM, R2DM_UPSAMPLING
+from lidarsynth.metrics.statistics import Statistics
+from lidarsynth.presets import preset
+from lidarsynth.report import describe
+from lidarsynth.weights import load_parts, read_official
+
+WORDS = ("vanilla-gan", "dusty-v1", "dusty-v2")
+TOLERANCE = {"atol": 2e-5, "rtol": 1e-4}
+
+
+def tiny(word: str, **changes) -> Experiment:
+    return with_fields(preset("tiny-gan"), {"model.network": word, **changes})
+
+
+def model_of(experiment: Experiment) -> GanModel:
+    """Its images are about 3 to 10 m, with drop-outs where the network has them."""
+    torch.manual_seed(0)
+    model = assemble(experiment, build_network(experiment))
+    assert isinstance(model, GanModel)
+    with torch.no_grad():
+        for name, parameter in model.network.named_parameters():
+            if name.endswith(("image.bias", "image.1.module.bias")):
+                parameter.fill_(-0.4)
+    return model
+
+
+@pytest.fixture(scope="module", params=WORDS)
+def model(request: pytest.FixtureRequest) -> GanModel:
+    return model_of(tiny(request.param))
+
+
+def assert_same(one: RangeImage, two: RangeImage) -> None:
+    """Up to the rounding of other batch sizes."""
+    assert (one.mask != two.mask).mean() < 0.002
+    both = one.mask & two.mask
+    np.testing.assert_allclose(one.range[both], two.range[both], rtol=1e-3)
+
+
+# ---------------------------------------------------------------- generation
+
+
+def test_a_scan_depends_on_seed_plus_index_only(model: GanModel):
+    calls: list[int] = []
+    images = model.generate(5, seed=3, batch_size=2, on_step=lambda: calls.append(1))
+    assert len(images) == 5 and len(calls) == 3 * model.generation_steps()
+    for i in (0, 4):
+        assert_same(model.generate(1, seed=3 + i)[0], images[i])
+        assert_same(next(model.stream(i + 1, seed=3, first=i)), images[i])
+    assert not np.allclose(images[0].range, images[1].range, atol=0.1)
+    assert all(image.mask.mean() > 0.05 and not image.reflectance.any() for image in images)
+    assert not model.experiment.data.reflectance
+
+
+def test_rays_drop_by_one_noise_map_for_all_scans():
+    model = model_of(tiny("dusty-v1"))
+    uniform = torch.rand(1, 1, 32, 64, generator=torch.Generator().manual_seed(0))
+    for seed in (0, 7):
+        z = torch.randn(8, generator=torch.Generator().manual_seed(seed))[None]
+        with torch.no_grad():
+            out = model.network(z, torch.full((1, 1, 1, 1), 0.5))
+        assert out.raydrop_logit is not None
+        kept = (out.raydrop_logit + torch.log(uniform) - torch.log1p(-uniform) > 0)[0, 0].numpy()
+        image = model.generate(1, seed=seed)[0]
+        assert 0.2 < kept.mean() < 0.8 and not image.mask[~kept].any()
+        depth = decode((out.image_orig[0, 0].clamp(-1, 1) + 1) / 2, model.sensor, "inverse").numpy()
+        np.testing.assert_allclose(image.range, depth * kept, rtol=1e-5)
+
+
+def test_what_a_gan_cannot_do_is_said(model: GanModel):
+    with pytest.raises(ValueError, match="expected no steps, since a GAN takes one, found 32"):
+        model.generate(1, steps=32)
+    with pytest.raises(ValueError, match="expected no sampler, since a GAN has none, found 'ddpm'"):
+        model.generate(1, sampler="ddpm")
+    with pytest.raises(ValueError, match="expected n and batch_size of at least 1, found 0"):
+        model.generate(0)
+    image = model.generate(1)[0]
+    with pytest.raises(ValueError, match="expected a method of auto, inversion, found 'repaint'"):
+        model.complete(image, method="repaint")
+    with pytest.raises(ValueError, match="expected no sampler"):
+        model.complete(image, sampler="ddim")
+    with pytest.raises(ValueError, match="expected at least one known pixel with a return, found none"):
+        model.complete(image, np.zeros(image.shape, bool), steps=1)
+    with pytest.raises(ValueError, match=r"data.codec: expected inverse or inverse-minmax for .*, found 'log'"):
+        build_network(with_fields(model.experiment, {"data.codec": "log"}))
+    assert len(model.generate(1, steps=1)) == 1, "one step is what it takes"
+
+
+# ---------------------------------------------------------------- completion
+
+
+def test_inversion_finds_its_own_image_again(model: GanModel):
+    """Every second beam of a scan that the generator can make: the hidden ones come near."""
+    torch.manual_seed(1)
+    truth = model.generate(1, seed=11)[0]
+    known = corrupt(truth, "beams:2", 0)
+    before = truth.keep(known)
+    calls: list[int] = []
+    filled = model.complete(before, known, steps=60, on_step=lambda: calls.append(1))
+    assert len(calls) == 60 == model.evaluations(steps=60) and model.evaluations() == 500
+    np.testing.assert_array_equal(filled.range[known], truth.range[known])
+    np.testing.assert_array_equal(filled.mask[known], truth.mask[known])
+    assert not filled.reflectance.any()
+    start = model.complete(before, known, steps=1)
+    hidden = ~known & truth.mask & filled.mask & start.mask
+    assert hidden.any()
+    errors = [np.abs(1 / image.range[hidden] - 1 / truth.range[hidden]).mean() for image in (filled, start)]
+    assert errors[0] < 0.8 * errors[1]
+    again = model.complete(before, known, steps=60)
+    np.testing.assert_array_equal(again.range, filled.range)
+
+
+def test_a_sparse_scan_becomes_an_image_of_the_model(model: GanModel):
+    sensor = get_sensor("vlp-16").resized(width=64)
+    wall = np.full((16, 64), 8.0, np.float32)
+    scan = RangeImage(wall, 0 * wall, wall > 0, sensor).to_scan()
+    dense = model.upsample(scan, "vlp-16", steps=2)
+    assert dense.shape == (32, 64) and dense.mask.sum() > 200
+
+
+def test_rows_that_need_reflectance_are_not_computed(model: GanModel):
+    images, sensor = model.generate(3), model.sensor
+    real = [RangeImage(i.range, 0.5 * i.mask.astype(np.float32), i.mask, i.sensor) for i in images]
+    sides = [Statistics(R2DM, sensor, "samples"), Statistics(R2DM, sensor, "real")]
+    for statistics, scans in zip(sides, (images, real), strict=True):
+        statistics.update(scans, [True] * 3, [True] * 3)
+        for kind in ("rangenet", "pointnet"):
+            statistics.add_features(kind, np.random.default_rng(0).random((3, 4)), [True] * 3)
+    results = {result.name: result for result in results_of(*sides)}
+    assert str(results["FRD"]) == "N/A" and "have no reflectance" in results["FRD"].reason
+    assert results["FPD"].value is not None and results["JSD x1e2"].value is not None
+    pairs = Pairs(R2DM_UPSAMPLING)
+    pairs.update([model.complete(real[0], steps=1)], [real[0]])
+    assert not pairs.lit, "also where known pixels had a reflectance"
+
+
+def test_it_saves_loads_and_is_described(model: GanModel, tmp_path: Path, capsys: pytest.CaptureFixture):
+    save(tmp_path / "m", model.experiment, model.network)
+    again = lidarsynth.load(tmp_path / "m")
+    assert isinstance(again, GanModel) and again.experiment == model.experiment
+    np.testing.assert_array_equal(again.generate(1)[0].range, model.generate(1)[0].range)
+    main(["generate", "-n", "2", "--out", str(tmp_path / "out"), "--model", str(tmp_path / "m"), "--format", "npz"])
+    assert (tmp_path / "out" / "000001.png").exists()
+    scan = str(tmp_path / "out" / "000000.npz")
+    target = str(tmp_path / "full.npz")
+    words = ["complete", scan, "--out", target, "--corrupt", "beams:2", "--method", "inversion", "--steps", "3"]
+    main([*words, "--model", str(tmp_path / "m"), "--no-picture"])
+    said = capsys.readouterr().out
+    assert "lidarsynth" in said and Path(target).exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "generator", "discriminator"),
+    [("vanilla-gan", 36_308_929, 2_821_057), ("dusty-v1", 36_309_954, 2_821_057), ("dusty-v2", 4_367_594, 38_445_569)],
+)
+def test_info_prints_the_published_counts(word: str, generator: int, discriminator: int):
+    said = describe(word)
+    assert f"{generator:,}\n" in said and f"{discriminator:,} parameters, in training only" in said
+    assert "stem" not in said and "schedule" not in said and "range only" in said
+
+
+def test_min_max_inverse_depth_ends_at_both_limits():
+    sensor = get_sensor("hdl-64e-kitti")
+    distance = torch.tensor([1.4500001, 2 / (1 / 1.45 + 1 / 80), 79.9999, 80.0], dtype=torch.float64)
+    assert encode(distance, sensor, "inverse-minmax").tolist() == pytest.approx([1, 0.5, 0, 0], abs=1e-6)
+    assert decode(torch.zeros(1), sensor, "inverse-minmax").item() == 0
+
+
+# ---------------------------------------------------------------- official checkpoints
+
+
+def parts(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
+def released(tensors: dict[str, Tensor], angle: Tensor | None = None) -> dict:
+    """A checkpoint as the official programs save it, from a fixture; G differs from G_ema."""
+    average = parts(tensors, "G_ema.")
+    raw = {key: value + 1 if key.endswith("weight") else value for key, value in average.items()}
+    angle = {} if angle is None else {"angle": angle}
+    return {"step": 781_250, "G": raw, "D": parts(tensors, "D."), "G_ema": average, "optim_G": {}, **angle}
+
+
+def angles(height: int, width: int) -> Tensor:
+    elevation = torch.linspace(0.05, -0.4, height)
+    azimuth = math.pi * (1 - 2 * (torch.arange(width) + 0.5) / width)
+    return torch.stack(torch.meshgrid(elevation, azimuth, indexing="ij"))[None]
+
+
+@pytest.mark.parametrize("word", WORDS)
+@torch.no_grad()
+def test_official_weights_say_what_the_reference_says(fixture_tensors, tmp_path: Path, word: str):
+    expected = fixture_tensors({"vanilla-gan": "gan_vanilla_small", "dusty-v1": "gan_dusty_v1_small",
+                                "dusty-v2": "gan_dusty_v2_small"}[word])  # fmt: skip
+    angle = expected.get("angle", angles(*expected["eval.image"].shape[2:]))
+    torch.save(released(expected, angle), tmp_path / "official.pth")
+    experiment, network = read_official(tmp_path / "official.pth")
+    out = network(expected["z"], expected.get("uniform"))
+    assert_close(out.image, expected["eval.image"], **TOLERANCE)
+    assert not network.training and experiment.model.network == word
+    assert "step 781250" in experiment.card.history[0] and "NC-SA" in experiment.card.licence
+    found = torch.from_numpy(build_sensor(experiment).ray_angles())
+    assert_close(found[0], angle[0, 0], atol=1e-6, rtol=0)
+    assert float(torch.sin(found[1] - angle[0, 1]).abs().max()) < 2 * math.pi / angle.shape[3], "within a pixel"
+    raw = load_parts(tmp_path / "official.pth", ema=False)[1](expected["z"], expected.get("uniform")).image
+    assert float((raw - out.image).abs().max()) > 1e-2
+    assert describe(str(tmp_path / "official.pth")).startswith("official\n")
+    save(tmp_path / "ours", experiment, network)
+    again = load_parts(tmp_path / "ours")[1](expected["z"], expected.get("uniform"))
+    assert torch.equal(again.image, out.image), "angles are saved too"
+
+
+@pytest.mark.parametrize(("name", "word"), [("gan_iros21_vanilla", "vanilla-gan"), ("gan_iros21_dusty1", "dusty-v1")])
+@torch.no_grad()
+def test_the_first_release_is_read_too(fixture_tensors, tmp_path: Path, name: str, word: str):
+    expected = fixture_tensors(name)
+    torch.save(released(expected), tmp_path / "iros.pth")
+    experiment, network = read_official(tmp_path / "iros.pth")
+    out = network(expected["z"], torch.full((1, 1, 1, 1), 0.5))
+    assert_close(out.image_orig, expected.get("eval.depth_orig", expected["eval.depth"]), **TOLERANCE)
+    sensor = build_sensor(experiment)
+    assert (experiment.model.network, experiment.data.codec) == (word, "inverse-minmax")
+    assert (sensor.min_range, sensor.max_range, sensor.height, sensor.width) == (0.9, 120.0, 64, 128)
+    model = assemble(experiment, network)
+    image = model.generate(1)[0]
+    assert image.range.max() < (62 if word == "vanilla-gan" else 120), "codes up to 0.008 are no returns"
+    truth = image.keep(corrupt(image, "points:0.5", 0))
+    assert model.complete(truth, steps=2).mask.sum() >= truth.mask.sum()
+
+
+@pytest.mark.parametrize(("official", "word"), [("vanilla", "vanilla-gan"), ("dusty_v2", "dusty-v2")])
+def test_the_published_sizes_are_read(shared: Path, tmp_path: Path, official: str, word: str):
+    table = json.loads((shared / "facts" / "gans_state_dict_shapes.json").read_text())
+    entries = table[f"wacv23/{official}.G"].items()
+    state = {key: torch.zeros(()).expand(entry["shape"]) for key, entry in entries}  # a file of few bytes
+    checkpoint = {"step": 1, "angle": angles(64, 512), "G": state, "D": {}, "G_ema": state, "A": {}}
+    torch.save(checkpoint, tmp_path / "full.pth")
+    experiment, _ = read_official(tmp_path / "full.pth")
+    ours = preset(word)
+    assert (experiment.model, experiment.adversarial) == (ours.model, ours.adversarial)
+    kept = [f.name for f in fields(ours.data) if f.name != "sensor"]
+    assert [getattr(experiment.data, name) for name in kept] == [getattr(ours.data, name) for name in kept]
+
+
+@pytest.fixture
+def omegaconf(monkeypatch: pytest.MonkeyPatch):
+    """The classes of OmegaConf as its pickles name them, with a constructor that must not run again."""
+    kinds = {}
+    monkeypatch.setitem(sys.modules, "omegaconf", types.ModuleType("omegaconf"))
+    for name in ("dictconfig.DictConfig", "nodes.AnyNode", "base.Metadata", "base.ContainerMetadata"):
+        home, _, word = name.partition(".")
+        module = types.ModuleType(f"omegaconf.{home}")
+        kinds[word] = type(word, (), {"__module__": f"omegaconf.{home}"})
+        module = sys.modules.get(module.__name__, module)
+        setattr(module, word, kinds[word])
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    return kinds
+
+
+def test_a_pickled_configuration_is_read_without_its_package(fixture_tensors, tmp_path: Path, monkeypatch, omegaconf):
+    from collections import defaultdict
+    from typing import Any
+
+    tensors = fixture_tensors("gan_vanilla_small")
+    config, node = omegaconf["DictConfig"](), omegaconf["AnyNode"]()
+    node.__dict__ |= {"_val": 64, "_parent": config}
+    metadata = omegaconf["ContainerMetadata"]()
+    metadata.__dict__ |= {"ref_type": Any, "object_type": dict, "resolver_cache": defaultdict(dict), "key": None}
+    config.__dict__ |= {"_metadata": metadata, "_content": {"ch_base": node}}
+    height, width = tensors["eval.image"].shape[2:]
+    torch.save({"cfg": config, **released(tensors, angles(height, width))}, tmp_path / "official.pth")
+    for name in [name for name in sys.modules if name.startswith("omegaconf")]:
+        monkeypatch.delitem(sys.modules, name)
+    assert read_official(tmp_path / "official.pth")[0].model.network == "vanilla-gan"
+    assert not [name for name in sys.modules if name.startswith("omegaconf")]
+
+
+class Foreign:
+    """Something that no file may bring."""
+
+
+def changed(checkpoint: dict, key: str, value: Tensor | None) -> dict:
+    """The checkpoint with one tensor of G_ema replaced or, for None, gone."""
+    state = {k: v for k, v in checkpoint["G_ema"].items() if k != key}
+    return {**checkpoint, "G_ema": state if value is None else {**state, key: value}}
+
+
+def test_other_files_are_named(fixture_tensors, tmp_path: Path):
+    tensors = fixture_tensors("gan_dusty_v1_small")
+    height, width = tensors["eval.image"].shape[2:]
+    good = released(tensors, angles(height, width))
+    first, second = "synthesis_network.0.1.module.weight", "synthesis_network.1.1.module.weight"
+    cases = {
+        "no angle": ({**good, "angle": None}, r"expected angle \(1, 2, H, W\) beside G, found NoneType"),
+        "size": ({**good, "angle": angles(height, 2 * width)}, r"of the size of angle \(\d+, \d+\), found"),
+        "upside down": ({**good, "angle": -good["angle"]}, "elevations that fall from row to row"),
+        "width": (changed(good, second, torch.zeros(2, 2, 4, 4)), rf"G_ema: expected generator.{second} .* found"),
+        "truncated": (changed(good, second, None), rf"1 missing \['generator.{second}'\]"),
+        "headless": (changed(good, first, None), f"expected a generator with {first} of 4 dimensions, found"),
+        "no tensors": ({**good, "G_ema": [1]}, "expected G_ema with tensors by name, found list"),
+        "dusty-ii": (released(fixture_tensors("gan_iros21_dusty2")), r"\(DUSty-I\), found 2 \(DUSty-II\)"),
+        "foreign": ({**good, "cfg": Foreign()}, "found a damaged or unsafe file .*Foreign"),
+    }
+    for name, (checkpoint, message) in cases.items():
+        path = tmp_path / f"{name}.pth"
+        torch.save(checkpoint, path)
+        with pytest.raises(ValueError, match=message) as caught:
+            read_official(path)
+        assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+    torch.save(good, tmp_path / "good.pth")
+    content = (tmp_path / "good.pth").read_bytes()
+    (tmp_path / "cut.pth").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"cut.pth: expected .*dusty-v2.*, found a truncated file"):
+        read_official(tmp_path / "cut.pth")
