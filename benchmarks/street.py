@@ -1,9 +1,10 @@
 """The protocol street-1: its floor, whether worse scans get worse scores, and how well its network knows classes.
 
 python benchmarks/street.py                                          floor and sensitivity, 256 against 256 scans
-python benchmarks/street.py --counts 64 128 256 512 1024             the floor at these counts too
-python benchmarks/street.py --classes FOLDER                         IoU of each class on a folder of labelled scans,
-                                                                     KITTI .bin with .label beside, and .npz images
+python benchmarks/street.py --counts 64 128 256 512 1024             the floor at these counts
+python benchmarks/street.py --classes synthetic                      IoU of each class on 171 held-out streets
+python benchmarks/street.py --classes FOLDER                         or on a folder of KITTI .bin with .label beside,
+                                                                     and .npz images with xyz and label
 Scans are of a seed that the network has not seen; one of each world, so that they are independent of each other.
 """
 
@@ -13,7 +14,7 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -52,7 +53,8 @@ def blurred(sigma: float) -> Corrupt:
     from scipy.ndimage import gaussian_filter
 
     def smooth(values: np.ndarray) -> np.ndarray:
-        return gaussian_filter(values.astype(np.float64), sigma, mode=("nearest", "wrap"))
+        modes: Any = ("nearest", "wrap")  # one for each axis, which scipy's stubs do not know
+        return gaussian_filter(values.astype(np.float64), sigma, mode=modes)
 
     def corrupt(image: RangeImage, rng: np.random.Generator) -> RangeImage:
         share = np.maximum(smooth(image.mask), 1e-9)
@@ -123,7 +125,7 @@ CORRUPTIONS: dict[str, dict[str, Corrupt]] = {
     "points without return": {f"{s:.0%}": points_lost(s) for s in (0.02, 0.1, 0.4)},
     "range noise": {f"{m:g} m": noisy(m) for m in (0.05, 0.2, 1.0)},
     "reflectance faded": {f"{s:.0%}": faded(s) for s in (0.1, 0.3, 1.0)},
-    "noise image": {"": noise_image},
+    "noise images": {"": noise_image},
 }
 
 
@@ -158,8 +160,8 @@ def table(title: str, rows: Iterable[tuple[str, list[Result]]]) -> Iterator[str]
 def floor(judge: Judge, counts: Sequence[int]) -> Iterator[tuple[str, list[Result]]]:
     """Real against real: two sets of other worlds, of so many scans each."""
     for count in counts:
-        sets = [judge.gather(streets(first, count), role) for first, role in ((HELD_OUT, "samples"), (0, "real"))]
-        yield f"{count} against {count}", judge.scores(*sets)
+        samples, real = judge.gather(streets(HELD_OUT, count)), judge.gather(streets(0, count), "real")
+        yield f"{count} against {count}", judge.scores(samples, real)
 
 
 def sensitivity(judge: Judge, count: int) -> Iterator[tuple[str, list[Result]]]:
@@ -209,11 +211,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=256, help="how many against how many")
     parser.add_argument("--counts", type=int, nargs="+", default=[], help="draw the floor at these counts instead")
-    parser.add_argument("--classes", type=Path, nargs="+", help="folders of labelled scans")
+    parser.add_argument("--classes", type=Path, help="`synthetic`, or a folder of labelled scans")
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.classes:
-        lines = class_table([image for folder in args.classes for image in labelled(folder)])
+        every_sixth = (image for first in range(HELD_OUT, 2 * HELD_OUT, 6) for image in streets(first, 1))
+        lines = class_table(list(every_sixth) if str(args.classes) == "synthetic" else labelled(args.classes))
     else:
         protocol = get_protocol(WORD)
         judge = Judge(protocol, load_networks(protocol, SENSOR.width))

@@ -547,3 +547,13 @@ def test_the_examples_run(kind: str, data: Path, tmp_path: Path):
     table_of = benchmark(kind, written(tmp_path / "b.toml", text), tmp_path / "out", ls.load, data=shown)
     names = [row[0] for row in cells(table_of, "## ")]
     assert "default, 1 step" in names and len(names) == {"upsampling": 7, "generation": 5}[kind]
+
+
+def test_the_commands_of_the_results_name_files_that_are_there():
+    text = (REPO_ROOT / "docs" / "results.md").read_text()
+    commands = re.findall(r"^lidarsynth benchmark (\w+) (\S+) ", text, re.MULTILINE)
+    assert {kind for kind, _ in commands} == {"upsampling", "generation"}
+    for kind, path in commands:
+        assert read_config(kind, REPO_ROOT / path).method
+    for path in re.findall(r"\]\((images/\S+)\)", text):
+        assert (REPO_ROOT / "docs" / path).is_file()

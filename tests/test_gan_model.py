@@ -144,6 +144,20 @@ def test_a_sparse_scan_becomes_an_image_of_the_model(model: GanModel):
     assert dense.shape == (32, 64) and dense.mask.sum() > 200
 
 
+def test_dusty_v2_renders_the_rays_of_any_sensor():
+    model = model_of(tiny("dusty-v2"))
+    same = model.into(model.sensor)
+    np.testing.assert_array_equal(same.generate(1)[0].range, model.generate(1)[0].range)
+    other = model.into(get_sensor("hdl-32e").resized(width=128))
+    image = other.generate(1)[0]
+    assert image.shape == (32, 128) and image.mask.any() and image.sensor.name == "hdl-32e"
+    assert model.generate(1)[0].shape == (32, 64), "the model itself stays"
+    with pytest.raises(ValueError, match="divisible by 16, at least 32, found 16 x 1024"):
+        model.into("vlp-16")
+    with pytest.raises(ValueError, match="only dusty-v2 renders any rays, found hdl-32e"):
+        model_of(tiny("dusty-v1")).into("hdl-32e")
+
+
 def test_rows_that_need_reflectance_are_not_computed(model: GanModel):
     images, sensor = model.generate(3), model.sensor
     real = [RangeImage(i.range, 0.5 * i.mask.astype(np.float32), i.mask, i.sensor) for i in images]

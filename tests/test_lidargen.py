@@ -398,7 +398,7 @@ def test_the_network_is_also_a_noise_predictor():
     experiment = with_fields(
         preset("r2dm-refinenet"),
         {"model.base_channels": 8, "data.height": 16, "data.width": 64, "data.sensor": "hdl-64e-kitti",
-         "training.steps": 30, "training.batch_size": 4, "training.warmup": 1, "training.learning_rate": 3e-3},
+         "training.steps": 16, "training.batch_size": 4, "training.warmup": 1, "training.learning_rate": 5e-3},
     )  # fmt: skip
     torch.manual_seed(0)
     state = start(experiment, build_network(experiment))

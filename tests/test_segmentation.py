@@ -187,9 +187,9 @@ def test_images_without_labels_are_refused(tmp_path: Path):
     bare = replace(scene(0), label=None)
     with pytest.raises(ValueError, match="expected images with labels"):
         augment(small(), bare, sample_rng(0, 0, 0))
-    list(write_cache(tmp_path / "bare", lambda i: replace(scene(i), label=None), 3, SENSOR, {"name": "bare"}))
-    list(write_cache(tmp_path / "zero", lambda i: replace(scene(i), label=np.zeros((16, 64), int)), 3, SENSOR, {"name": "zero"}))  # fmt: skip
-    for name, message in (("bare", "images with labels"), ("zero", "labelled pixels, found none")):
+    nowhere = np.zeros((16, 64), int)
+    for name, label, message in (("bare", None, "with labels"), ("zero", nowhere, "labelled pixels, found none")):
+        list(write_cache(tmp_path / name, lambda i: replace(scene(i), label=label), 3, SENSOR, {"name": name}))  # noqa: B023
         with pytest.raises(ValueError, match=message):
             class_shares(CachedImages(tmp_path / name))
 
@@ -237,7 +237,7 @@ def test_weights_continue_and_others_are_refused(tmp_path: Path):
     with pytest.raises(ValueError, match=r"weights: expected backbone.conv1.weight \(4, 5, 3, 3\), found \(2, 5"):
         transfer(network(wide), wide, source, small(), "weights")
     other = nn.Linear(2, 2)
-    with pytest.raises(ValueError, match="weights: expected the .* tensors of the experiment's network"):
+    with pytest.raises(ValueError, match=r"weights: expected the .* tensors of the experiment's network"):
         transfer(target, small(), other, preset("tiny"), "weights")
 
 

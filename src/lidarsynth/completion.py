@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.recognise import recognise
+from lidarsynth.gan_model import GanModel
 from lidarsynth.interpolation_model import InterpolationModel, interpolated
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import project, row_of_points
@@ -111,7 +112,7 @@ def upsample_scan(
 
 def into_sensor(model: ScanModel, sensor: str) -> ScanModel:
     """The model with images of another sensor. Raises ValueError for a network that knows the rays of its own only."""
-    if isinstance(model, UpsamplingModel | InterpolationModel):
+    if isinstance(model, UpsamplingModel | InterpolationModel | GanModel):
         return model.into(sensor)
     raise ValueError(f"{model.experiment.name}: expected a model of any sensor, such as iln, lidar-sr or bilinear, for "
                      f"--to {sensor}, found one of {model.sensor.name} only")  # fmt: skip

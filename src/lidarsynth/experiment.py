@@ -120,7 +120,7 @@ class Training:
     learning_rate: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.99)
     warmup: int = 10_000  # steps of linear warm-up
-    decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant
+    decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant | inverse | halving
     clip_norm: float | None = 1.0  # None = gradients as they are
     ema_decay: float = 0.995
     ema_every: int = 10  # steps

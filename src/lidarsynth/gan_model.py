@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from lidarsynth.diffusion.samplers import generators
-from lidarsynth.experiment import Adversarial, Experiment
+from lidarsynth.experiment import Adversarial, Experiment, with_fields
 from lidarsynth.hub import push
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.models.inverse_depth import to_inverse_depth
 from lidarsynth.models.inversion import invert, unit_rms
 from lidarsynth.models.scan_generator import ScanGenerator
@@ -41,6 +41,23 @@ class GanModel:
         """The same model with its network on another device."""
         self.network.to(device)
         return self
+
+    def into(self, sensor: Sensor | str) -> GanModel:
+        """The same weights with images of another sensor, for DUSty v2, which renders any ray angles.
+
+        Raises ValueError for the other two, and for sizes that are no multiples of 16, at least 32.
+        """
+        sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
+        if self.network.angles is None:
+            raise ValueError(f"{self.experiment.name}: expected images of {self.sensor.name}, since only dusty-v2 "
+                             f"renders any rays, found {sensor.name}")  # fmt: skip
+        if sensor.height % 16 or sensor.width % 16 or min(sensor.height, sensor.width) < 32:
+            raise ValueError(f"{self.experiment.name}: expected beams and columns divisible by 16, at least 32, "
+                             f"found {sensor.height} x {sensor.width}")  # fmt: skip
+        angles = torch.from_numpy(sensor.ray_angles())[None].to(self._device)
+        fields = {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width}
+        network = ScanGenerator(self.network.generator, angles).eval()
+        return GanModel(network, sensor, with_fields(self.experiment, fields))
 
     def generate(
         self,

@@ -187,7 +187,7 @@ def kitti() -> Experiment:
 
 
 def rangenet_53() -> Experiment:
-    """RangeNet-53 as published (Milioto et al. 2019). 50,377,364 parameters; for labelled data such as SemanticKITTI."""
+    """RangeNet-53 as published (Milioto et al. 2019). 50,377,364 parameters; for labelled scans, as SemanticKITTI's."""
     return Experiment(
         "rangenet-53",
         model=Model(network="rangenet", base_channels=32, dropout=0.01),
@@ -207,9 +207,7 @@ def rangenet_street() -> Experiment:
         "rangenet-street",
         data=Data(sensor="hdl-64e-kitti", projection="auto", roll=True, mirror=True),
         model=Model(network="rangenet", base_channels=8),
-        training=Training(
-            steps=3_500, batch_size=4, learning_rate=3e-3, warmup=200, ema_decay=0.98, ema_start=500
-        ),
+        training=Training(steps=3_500, batch_size=4, learning_rate=3e-3, warmup=200, ema_decay=0.98, ema_start=500),
         segmentation=Segmentation(layers=21, columns=512, drop=0.1),
     )
 

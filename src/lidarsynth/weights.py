@@ -138,6 +138,7 @@ def cache_folder() -> Path:
 def _unknown(source: str) -> str:
     expected = f"expected shipped weights ({', '.join(shipped()) or 'none here'}), a release ({', '.join(RELEASES)})"
     found = "a preset, which has no trained weights" if source in PRESETS else "no file or folder of that name"
+    expected += f", an interpolation ({', '.join(WITHOUT_WEIGHTS)})"
     return f"{source}: {expected}, a model folder, an official .pth file or owner/name of a hub, found {found}"
 
 

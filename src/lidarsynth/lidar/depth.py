@@ -1,4 +1,4 @@
-"""Depth codecs: metres <-> `log`, `inverse`, `metric`, `log-63m` or `inverse-minmax` in [0, 1], and RangeImage <-> x_0 in [-1, 1]."""
+"""Depth codecs: metres <-> a word of CODECS in [0, 1], and RangeImage <-> x_0 in [-1, 1]."""
 
 from __future__ import annotations
 

@@ -263,8 +263,35 @@ BEV_1 = EvaluationProtocol(
     real=10_000,
 )
 
+_SPREAD = Row("FRD", "frechet", FRECHET, "rangenet")
+STREET_1 = EvaluationProtocol(
+    "street-1",
+    1,
+    "lidarsynth: features of a RangeNet that learned synthetic streets and comes with the package; no download",
+    (_SPREAD, Row("FRD squared MMD x1e3", "kernel", KERNEL, "rangenet", 1e3), *_BEV_ROWS, *_BEAMS),
+    (
+        Network(
+            "rangenet",
+            ((1024, "street-1"),),
+            "ln(0.01 + standard deviation over all pixels) of each channel at W / 8: encoder stage 3, decoder stage 4",
+            128,
+            layers=21,
+        ),
+    ),
+    Bev(),
+    sensor="hdl-64e-kitti",
+    projection="auto",
+    near=0.0,
+    far=float("inf"),
+    gated=(),
+    samples=None,
+    samples_bev=None,
+    real_bev=None,
+    notes=("all images of both sides count; compare scores of the same counts only",),
+)
+
 PROTOCOLS: dict[str, EvaluationProtocol] = {
-    p.name: p for p in (R2DM, LIDARGEN, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, BEV_1)
+    p.name: p for p in (R2DM, LIDARGEN, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, BEV_1, STREET_1)
 }
 
 

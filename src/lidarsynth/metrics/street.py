@@ -1,6 +1,7 @@
-"""Features of the protocol street-1: maps of our own small RangeNet, pooled so that few scans tell their covariance.
+"""Features of the protocol street-1: how much the maps of our own small RangeNet vary within a scan.
 
-A protocol's numbers hold for one definition of its features: what is here is frozen with street-1's version.
+A protocol's numbers hold for one definition of its features: what is here is frozen with street-1's version. Layer and
+pooling were chosen on synthetic streets by what blur, swapped rows and missing cars do to the score (docs/street-1.md).
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from torch import Tensor, nn
 
 from lidarsynth.metrics.rangenet import RangeNet
 
-BANDS = 8  # of beams, from the top
-FEATURES = 128
+LEAST = 0.01  # added to each deviation, so that a map without any has a logarithm
 
 
 class StreetFeatures(nn.Module):
-    """Mean and standard deviation of each channel of a RangeNet's decoder output, in eight bands of beams.
+    """Logarithms of the standard deviations of a RangeNet's maps at an eighth of the width: encoder, then decoder.
 
-    Turning a scan about the vertical hardly changes them, moving what it shows up or down does.
+    Of a network of width 8 these are 64 + 64 numbers. A logarithm tells relative changes, so no channel weighs more
+    than another because its numbers are larger.
     """
 
     def __init__(self, network: RangeNet):
@@ -26,13 +27,15 @@ class StreetFeatures(nn.Module):
 
     @torch.no_grad()
     def forward(self, image: Tensor, mask: Tensor) -> Tensor:
-        """(B, 128) float32; image (B, 5, H, W) and mask as in `RangeNet.network_input`, H a multiple of 8.
+        """(B, 16 width) float32; image (B, 5, H, W) and mask as in `RangeNet.network_input`.
 
-        Raises ValueError for another height, or a network in training mode.
+        Raises ValueError for a network in training mode.
         """
-        if self.network.training or image.shape[2] % BANDS:
-            raise ValueError(f"expected a network in evaluation mode and rows that are a multiple of {BANDS}, found "
-                             f"training {self.network.training} and {image.shape[2]} rows")  # fmt: skip
-        maps = self.network.features(self.network.network_input(image, mask))
-        bands = maps.float().reshape(*maps.shape[:2], BANDS, -1)
-        return torch.cat([bands.mean(-1), bands.std(-1)], 1).flatten(1)
+        if self.network.training:
+            raise ValueError("expected the network in evaluation mode, found it in training mode")
+        x = self.network.network_input(image, mask)
+        deepest, skips = self.network.backbone(x.contiguous(memory_format=torch.channels_last))
+        decoder, encoded = self.network.decoder, skips[3]
+        decoded = decoder.dec4(decoder.dec5(deepest) + skips[4]) + encoded
+        deviations = torch.cat([maps.float().std((2, 3)) for maps in (encoded, decoded)], 1)
+        return torch.log(deviations + LEAST)

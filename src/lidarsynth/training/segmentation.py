@@ -124,7 +124,7 @@ def class_shares(images: Images) -> np.ndarray:
 
 
 def class_weights(shares: np.ndarray) -> Tensor:
-    """(classes,) float32: 1 / ln(1.02 + share) (Paszke et al. 2016), scaled so that the mean labelled pixel weighs 1."""
+    """(classes,) float32: 1 / ln(1.02 + share) (Paszke et al. 2016), so that labelled pixels weigh 1 on average."""
     weights = 1 / np.log(1.02 + shares)
     return torch.from_numpy(weights / (weights * shares).sum()).float()
 
