@@ -80,9 +80,9 @@ def test_the_walk_through_walks(folder: Path, monkeypatch: pytest.MonkeyPatch, c
 
 
 def test_what_the_document_says_of_rows_and_columns_is_so():
-    """A multiple of 16 rows and 32 columns builds, of 8 and 16 does not."""
-    beams = {"name": "own", "elevations": [float(-i) for i in range(80)]}
-    for height, width, fits in ((16, 32, True), (80, 96, True), (40, 64, False), (16, 48, False)):
+    """A multiple of 32 rows and 8 columns builds, of 16 and 4 does not."""
+    beams = {"name": "own", "elevations": [-i / 4 for i in range(192)]}
+    for height, width, fits in ((32, 64, True), (64, 104, True), (48, 64, False), (32, 100, False)):
         fields = {"data.sensor": beams, "data.height": height, "data.width": width, "model.base_channels": 8}
         experiment = with_fields(preset("default"), fields)
         if fits:

@@ -239,7 +239,7 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_scans():
 
 
 def test_training_lowers_the_loss_on_fixed_noise():
-    changes = {"training.steps": 40, "training.learning_rate": 3e-3, "data.roll": False, "data.mirror": False}
+    changes = {"training.steps": 60, "training.learning_rate": 3e-3, "data.roll": False, "data.mirror": False}
     experiment, images = with_fields(TINY, changes), Noise(1)
     run = start(experiment, network(experiment))
     before = fixed_losses(experiment, run.network.eval(), images.x_0([0]))
