@@ -98,7 +98,7 @@ def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
     for k in range(rng.integers(area.crossings[0], area.crossings[1] + 1)):
         place = places[k] + rng.uniform(-14, 14)
         x, y, yaw = roads[0].at(np.asarray(place), np.asarray(0.0))
-        one_sided = rng.choice([(-90, 90), (-90, 0), (0, 90)])
+        one_sided = rng.choice(np.array([(-90, 90), (-90, 0), (0, 90)]))
         side = Road(float(x), float(y), float(yaw) + np.pi / 2 + rng.normal(0, 0.12), rng.uniform(2.2, max(3.0, lane)),
                     walk * rng.uniform(0.5, 1), start=float(one_sided[0]), stop=float(one_sided[1]))  # fmt: skip
         roads.append(side)
