@@ -129,6 +129,21 @@ def test_coordinate_augmentation_undoes_its_own_turn():
     assert_close(unshift(x, torch.tensor([0.25, 0.5])), torch.stack([x[0].roll(-2, 2), x[1].roll(-4, 2)]))
 
 
+@pytest.mark.parametrize("training", [False, True])
+def test_features_shared_by_the_batch_give_what_every_sample_s_own_would(training):
+    shift, z, uniform = torch.tensor([0.0, 0.3, 0.77]), torch.randn(3, 8), torch.rand(3, 1, 32, 64)
+    angles, results, variances = regular_angles(32, 64), [], []
+    for given in (angles, angles.expand(3, -1, -1, -1)):
+        torch.manual_seed(0)
+        net = small_generator().train(training)
+        results.append(net(z, given, uniform, shift=shift).image_orig)
+        variances.append(net.synthesis_network.layers[1].conv1.ema_var)
+    assert results[0].std() > 0.01
+    assert_close(results[0], results[1], atol=1e-4, rtol=1e-4)
+    assert_close(variances[0], variances[1])
+    assert (variances[0] != 1) == training
+
+
 def test_any_resolution_is_rendered_and_bad_sizes_are_named():
     net = small_generator()
     out = net(torch.randn(2, 8), regular_angles(48, 80), torch.rand(2, 1, 48, 80))

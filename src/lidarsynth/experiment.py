@@ -127,6 +127,7 @@ class Training:
     ema_start: int = 10_000  # steps of plain copying
     ema_half_life: int = 10_000  # images; of GANs, in the place of the three above
     generation_share: float = 1.0  # share of a batch trained without known pixels; 1 for unconditional networks
+    upsampling_share: float = 0.0  # of the others, the share that knows every fourth beam and begins at pure noise
     seed: int = 0
 
 

@@ -178,7 +178,9 @@ def kitti() -> Experiment:
         start,
         name="kitti",
         data=replace(start.data, roll=True, mirror=True),
-        training=replace(start.training, steps=12_000, warmup=100, ema_decay=0.99, generation_share=0.25),
+        training=replace(
+            start.training, steps=5_000, warmup=100, ema_start=100, generation_share=0.25, upsampling_share=0.6
+        ),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",
             data="from `default`, on 105 real HDL-64E scans of KITTI (about 75 different views)",

@@ -46,15 +46,11 @@ class SynthesisNetwork(nn.Module):
         self.num_styles = 2 * len(self.layers)
 
     def forward(self, w: Tensor, angles: Tensor, shift: Tensor | None = None) -> dict[str, Tensor]:
-        if shift is not None:
-            angles = torch.stack(
-                [angles[:, 0].expand(len(w), -1, -1), angles[:, 1] + 2 * math.pi * shift[:, None, None]], 1
-            )
         h, maps = None, {}
         for i, (block, level) in enumerate(zip(self.layers, self.pyramid(angles), strict=True)):
             # a head shares its style with the first convolution of the next block
             own = w[:, max(2 * i - 1, 0) : 2 * i + 2].unbind(1)
-            h, maps = block(h, maps, level, own)
+            h, maps = block(h, maps, level, own, shift)
         if shift is not None:
             maps = {name: unshift(value, shift) for name, value in maps.items()}
         return {name: _ACTIVATIONS[name](value * _OUTPUT_SCALE) for name, value in maps.items()}

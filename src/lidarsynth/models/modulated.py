@@ -1,7 +1,8 @@
 """Modulated layers on Fourier features of the ray angles: the blocks of DUSty v2 (facts/gans.md section 5)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -40,12 +41,25 @@ class RandomFourierFeatures(nn.Module):
         arguments = elevation * angles[:, :1] + azimuth * angles[:, 1:] + self.phase.float()[:, None, None]
         return torch.cat([arguments.sin(), arguments.cos()], dim=1)
 
+    def turned(self, weight: Tensor, shift: Tensor) -> Tensor:
+        """Weights (B,out,2*count) that do with the features of some angles what `weight` does `shift` (B,) turns on.
+
+        sin(a + d) and cos(a + d) are sums of sin a and cos a, so all samples can share the features of one angle map.
+        """
+        delta = 2 * math.pi * shift[:, None, None] * self.freqs.float()[:, 1, 0, 0]
+        sine, cosine = delta.sin(), delta.cos()
+        of_sine, of_cosine = weight.chunk(2, dim=2)
+        return torch.cat([of_sine * cosine - of_cosine * sine, of_sine * sine + of_cosine * cosine], dim=2)
+
 
 class ModulatedConv1x1(nn.Module):
     """1x1 convolution whose input channels are scaled by a style: (B,in,H,W), (B,D) -> (B,out,H,W).
 
     StyleGAN3's order: normalise weight and style, modulate by 1 + style, demodulate, divide by the running root mean
     square `ema_var` of the input, which a forward pass in training mode updates first.
+
+    Features that all samples share, channels behind those of x, come as `shared` (1,C,H,W), with `turn` to change their
+    weights (B,out,C): one product for the whole batch, and no copy for each sample.
     """
 
     ema_var: Tensor
@@ -60,11 +74,28 @@ class ModulatedConv1x1(nn.Module):
         self.mod = EqualLR(nn.Linear(style_channels, in_channels))
         self.register_buffer("ema_var", torch.tensor(1.0))
 
-    def forward(self, x: Tensor, style: Tensor) -> Tensor:
+    def forward(
+        self,
+        x: Tensor | None,
+        style: Tensor,
+        shared: Tensor | None = None,
+        turn: Callable[[Tensor], Tensor] | None = None,
+    ) -> Tensor:
+        parts = [part for part in (x, shared) if part is not None]
+        channels = self.weight.shape[2]
         if self.training:
             with torch.no_grad():
-                self.ema_var.lerp_(x.float().square().mean(), 1 - EMA_VAR_DECAY)
-        y = (self.modulated(style).to(x.dtype) @ x.flatten(2)).unflatten(2, x.shape[2:])
+                squares = sum(part.float().square().mean() * (part.shape[1] / channels) for part in parts)
+                self.ema_var.lerp_(torch.as_tensor(squares), 1 - EMA_VAR_DECAY)
+        weight = self.modulated(style)
+        own = channels if shared is None else channels - shared.shape[1]
+        y = weight.new_zeros(())
+        if x is not None:
+            y = weight[..., :own].to(x.dtype) @ x.flatten(2)
+        if shared is not None:
+            common = weight[..., own:] if turn is None else turn(weight[..., own:])
+            y = y + (common.flatten(0, 1).to(shared.dtype) @ shared[0].flatten(1)).unflatten(0, common.shape[:2])
+        y = y.unflatten(2, parts[0].shape[2:])
         return y if self.bias is None else y + self.bias
 
     def modulated(self, style: Tensor) -> Tensor:
@@ -121,11 +152,21 @@ class SynthesisBlock(nn.Module):
         self.head = _Heads(out_channels, style_channels, names)
 
     def forward(
-        self, h: Tensor | None, maps: Mapping[str, Tensor], angles: Tensor, styles: Sequence[Tensor]
+        self,
+        h: Tensor | None,
+        maps: Mapping[str, Tensor],
+        angles: Tensor,  # (1 or B,2,H,W)
+        styles: Sequence[Tensor],
+        shift: Tensor | None = None,  # (B,) turns added to the azimuths
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        features = self.pe(angles).expand(len(styles[0]), -1, -1, -1)
-        x = features if h is None else torch.cat([self.resample(h), features.to(h.dtype)], dim=1)
-        x = self.bias_act1(self.conv1(x, styles[0]))
+        x = None if h is None else self.resample(h)
+        if len(angles) == 1:
+            turn = None if shift is None else partial(self.pe.turned, shift=shift)
+            x = self.conv1(x, styles[0], self.pe(angles), turn)
+        else:
+            features = self.pe(angles if shift is None else turned(angles, shift))
+            x = self.conv1(features if x is None else torch.cat([x, features.to(x.dtype)], dim=1), styles[0])
+        x = self.bias_act1(x)
         if not self.first:
             x = self.bias_act2(self.conv2(x, styles[1]))
         new = self.head(x, styles[-1])
@@ -135,6 +176,12 @@ class SynthesisBlock(nn.Module):
         """Angles at half the resolution, averaged on the circle: (B,2,H,W) -> (B,2,H/2,W/2), radians."""
         smooth = self.downsample(circle(angles))
         return torch.atan2(smooth[:, ::2], smooth[:, 1::2])
+
+
+def turned(angles: Tensor, shift: Tensor) -> Tensor:
+    """Azimuths (1 or B,2,H,W), elevation first, `shift` (B,) turns on: (B,2,H,W) radians."""
+    azimuth = angles[:, 1] + 2 * math.pi * shift[:, None, None]
+    return torch.stack([angles[:, 0].expand_as(azimuth), azimuth], dim=1)
 
 
 def circle(angles: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lidarsynth.build import build_denoiser, build_sensor
 from lidarsynth.diffusion.denoiser import Denoiser, masked_mean, min_snr_weight
-from lidarsynth.experiment import Data, Experiment, Training
+from lidarsynth.experiment import Experiment, Training
 from lidarsynth.lidar.depth import CODECS
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Images, Phase, Task
@@ -109,9 +109,7 @@ def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -
     """The batch of clean images x_0 (b, 2, H, W) that stand at rising `positions` of step `step`'s global batch."""
     count = generation_count(experiment.training)
     seed = experiment.training.seed
-    drawn = [
-        _draw(experiment.data, x, p >= count, sample_rng(seed, step, p)) for x, p in zip(x_0, positions, strict=True)
-    ]
+    drawn = [_draw(experiment, x, p >= count, sample_rng(seed, step, p)) for x, p in zip(x_0, positions, strict=True)]
     times = [
         draw_time(sample_rng(seed, step, p), False) for p in range(count if experiment.diffusion.mean_weight else 0)
     ]
@@ -130,12 +128,17 @@ def sample_rng(seed: int, step: int, position: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence((seed, step, position)).generate_state(1)[0]))
 
 
-def _draw(data: Data, x_0: Tensor, completes: bool, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _draw(
+    experiment: Experiment, x_0: Tensor, completes: bool, rng: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """x_0, t, eps and known of one sample (2, H, W)."""
     t = draw_time(rng, completes)  # first, because `draw` repeats it for the other processes' samples
-    x_0 = augment(x_0, rng, data.roll, data.mirror)
+    x_0 = augment(x_0, rng, experiment.data.roll, experiment.data.mirror)
     known = random_known(x_0, rng) if completes else torch.zeros(x_0.shape, dtype=torch.bool)
-    return x_0, t, torch.randn(x_0.shape, generator=rng), known
+    eps, dice = torch.randn(x_0.shape, generator=rng), torch.rand(3, generator=rng).tolist()
+    if completes and dice[0] < experiment.training.upsampling_share:
+        t, known = torch.ones(()), every_fourth_beam(x_0, 0 if dice[1] < 0.5 else int(dice[2] * 4))
+    return x_0, t, eps, known
 
 
 def draw_time(rng: torch.Generator, completes: bool) -> Tensor:
@@ -165,6 +168,13 @@ def random_known(x_0: Tensor, rng: torch.Generator) -> Tensor:
         known &= x_0[:1] > -1
     if dice[9] < 0.1:
         known[1] = False
+    return known
+
+
+def every_fourth_beam(x_0: Tensor, first: int) -> Tensor:
+    """Bool (2, H, W): the rows first, first + 4, ..., the paper's upsampling."""
+    known = torch.zeros(x_0.shape, dtype=torch.bool)
+    known[:, first::4] = True
     return known
 
 
