@@ -94,7 +94,7 @@ class Counted:
     """A model that counts what it is asked for, and stops the program at a call where it is told to."""
 
     model: Any
-    network_word: str = ""
+    reflectance: bool = True
     stop_at: int = -1
     calls: list[int] = field(default_factory=list)  # seeds
 
@@ -109,7 +109,7 @@ class Counted:
     @property
     def experiment(self):
         own = self.model.experiment
-        return replace(own, model=replace(own.model, network=self.network_word or own.model.network))
+        return replace(own, data=replace(own.data, reflectance=self.reflectance))
 
     def _count(self, seed: int) -> None:
         if len(self.calls) == self.stop_at:
@@ -267,7 +267,7 @@ def test_rows_that_cannot_be_are_told(data: Path, tiny: Path, tmp_path: Path):
     assert "- N/A, tiny: expected an image of 16 x 64, found (16, 32)" in text
     assert results(tmp_path / "out")["tiny"]["reports"] == {}
     config = written(tmp_path / "c.toml", f'data = "{data}"\n[[method]]\nname="range only"\nmodel="tiny"\nsteps=1\n')
-    text = benchmark("upsampling", config, tmp_path / "out", lambda word: Counted(ls.load(tiny), "iln"))
+    text = benchmark("upsampling", config, tmp_path / "out", lambda word: Counted(ls.load(tiny), reflectance=False))
     found = results(tmp_path / "out")["range only"]
     assert list(found["errors of each scan"]) == ["range MAE", "hidden range MAE"]
     values = found["reports"]["r2dm-upsampling-2024"]["values"]
@@ -424,7 +424,7 @@ def test_range_only_models_have_no_feature_distance(generation: Path, tiny: Path
     config = written(
         generation, generation.read_text().replace("count = 3", 'count = 3\nprotocol = ["bev-1", "r2dm-2024"]')
     )
-    text = benchmark("generation", config, tmp_path / "out", lambda word: Counted(ls.load(tiny), "dusty-v2"))
+    text = benchmark("generation", config, tmp_path / "out", lambda word: Counted(ls.load(tiny), reflectance=False))
     assert "## r2dm-2024 v1" in text and "## bev-1 v1" in text
     for path in (tmp_path / "out" / "scans").glob("tiny-*/*.npz"):
         assert not ls.read_image(path).reflectance.any()

@@ -5,13 +5,10 @@ from __future__ import annotations
 from lidarsynth.benchmark.config import GenerationMethod, UpsamplingMethod
 from lidarsynth.scan_model import ScanModel
 
-# Words of `experiment.Model.network` that are published with range only: where a measure takes more, they are N/A.
-WITHOUT_REFLECTANCE = frozenset({"vanilla-gan", "dusty-v1", "dusty-v2", "lidar-sr", "iln", "liif"})
-
 
 def has_reflectance(model: ScanModel) -> bool:
     """Whether the reflectance of its scans means anything."""
-    return model.experiment.model.network not in WITHOUT_REFLECTANCE
+    return model.experiment.data.reflectance
 
 
 def completion_evaluations(model: ScanModel, method: UpsamplingMethod) -> int:
