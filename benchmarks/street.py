@@ -21,7 +21,6 @@ import torch
 
 from lidarsynth.data.files import read
 from lidarsynth.data.synthetic.reader import SyntheticStreets
-from lidarsynth.data.synthetic.world import POSES
 from lidarsynth.gathering import Loaded, load_networks
 from lidarsynth.lidar.colours import CLASSES
 from lidarsynth.lidar.projection import project
@@ -44,8 +43,8 @@ Corrupt = Callable[[RangeImage, np.random.Generator], RangeImage]
 
 def streets(first: int, count: int, without: tuple[str, ...] = ()) -> Iterator[RangeImage]:
     """Scans first .. first + count - 1, each from a world of its own; of classes `without` nothing is there."""
-    reader = SyntheticStreets(SEED, 1 << 40, SENSOR, without)
-    return (reader.image(POSES * i + i % POSES) for i in range(first, first + count))
+    reader = SyntheticStreets(SEED, 1 << 40, SENSOR, without, apart=True)
+    return (reader.image(i) for i in range(first, first + count))
 
 
 def blurred(sigma: float) -> Corrupt:

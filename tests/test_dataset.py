@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from lidarsynth.cli import main
 from lidarsynth.data import cache
 from lidarsynth.data.dataset import CachedImages, read_index, verify, write_cache
-from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, summary
+from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, prepare, summary
 from lidarsynth.lidar.depth import CODECS, to_x_0
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -307,6 +307,21 @@ def test_synthetic_streets_have_labels(tmp_path: Path):
     label = CachedImages(tmp_path)[0].label
     assert label is not None and 9 in label
     assert summary(tmp_path) == f"2 images in {tmp_path}/"
+
+
+def test_streets_apart_are_those_of_other_worlds(tmp_path: Path):
+    pytest.importorskip("embreex")
+    from lidarsynth.data.synthetic.reader import SyntheticStreets
+    from lidarsynth.data.synthetic.world import POSES
+
+    assert list(cache_synthetic(tmp_path / "apart", 2, width=64, seed=3, apart=True)) == [(2, 2)]
+    apart = CachedImages(tmp_path / "apart")
+    together = SyntheticStreets(seed=3, sensor=apart.sensor)
+    np.testing.assert_allclose(apart[1].range, together.image(POSES + 1).range, atol=1e-3)
+    with pytest.raises(ValueError, match="expected a cache of source"):
+        list(cache_synthetic(tmp_path / "apart", 2, width=64, seed=3))
+    with pytest.raises(ValueError, match="expected --apart with synthetic"):
+        prepare("files", tmp_path, tmp_path / "x", apart=True)
 
 
 @pytest.mark.parametrize(

@@ -211,6 +211,7 @@ def data(
     check: bool = False,
     seed: int = 0,
     intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
+    apart: bool = False,
 ) -> None:
     """Prepare a cache of range images for training; killed at any moment, the same command goes on.
 
@@ -228,10 +229,11 @@ def data(
         check: also compare the checksums of what is there already, and make anew what is damaged.
         seed: of the synthetic streets.
         intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
+        apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
     """
     from lidarsynth.data.sources import prepare, summary
 
-    more = (workers, count, check, seed, intensity)
+    more = (workers, count, check, seed, intensity, apart)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass
     say(f"wrote {summary(cache or root)}")

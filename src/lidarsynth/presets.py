@@ -179,7 +179,7 @@ def kitti() -> Experiment:
         name="kitti",
         data=replace(start.data, roll=True, mirror=True),
         training=replace(
-            start.training, steps=5_000, warmup=100, ema_start=100, generation_share=0.25, upsampling_share=0.6
+            start.training, steps=3_600, warmup=50, ema_start=100, generation_share=0.25, upsampling_share=0.85
         ),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",

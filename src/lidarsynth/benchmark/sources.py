@@ -25,7 +25,8 @@ STREET = "street"  # the scan that comes with the package
 def located(word: str, folder: Path, sensor: str | None = None, on_images: OnImages = None) -> Path:
     """The file, folder or cache of a word of a benchmark's file.
 
-    `synthetic:COUNT:SEED` is cast into a cache below `folder`, which goes on where it was stopped. Raises ValueError.
+    `synthetic:COUNT:SEED`, each scan from a street of its own, is cast into a cache below `folder`, which goes on where
+    it was stopped. Raises ValueError.
     """
     if word == STREET:
         return Path(__file__).parents[1] / "shipped" / "street.npz"
@@ -36,7 +37,7 @@ def located(word: str, folder: Path, sensor: str | None = None, on_images: OnIma
         raise ValueError(f"expected synthetic:COUNT:SEED, such as synthetic:64:777, found {word!r}")
     count, seed = map(int, numbers)
     cache = folder / f"streets-{count}-{seed}{f'-{Path(sensor).stem}' if sensor else ''}"
-    for done, total in cache_synthetic(cache, count, sensor or SYNTHETIC, seed=seed):
+    for done, total in cache_synthetic(cache, count, sensor or SYNTHETIC, seed=seed, apart=True):
         if on_images:
             on_images("streets", done, total)
     return cache

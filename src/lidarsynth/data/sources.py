@@ -80,11 +80,14 @@ def prepare(
     check: bool = False,
     seed: int = 0,
     intensity: str = "auto",
+    apart: bool = False,
 ) -> Iterator[tuple[int, int]]:
     """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others."""
     if name == "synthetic":
         spec = SYNTHETIC if sensor is None else sensor
-        return cache_synthetic(folder or root, count, spec, _width(width, spec, 1024), seed, workers, check)
+        return cache_synthetic(folder or root, count, spec, _width(width, spec, 1024), seed, workers, check, apart)
+    if apart:
+        raise ValueError(f"expected --apart with synthetic, whose scans share worlds, found it with {name}")
     if folder is None:
         raise ValueError(f"expected data {name} ROOT CACHE, found no CACHE")
     return cache_source(name, root, folder, split, sensor, projection, width, workers, check, intensity)
@@ -133,13 +136,17 @@ def cache_synthetic(
     seed: int = 0,
     workers: int | None = 0,
     check: bool = False,
+    apart: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`."""
+    """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`.
+
+    apart  a world for each of them, for sets that are compared; else sixteen places in each, many times faster
+    """
     from lidarsynth.data.synthetic.reader import SyntheticStreets
 
     spec = _sensor(sensor, width)
-    streets = SyntheticStreets(seed=seed, length=count, sensor=spec)
-    source = {"name": "synthetic", "seed": seed}
+    streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart)
+    source = {"name": "synthetic", "seed": seed} | ({"apart": True} if apart else {})
     for done in write_cache(folder, streets.image, count, spec, source, workers=_processes(workers), check=check):
         yield done, count
 

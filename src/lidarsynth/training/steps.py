@@ -20,7 +20,7 @@ from lidarsynth.experiment import Experiment, Training
 from lidarsynth.lidar.depth import CODECS
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Images, Phase, Task
-from lidarsynth.training.validation import judge_diffusion, picture_samples
+from lidarsynth.training.validation import EVERY, judge_diffusion, picture_samples
 
 
 class Batch(NamedTuple):
@@ -135,9 +135,10 @@ def _draw(
     t = draw_time(rng, completes)  # first, because `draw` repeats it for the other processes' samples
     x_0 = augment(x_0, rng, experiment.data.roll, experiment.data.mirror)
     known = random_known(x_0, rng) if completes else torch.zeros(x_0.shape, dtype=torch.bool)
-    eps, dice = torch.randn(x_0.shape, generator=rng), torch.rand(3, generator=rng).tolist()
-    if completes and dice[0] < experiment.training.upsampling_share:
-        t, known = torch.ones(()), every_fourth_beam(x_0, 0 if dice[1] < 0.5 else int(dice[2] * 4))
+    eps = torch.randn(x_0.shape, generator=rng)
+    if completes and torch.rand((), generator=rng) < experiment.training.upsampling_share:
+        t, known = torch.ones(()), torch.zeros(x_0.shape, dtype=torch.bool)
+        known[:, ::EVERY] = True
     return x_0, t, eps, known
 
 
@@ -168,13 +169,6 @@ def random_known(x_0: Tensor, rng: torch.Generator) -> Tensor:
         known &= x_0[:1] > -1
     if dice[9] < 0.1:
         known[1] = False
-    return known
-
-
-def every_fourth_beam(x_0: Tensor, first: int) -> Tensor:
-    """Bool (2, H, W): the rows first, first + 4, ..., the paper's upsampling."""
-    known = torch.zeros(x_0.shape, dtype=torch.bool)
-    known[:, first::4] = True
     return known
 
 

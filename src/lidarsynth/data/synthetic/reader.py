@@ -27,7 +27,9 @@ class SyntheticStreets:
     sensor  beams, offsets, range limits, columns and mounting height
     without words of SemanticKITTI classes, such as `car`: things of these are taken away, all else stays where it is
 
-    Sixteen consecutive scans are sixteen places in one world; reading in order builds each world once.
+    apart   every scan has a world of its own, as statistics of independent scans want it
+
+    Else sixteen consecutive scans are sixteen places in one world, and reading in order builds each world once.
     Raises IndexError beyond the length, ImportError naming the extra when embreex is missing, ValueError for others.
     """
 
@@ -37,12 +39,14 @@ class SyntheticStreets:
         length: int = 1000,
         sensor: Sensor = SENSORS["hdl-64e-kitti"],
         without: tuple[str, ...] = (),
+        apart: bool = False,
     ):
         if seed < 0 or length < 1:
             raise ValueError(f"expected seed >= 0 and length >= 1, got seed {seed} and length {length}")
         if unknown := [word for word in without if word not in LABEL]:
             raise ValueError(f"expected classes of {', '.join(LABEL)}, found {unknown[0]!r}")
         self.without = without
+        self.apart = apart
         self.seed = seed
         self.length = length
         self.sensor = sensor
@@ -98,6 +102,8 @@ class SyntheticStreets:
         """Returns of all H * W rays, and the rays (H, W, 3) in the sensor frame."""
         if not 0 <= index < self.length:
             raise IndexError(f"expected a scan number in 0..{self.length - 1}, got {index}")
+        if self.apart:
+            index = POSES * index + index % POSES
         world, caster = self._world(index // POSES)
         rng = np.random.default_rng((self.seed, index, 1))
         rays = _jittered(sensor, rng)
