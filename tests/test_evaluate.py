@@ -317,6 +317,20 @@ def test_upsampling_compares_images_one_by_one():
         ls.evaluate(STREETS, REAL, protocol=R2DM_UPSAMPLING.name)
 
 
+def test_the_shipped_network_tells_classes_without_a_download():
+    street = ls.read(Path(ls.__file__).parent / "shipped" / "street.npz")
+    truth = ls.load().image_of(street)
+    rows = np.zeros(truth.shape, bool)
+    rows[::4] = True
+    hidden = truth.keep(rows)
+    same, less = (ls.evaluate([image], [truth], protocol="street-upsampling-1") for image in (truth, hidden))
+    assert same.values["range MAE"] == 0 and same.classes["car"] == 1 and same.classes["road"] == 1
+    assert same.values["IoU weighted"] == pytest.approx(100)
+    assert less.values["IoU weighted"] < 60 and less.classes["road"] < 0.6
+    (weights,) = {value for name, value in same.to_dict()["hashes"].items() if "rangenet" in name}
+    assert len(weights) == 64
+
+
 def test_classes_are_compared_pixel_by_pixel_and_named(tmp_path: Path):
     with torch.random.fork_rng():
         torch.manual_seed(0)

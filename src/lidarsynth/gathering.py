@@ -55,7 +55,8 @@ def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu",
             loaded.missing[network.kind] = f"no official {network.kind} for {width} columns, only for {widths}"
             continue
         if name in (own := shipped()):
-            loaded.networks[network.kind] = _read_shipped(name).to(device)
+            rangenet = _read_shipped(name)
+            loaded.networks[network.kind] = (rangenet if protocol.pairs else StreetFeatures(rangenet)).to(device)
             loaded.weights[network.kind] = sha256(own[name] / WEIGHTS)
             continue
         path = cache_folder() / name
@@ -74,10 +75,10 @@ def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu",
     return loaded
 
 
-def _read_shipped(word: str) -> StreetFeatures:
+def _read_shipped(word: str) -> RangeNet:
     rangenet = load_parts(word)[1]
     assert isinstance(rangenet, RangeNet)
-    return StreetFeatures(rangenet)
+    return rangenet
 
 
 def _read_network(network: Network, path: Path) -> nn.Module:

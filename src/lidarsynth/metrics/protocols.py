@@ -290,8 +290,16 @@ STREET_1 = EvaluationProtocol(
     notes=("all images of both sides count; compare scores of the same counts only",),
 )
 
+STREET_UPSAMPLING_1 = replace(
+    R2DM_UPSAMPLING,
+    name="street-upsampling-1",
+    source="lidarsynth: r2dm-upsampling-2024 with the classes of street-1's network, which comes with the package",
+    networks=(replace(STREET_1.networks[0], layer=R2DM_UPSAMPLING.networks[0].layer, features=0),),
+    notes=("the network learned synthetic streets: its IoU tells methods apart, and is not that of RangeNet-53",),
+)
+
 PROTOCOLS: dict[str, EvaluationProtocol] = {
-    p.name: p for p in (R2DM, LIDARGEN, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, BEV_1, STREET_1)
+    p.name: p for p in (R2DM, LIDARGEN, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, BEV_1, STREET_1, STREET_UPSAMPLING_1)
 }
 
 
