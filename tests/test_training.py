@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -12,11 +13,13 @@ from torch import Tensor, nn
 from lidarsynth.build import build_denoiser, build_network
 from lidarsynth.data.frames import Name
 from lidarsynth.experiment import Experiment, Training, with_fields
+from lidarsynth.lidar.depth import from_x_0, to_x_0
+from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.presets import preset
 from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
 from lidarsynth.training.loop import learning_rate, start, train, update_ema
 from lidarsynth.training.options import Options
-from lidarsynth.training.steps import Batch, Objective, augment, draw, random_known
+from lidarsynth.training.steps import Batch, Objective, augment, draw, random_known, scaled
 from lidarsynth.training.task import ema_decay, ema_due
 from lidarsynth.training.validation import TIMES, fixed_losses
 
@@ -148,6 +151,33 @@ def test_augmentation_turns_and_mirrors_whole_columns():
 def _turned(x: Tensor, shift: int, flip: bool) -> Tensor:
     x = torch.roll(x, shift, dims=-1)
     return x.flip(-1) if flip else x
+
+
+def test_a_scaled_scan_is_that_of_a_larger_or_smaller_world():
+    experiment, image = (
+        with_fields(TINY, {"data.scale": 0.2}),
+        from_x_0(Noise().x_0([0])[0], SENSORS["hdl-64e-kitti"].resized(16, 64)),
+    )
+    x_0 = to_x_0(image)
+    factors = []
+    for seed in range(20):
+        found = from_x_0(scaled(experiment, x_0, torch.Generator().manual_seed(seed)), image.sensor)
+        both = image.mask & found.mask
+        ratio = found.range[both] / image.range[both]
+        factors.append(float(np.median(ratio)))
+        np.testing.assert_allclose(ratio, factors[-1], rtol=1e-4)
+        np.testing.assert_allclose(found.reflectance[both], image.reflectance[both], atol=1e-6)
+        assert not (found.mask & ~image.mask).any()
+        left = image.range[image.mask & ~found.mask] * factors[-1]
+        assert ((left <= image.sensor.min_range * 1.001) | (left >= image.sensor.max_range * 0.999)).all()
+    assert 0.8 <= min(factors) < 0.9 and 1.1 < max(factors) <= 1.2
+
+
+def test_a_share_of_a_sample_is_one_of_several_steps():
+    experiment = with_fields(TINY, {"training.generation_share": 0.1, "training.batch_size": 2})
+    x_0 = Noise().x_0([0, 1])
+    counts = [draw(experiment, x_0, step, [0, 1]).generation for step in range(50)]
+    assert sum(counts) == 10 and set(counts) == {0, 1}
 
 
 def test_random_patterns_leave_something_known_and_something_to_do():

@@ -19,6 +19,7 @@ class Data:
     reflectance: bool = True  # whether the network knows reflectance
     roll: bool = False  # augmentation: turn the scan by any number of columns
     mirror: bool = False  # augmentation: swap left and right
+    scale: float = 0.0  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class Training:
     ema_half_life: int = 10_000  # images; of GANs, in the place of the three above
     generation_share: float = 1.0  # share of a batch trained without known pixels; 1 for unconditional networks
     upsampling_share: float = 0.0  # of the others, the share that knows every fourth beam and begins at pure noise
+    metres_weight: float = 0.1  # of completion's error in metres, beside that in code
     seed: int = 0
 
 

@@ -177,9 +177,17 @@ def kitti() -> Experiment:
     return replace(
         start,
         name="kitti",
-        data=replace(start.data, roll=True, mirror=True),
+        data=replace(start.data, roll=True, mirror=True, scale=0.15),
         training=replace(
-            start.training, steps=3_600, warmup=50, ema_start=100, generation_share=0.25, upsampling_share=0.85
+            start.training,
+            steps=5_200,
+            batch_size=2,
+            learning_rate=2e-3,
+            warmup=50,
+            ema_start=100,
+            generation_share=0.1,
+            upsampling_share=0.85,
+            metres_weight=0.2,
         ),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from lidarsynth.build import build_denoiser, build_sensor
 from lidarsynth.diffusion.denoiser import Denoiser, masked_mean, min_snr_weight
 from lidarsynth.experiment import Experiment, Training
-from lidarsynth.lidar.depth import CODECS
+from lidarsynth.lidar.depth import CODECS, decode, encode, valid
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Images, Phase, Task
 from lidarsynth.training.validation import EVERY, judge_diffusion, picture_samples
@@ -84,7 +84,7 @@ def completion_loss(
     """Mean absolute error (b,) of the pixels that are not `known` (b, 2, H, W), in code and, of range, in metres too.
 
     The absolute error has the median as its optimum, which is the same in metres and in any depth code; in code the
-    near pixels weigh most, in metres, here per 10 m, the far ones.
+    near pixels weigh most, in metres, by `training.metres_weight`, the far ones.
     """
     mask = known.to(x_0)
     _, alpha, sigma = denoiser.schedule.at(t, x_0)
@@ -92,7 +92,8 @@ def completion_loss(
     error = (x_0_hat - x_0).abs()
     sensor, codec = build_sensor(experiment), experiment.data.codec
     metres = (_metres(x_0_hat[:, :1], sensor, codec) - _metres(x_0[:, :1], sensor, codec)).abs()
-    return masked_mean(error + torch.cat([metres / 10, torch.zeros_like(metres)], dim=1), 1 - mask)
+    metres = metres * experiment.training.metres_weight
+    return masked_mean(error + torch.cat([metres, torch.zeros_like(metres)], dim=1), 1 - mask)
 
 
 def _metres(code: Tensor, sensor: Sensor, codec: str) -> Tensor:
@@ -100,14 +101,15 @@ def _metres(code: Tensor, sensor: Sensor, codec: str) -> Tensor:
     return CODECS[codec].inverse((code.clamp(-1, 1) + 1) / 2, sensor).clamp(max=sensor.max_range)
 
 
-def generation_count(training: Training) -> int:
-    """How many samples of the global batch, the first ones, learn p(x_0)."""
-    return round(training.generation_share * training.batch_size)
+def generation_count(training: Training, step: int) -> int:
+    """How many samples of a step's global batch, the first ones, learn p(x_0); over many steps exactly their share."""
+    wanted = training.generation_share * training.batch_size
+    return math.floor(wanted * (step + 1) + 1e-9) - math.floor(wanted * step + 1e-9)
 
 
 def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> Batch:
     """The batch of clean images x_0 (b, 2, H, W) that stand at rising `positions` of step `step`'s global batch."""
-    count = generation_count(experiment.training)
+    count = generation_count(experiment.training, step)
     seed = experiment.training.seed
     drawn = [_draw(experiment, x, p >= count, sample_rng(seed, step, p)) for x, p in zip(x_0, positions, strict=True)]
     times = [
@@ -134,6 +136,7 @@ def _draw(
     """x_0, t, eps and known of one sample (2, H, W)."""
     t = draw_time(rng, completes)  # first, because `draw` repeats it for the other processes' samples
     x_0 = augment(x_0, rng, experiment.data.roll, experiment.data.mirror)
+    x_0 = scaled(experiment, x_0, rng) if experiment.data.scale else x_0
     known = random_known(x_0, rng) if completes else torch.zeros(x_0.shape, dtype=torch.bool)
     eps = torch.randn(x_0.shape, generator=rng)
     if completes and torch.rand((), generator=rng) < experiment.training.upsampling_share:
@@ -155,6 +158,15 @@ def augment(x_0: Tensor, rng: torch.Generator, roll: bool, mirror: bool) -> Tens
     if roll:
         x_0 = torch.roll(x_0, shift, dims=-1)
     return x_0.flip(-1) if mirror and flip else x_0
+
+
+def scaled(experiment: Experiment, x_0: Tensor, rng: torch.Generator) -> Tensor:
+    """x_0 (2, H, W) of a world up to `data.scale` larger or smaller; what leaves the sensor's limits is gone."""
+    sensor, codec = build_sensor(experiment), experiment.data.codec
+    factor = 1 + experiment.data.scale * (2 * float(torch.rand((), generator=rng)) - 1)
+    distance = decode((x_0[:1] + 1) / 2, sensor, codec) * factor
+    code = 2 * encode(distance, sensor, codec) - 1
+    return torch.where(valid(distance, sensor), torch.cat([code, x_0[1:]]), -1.0)
 
 
 def random_known(x_0: Tensor, rng: torch.Generator) -> Tensor:
