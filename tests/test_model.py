@@ -155,6 +155,21 @@ def test_unconditional_models_complete_too(unconditional, image):
         unconditional.complete(image, known, method="conditional")
 
 
+def test_mixed_pixels_are_mended_if_the_experiment_says_so(model, image):
+    """A network that hardly learned interpolates: beside an empty row its ranges lie between a surface and nothing."""
+    known = np.zeros(image.shape, bool)
+    known[::4] = True
+    wall = replace(image, range=np.full(image.shape, 20, np.float32), mask=np.ones(image.shape, bool))
+    empty = np.zeros(image.shape, bool)
+    empty[4] = True
+    truth = replace(wall, range=np.where(empty, 0, wall.range), mask=~empty, xyz=None)
+    plain = replace(model, experiment=with_fields(model.experiment, {"data.mend": False}))
+    mixed, mended = (m.complete(truth.keep(known), known, "conditional", 1) for m in (plain, model))
+    between = [int(((m.range > 0) & (m.range < 12)).sum()) for m in (mixed, mended)]
+    assert between[1] < between[0], "beside nothing, ranges are those of the wall"
+    np.testing.assert_array_equal(mixed.range[known], mended.range[known])
+
+
 def test_what_was_not_measured_is_filled_by_default(model, image):
     scan = image.to_scan()
     result = model.complete(scan, steps=2)

@@ -19,6 +19,7 @@ class Data:
     reflectance: bool = True  # whether the network knows reflectance
     roll: bool = False  # augmentation: turn the scan by any number of columns
     mirror: bool = False  # augmentation: swap left and right
+    mend: bool = True  # mixed pixels that a conditional network makes are put onto the surface beside them
     scale: float = 0.0  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
 
 

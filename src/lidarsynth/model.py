@@ -234,9 +234,9 @@ class LidarModel:
         return langevin.evaluations(levels, per_level)
 
     def _image(self, x_0: Tensor) -> RangeImage:
-        """x_0 (2, H, W) as an image; mixed pixels are mended for our own kind of network, R2DM's stay as published."""
+        """x_0 (2, H, W) as an image; mixed pixels are mended if `data.mend`, those of R2DM's network stay as published."""
         image = from_x_0(x_0, self.sensor, self.experiment.data.codec)
-        return without_mixed_pixels(image) if self.conditional else image
+        return without_mixed_pixels(image) if self.conditional and self.experiment.data.mend else image
 
     @property
     def _device(self) -> torch.device:

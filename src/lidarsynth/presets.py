@@ -177,7 +177,7 @@ def kitti() -> Experiment:
     return replace(
         start,
         name="kitti",
-        data=replace(start.data, roll=True, mirror=True, scale=0.15),
+        data=replace(start.data, mend=False, roll=True, mirror=True, scale=0.15),
         training=replace(
             start.training,
             steps=5_200,
