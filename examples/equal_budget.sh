@@ -25,7 +25,7 @@ train r2dm r2dm-h 1100 model.base_channels=32 'model.num_residual_blocks=[2,2,2,
 train lidargen lidargen 300 model.base_channels=16 training.batch_size=2 training.learning_rate=0.001 \
     training.warmup=50 training.decay=cosine training.ema_decay=0.98 training.ema_start=20 score.sigma_max=1
 train vanilla-gan vanilla-gan 680 model.base_channels=8 adversarial.max_channels=128 $gan
-train dusty-v1 dusty-v1 700 model.base_channels=8 adversarial.max_channels=128 $gan
-train dusty-v2 dusty-v2 200 model.base_channels=8 adversarial.max_channels=64 $gan
+train dusty-v1 dusty-v1 612 model.base_channels=8 adversarial.max_channels=128 $gan
+train dusty-v2 dusty-v2 148 model.base_channels=8 adversarial.max_channels=64 $gan
 train lidar-sr lidar-sr 1000 model.base_channels=16 training.batch_size=4 training.learning_rate=0.001
 train iln iln 235 model.base_channels=32 training.batch_size=4 training.learning_rate=0.0005

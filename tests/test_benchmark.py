@@ -546,7 +546,7 @@ def test_the_examples_run(kind: str, data: Path, tmp_path: Path):
     shown = {"upsampling": None, "generation": "street"}[kind]  # as they are, but for the streets, which take an extra
     table_of = benchmark(kind, written(tmp_path / "b.toml", text), tmp_path / "out", ls.load, data=shown)
     names = [row[0] for row in cells(table_of, "## ")]
-    assert "default, 1 step" in names and len(names) == {"upsampling": 7, "generation": 5}[kind]
+    assert "default, 1 step" in names and len(names) == {"upsampling": 9, "generation": 5}[kind]
 
 
 def test_the_commands_of_the_results_name_files_that_are_there():
