@@ -33,7 +33,7 @@ Steps = Annotated[
     int | None,
     arg(
         metavar="INT",
-        help="network steps; default 4 where conditional, 32 where repaint, 1161 where posterior, 500 where inversion.",
+        help="network steps; default 1 where conditional, 32 where repaint, 1161 where posterior, 500 where inversion.",
     ),
 ]
 Resamples = Annotated[int, arg(help="passes over each step of repaint.")]

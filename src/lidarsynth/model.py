@@ -104,11 +104,11 @@ class LidarModel:
 
         scan    points, or an image of this model's sensor
         known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
-        method  `conditional`: the network is told the known pixels (few steps); `repaint`: R2DM's way, for any network;
-                `posterior`: LiDARGen's, for any network; `auto`: conditional where the network can, else posterior
-                after score matching, else repaint
-        steps   default 4; or 32 for repaint, where `resamples` passes go over each step; or, for posterior, at most so
-                many network evaluations, default 1161
+        method  `conditional`: the network is told the known pixels (one step, or few); `repaint`: R2DM's way, for any
+                network; `posterior`: LiDARGen's, for any network; `auto`: conditional where the network can, else
+                posterior after score matching, else repaint
+        steps   default 1, which errs least; or 32 for repaint, where `resamples` passes go over each step; or, for
+                posterior, at most so many network evaluations, default 1161
 
         A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
         """
@@ -167,7 +167,7 @@ class LidarModel:
         if method == "posterior":
             return self._langevin_calls(steps)
         if method == "conditional":
-            return 4 if steps is None else steps
+            return 1 if steps is None else steps
         return repaint.evaluations(32 if steps is None else steps, resamples)
 
     def _method(self, method: str) -> str:
@@ -201,7 +201,7 @@ class LidarModel:
         x_1 = self._start(x_0, rng, method == "posterior")
         if method == "conditional":
             told = self.denoiser.given(x_0, mask)
-            return self._states(told, x_1, rng, self._sampler(sampler or "ddim"), 4 if steps is None else steps)
+            return self._states(told, x_1, rng, self._sampler(sampler or "ddim"), 1 if steps is None else steps)
         if method == "repaint":
             return repaint.repaint(
                 self.denoiser, x_1, x_0, mask, rng, steps=32 if steps is None else steps, resamples=resamples
@@ -234,7 +234,7 @@ class LidarModel:
         return langevin.evaluations(levels, per_level)
 
     def _image(self, x_0: Tensor) -> RangeImage:
-        """x_0 (2, H, W) as an image; mixed pixels are mended if `data.mend`, those of R2DM's network stay as published."""
+        """x_0 (2, H, W) as an image; mixed pixels are mended if `data.mend`, R2DM's stay as published."""
         image = from_x_0(x_0, self.sensor, self.experiment.data.codec)
         return without_mixed_pixels(image) if self.conditional and self.experiment.data.mend else image
 
