@@ -1,6 +1,7 @@
 """The verbs as a user meets them: what they write, that they go on where they were stopped, and how they refuse."""
 
 import io
+import json
 import os
 import signal
 import subprocess
@@ -339,6 +340,18 @@ def test_info_knows_scans_models_presets_and_sensors(run: Run, tiny: Path, scan:
     assert [a.code for a in answers] == [0] * 4
     for answer, word in zip(answers, ("hdl-64e-kitti (", "42,", "31,099,650", "16 from +15.00"), strict=True):
         assert word in answer.out
+
+
+def test_train_takes_every_field_of_an_experiment(run: Run):
+    fields = ("--training.steps", "7", "--set", "data.roll=true", "--training.learning-rate=0.5", "--card.licence=x=y")
+    answer = run("train", "tiny", "--seed", "3", *fields, "--dry-run")
+    found = json.loads(answer.out)
+    assert (found["training"]["steps"], found["training"]["learning_rate"], found["training"]["seed"]) == (7, 0.5, 3)
+    assert found["data"]["roll"] is True and found["card"]["licence"] == "x=y"
+    assert found == json.loads(run("train", "tiny", *fields, "--dry-run", "--seed", "3").out)
+    refused(run("train", "tiny", "--dry-run", "--training.stepps", "7"), "'training.stepps'")
+    refused(run("train", "tiny", "--dry-run", "--training.steps", "x"), "training.steps")
+    refused(run("train", "tiny", "--dry-run", "--training.steps"), "--training.steps")
 
 
 def test_demo_runs_and_lists_what_it_made(run: Run, tiny: Path, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -53,3 +54,21 @@ SensorOut = Annotated[
 SensorWord = Annotated[
     str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")
 ]
+
+
+def fields_joined(argv: list[str]) -> list[str]:
+    """A command line whose `--group.field value` and `--group.field=value` stand behind one `--set` instead."""
+    rest, found = [], []
+    words = iter(argv)
+    for word in words:
+        path, equals, value = word.partition("=")
+        if not re.fullmatch(r"--[a-z_]+\.[a-z0-9_-]+", path):
+            rest.append(word)
+        elif equals or (value := next(words, None)) is not None:
+            found.append(f"{path[2:].replace('-', '_')}={value}")
+        else:
+            rest.append(word)  # without a value: let the parser complain
+    if not found:
+        return rest
+    before, after = (rest[: rest.index("--set")], rest[rest.index("--set") + 1 :]) if "--set" in rest else (rest, [])
+    return [*before, "--set", *found, *after]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -27,6 +28,7 @@ from lidarsynth.arguments import (
     Source,
     Steps,
     arg,
+    fields_joined,
 )
 from lidarsynth.benchmark.verb import benchmark
 from lidarsynth.terminal import answer, at_least, counted, load_with_bar, progress_line, say, step_bar
@@ -244,7 +246,7 @@ def train(
     data: Annotated[Path | None, arg(metavar="CACHE|synthetic", help="cache of `lidarsynth data`, or streets.")] = None,
     out: Annotated[Path | None, arg(help="folder for weights and checkpoints; default runs/PRESET.")] = None,
     weights: Annotated[str | None, arg(name="from", metavar="MODEL", help="start from these weights.")] = None,
-    set: Annotated[tuple[str, ...], arg(help="fields to change, such as training.steps=1000.")] = (),
+    set: Annotated[tuple[str, ...], arg(help="such as training.steps=9; or --training.steps 9.")] = (),
     validation: Annotated[Path | None, arg(metavar="CACHE", help="images that are not trained on.")] = None,
     resume: Annotated[bool, arg(help="insist that there is a run to continue.")] = False,
     dry_run: Annotated[bool, arg(help="print the resolved experiment and stop.")] = False,
@@ -342,4 +344,5 @@ VERBS = {
 
 def main(argv: list[str] | None = None) -> None:
     """Run one verb: exits 0, or 2 with one line that says what was expected and what was found."""
-    answer(VERBS, argv)
+    argv = sys.argv[1:] if argv is None else argv
+    answer(VERBS, fields_joined(argv) if argv[:1] == ["train"] else argv)
