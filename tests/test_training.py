@@ -19,7 +19,7 @@ from lidarsynth.presets import preset
 from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
 from lidarsynth.training.loop import learning_rate, start, train, update_ema
 from lidarsynth.training.options import Options
-from lidarsynth.training.steps import Batch, Objective, augment, draw, random_known, scaled
+from lidarsynth.training.steps import Batch, Objective, augment, draw, draw_images, random_known, scaled
 from lidarsynth.training.task import ema_decay, ema_due
 from lidarsynth.training.validation import TIMES, fixed_losses
 
@@ -171,6 +171,27 @@ def test_a_scaled_scan_is_that_of_a_larger_or_smaller_world():
         left = image.range[image.mask & ~found.mask] * factors[-1]
         assert ((left <= image.sensor.min_range * 1.001) | (left >= image.sensor.max_range * 0.999)).all()
     assert 0.8 <= min(factors) < 0.9 and 1.1 < max(factors) <= 1.2
+
+
+def test_a_share_of_the_completion_samples_gets_a_sector_of_another_image():
+    experiment = with_fields(TINY, {"data.mix": 0.5, "training.batch_size": 4, "training.generation_share": 0.5})
+    images = Noise(2)
+    one, other = images.x_0([0, 1])
+    shares = []
+    for step in range(50):
+        found = draw_images(experiment, images, [0] * 4, step, [0, 1, 2, 3])
+        again = draw_images(experiment, images, [0] * 2, step, [2, 3])
+        torch.testing.assert_close(found.x_0[2:], again.x_0, rtol=0, atol=0)
+        for x_0 in found.x_0:
+            columns = (x_0 == other).all(dim=(0, 1))
+            assert ((x_0 == one).all(dim=(0, 1)) | columns).all()
+            assert int((columns != columns.roll(1)).sum()) in (0, 2), "one sector"
+            shares.append(float(columns.float().mean()))
+    drawn = torch.tensor(shares).view(50, 4)
+    assert not drawn[:, :2].any(), "generation learns whole scans"
+    mixed = drawn[:, 2:][drawn[:, 2:] > 0]
+    assert 10 < len(mixed) < 40  # half of them, and half of these meet themselves
+    assert mixed.max() <= 0.5 and 0.15 < mixed.mean() < 0.35
 
 
 def test_a_share_of_a_sample_is_one_of_several_steps():

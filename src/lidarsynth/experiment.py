@@ -21,6 +21,7 @@ class Data:
     mirror: bool = False  # augmentation: swap left and right
     mend: bool = True  # mixed pixels that a conditional network makes are put onto the surface beside them
     scale: float = 0.0  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
+    mix: float = 0.0  # augmentation of completion: share of samples with a sector of another image of the cache
 
 
 @dataclass(frozen=True)

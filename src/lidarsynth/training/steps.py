@@ -7,6 +7,7 @@ depend on how many processes, workers or passes share a batch, and a resumed run
 from __future__ import annotations
 
 import math
+from collections.abc import Sized
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from lidarsynth.lidar.depth import CODECS, decode, encode, valid
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Images, Phase, Task
 from lidarsynth.training.validation import EVERY, judge_diffusion, picture_samples
+
+MIXING = 1  # purpose of `sample_rng`
 
 
 class Batch(NamedTuple):
@@ -120,14 +123,36 @@ def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -
 
 
 def draw_images(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
-    """`draw` of images of a cache or of streets."""
-    return draw(experiment, images.x_0(indices, experiment.data.codec), step, positions)
+    """`draw` of images of a cache or of streets; those that learn completion are mixed by `data.mix`."""
+    x_0 = images.x_0(indices, experiment.data.codec)
+    if experiment.data.mix:
+        count = generation_count(experiment.training, step)
+        for sample, position in zip(x_0, positions, strict=True):
+            if position >= count:
+                mix(experiment, sample, images, sample_rng(experiment.training.seed, step, position, MIXING))
+    return draw(experiment, x_0, step, positions)
 
 
-def sample_rng(seed: int, step: int, position: int) -> torch.Generator:
-    """The generator of one sample; neighbouring keys give unrelated streams."""
+def mix(experiment: Experiment, x_0: Tensor, images: Images, rng: torch.Generator) -> None:
+    """Put, into a share `data.mix` of samples x_0 (2, H, W), a sector of up to half a turn of another image of a cache.
+
+    PolarMix's swap of scenes (Xiao et al., NeurIPS 2022): a network that corrects the interpolation of its neighbours
+    cannot learn whole scans by heart. Endless streets are new each time and stay whole.
+    """
+    if not isinstance(images, Sized) or torch.rand((), generator=rng) >= experiment.data.mix:
+        return
+    other = images.x_0([int(torch.randint(len(images), (), generator=rng))], experiment.data.codec)[0]
+    other = augment(other, rng, experiment.data.roll, experiment.data.mirror)
+    first, width = torch.rand(2, generator=rng).mul(x_0.shape[-1]).tolist()
+    columns = (int(first) + torch.arange(int(width / 2))) % x_0.shape[-1]
+    x_0[..., columns] = other[..., columns]
+
+
+def sample_rng(seed: int, step: int, position: int, *purpose: int) -> torch.Generator:
+    """The generator of one sample, and of one `purpose`; neighbouring keys give unrelated streams."""
     # torch's CPU generator uses 32 bits of its seed, so the key is hashed, not added up
-    return torch.Generator().manual_seed(int(np.random.SeedSequence((seed, step, position)).generate_state(1)[0]))
+    key = np.random.SeedSequence((seed, step, position, *purpose)).generate_state(1)
+    return torch.Generator().manual_seed(int(key[0]))
 
 
 def _draw(
