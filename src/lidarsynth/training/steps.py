@@ -23,7 +23,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Images, Phase, Task
 from lidarsynth.training.validation import EVERY, judge_diffusion, picture_samples
 
-MIXING = 1  # purpose of `sample_rng`
+MIXING, NOISE = 1, 2  # purposes of `sample_rng` and `sample_seed`
 
 
 class Batch(NamedTuple):
@@ -31,10 +31,19 @@ class Batch(NamedTuple):
 
     x_0: Tensor  # (b, 2, H, W) in [-1, 1], augmented
     t: Tensor  # (b,) times in [0, 1]
-    eps: Tensor  # (b, 2, H, W) unit Gaussian noise
+    seeds: tuple[int, ...]  # of the samples' noise, which is drawn where the batch is used
     known: Tensor  # (b, 2, H, W) bool, False everywhere for the first `generation`
     times: Tensor  # (generation_count,) times of all samples of the global batch that learn p(x_0), for `mean_weight`
     generation: int
+
+    @property
+    def eps(self) -> Tensor:
+        """(b, 2, H, W) unit Gaussian noise, drawn on the batch's device: what a loader need not make nor copy."""
+        device = self.x_0.device
+        noise = torch.empty_like(self.x_0)
+        for sample, seed in zip(noise, self.seeds, strict=True):
+            sample.normal_(generator=torch.Generator(device).manual_seed(seed))
+        return noise
 
 
 class Objective(nn.Module):
@@ -52,13 +61,13 @@ class Objective(nn.Module):
         self.denoiser = build_denoiser(experiment, network)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        n = batch.generation
+        n, noise = batch.generation, batch.eps
         losses = {"generation": batch.t[:0], "completion": batch.t[:0]}
         if n:
-            x_0, t, eps = (part[:n] for part in (batch.x_0, batch.t, batch.eps))
+            x_0, t, eps = (part[:n] for part in (batch.x_0, batch.t, noise))
             losses["generation"] = generation_loss(self.experiment, self.denoiser, x_0, t, eps, batch.times)
         if n < len(batch.x_0):
-            x_0, t, eps, known = (part[n:] for part in (batch.x_0, batch.t, batch.eps, batch.known))
+            x_0, t, eps, known = (part[n:] for part in (batch.x_0, batch.t, noise, batch.known))
             losses["completion"] = completion_loss(self.experiment, self.denoiser, x_0, t, eps, known)
         return losses
 
@@ -112,14 +121,29 @@ def generation_count(training: Training, step: int) -> int:
 
 def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> Batch:
     """The batch of clean images x_0 (b, 2, H, W) that stand at rising `positions` of step `step`'s global batch."""
-    count = generation_count(experiment.training, step)
-    seed = experiment.training.seed
-    drawn = [_draw(experiment, x, p >= count, sample_rng(seed, step, p)) for x, p in zip(x_0, positions, strict=True)]
+    count, seed = generation_count(experiment.training, step), experiment.training.seed
+    augmented, t, known = _augmented(experiment), torch.empty(len(x_0)), torch.zeros(x_0.shape, dtype=torch.bool)
+    clean = torch.empty_like(x_0) if augmented else x_0
+    for i, position in enumerate(positions):
+        rng, completes = sample_rng(seed, step, position), position >= count
+        t[i] = draw_time(rng, completes)  # first, because it is repeated for the other processes' samples
+        if augmented:
+            clean[i] = _augment(experiment, x_0[i], rng)
+        if completes:
+            hide(experiment, clean[i], t[i], known[i], rng)
     times = [
         draw_time(sample_rng(seed, step, p), False) for p in range(count if experiment.diffusion.mean_weight else 0)
     ]
-    x_0, t, eps, known = map(torch.stack, zip(*drawn, strict=True))
-    return Batch(x_0, t, eps, known, torch.tensor(times), sum(p < count for p in positions))
+    seeds = tuple(sample_seed(seed, step, position, NOISE) for position in positions)
+    return Batch(clean, t, seeds, known, torch.tensor(times), sum(p < count for p in positions))
+
+
+def hide(experiment: Experiment, x_0: Tensor, t: Tensor, known: Tensor, rng: torch.Generator) -> None:
+    """Fill in `known` (2, H, W) of a sample that learns completion, and its time t () where that goes with it."""
+    known.copy_(random_known(x_0, rng))
+    if torch.rand((), generator=rng) < experiment.training.upsampling_share:
+        t.fill_(1)
+        known.zero_()[:, ::EVERY] = True
 
 
 def draw_images(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
@@ -150,24 +174,22 @@ def mix(experiment: Experiment, x_0: Tensor, images: Images, rng: torch.Generato
 
 def sample_rng(seed: int, step: int, position: int, *purpose: int) -> torch.Generator:
     """The generator of one sample, and of one `purpose`; neighbouring keys give unrelated streams."""
-    # torch's CPU generator uses 32 bits of its seed, so the key is hashed, not added up
-    key = np.random.SeedSequence((seed, step, position, *purpose)).generate_state(1)
-    return torch.Generator().manual_seed(int(key[0]))
+    return torch.Generator().manual_seed(sample_seed(seed, step, position, *purpose))
 
 
-def _draw(
-    experiment: Experiment, x_0: Tensor, completes: bool, rng: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """x_0, t, eps and known of one sample (2, H, W)."""
-    t = draw_time(rng, completes)  # first, because `draw` repeats it for the other processes' samples
+def sample_seed(*key: int) -> int:
+    """32 bits of a key: torch's CPU generator uses no more of its seed, so the key is hashed, not added up."""
+    return int(np.random.SeedSequence(key).generate_state(1)[0])
+
+
+def _augmented(experiment: Experiment) -> bool:
+    data = experiment.data
+    return data.roll or data.mirror or data.scale > 0
+
+
+def _augment(experiment: Experiment, x_0: Tensor, rng: torch.Generator) -> Tensor:
     x_0 = augment(x_0, rng, experiment.data.roll, experiment.data.mirror)
-    x_0 = scaled(experiment, x_0, rng) if experiment.data.scale else x_0
-    known = random_known(x_0, rng) if completes else torch.zeros(x_0.shape, dtype=torch.bool)
-    eps = torch.randn(x_0.shape, generator=rng)
-    if completes and torch.rand((), generator=rng) < experiment.training.upsampling_share:
-        t, known = torch.ones(()), torch.zeros(x_0.shape, dtype=torch.bool)
-        known[:, ::EVERY] = True
-    return x_0, t, eps, known
+    return scaled(experiment, x_0, rng) if experiment.data.scale else x_0
 
 
 def draw_time(rng: torch.Generator, completes: bool) -> Tensor:
