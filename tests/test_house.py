@@ -54,11 +54,11 @@ ARROWS: dict[str, set[str]] = {
     "official_upsampling": {"experiment", "models", "upsampling_presets"},
     # plain records, so that a release is built from its preset
     "weights": {"build", "hub", "official", "experiment", "presets", "upsampling_presets", "official_upsampling"},
-    "model": {"hub", "lidar", "diffusion", "experiment", "scan_model"},
-    "gan_model": {"hub", "lidar", "diffusion", "experiment", "models", "scan_model"},
-    "upsampling_model": {"hub", "lidar", "models", "experiment", "scan_model"},
-    "interpolation_model": {"lidar", "models", "experiment", "scan_model"},
-    "scan_model": {"lidar", "experiment", "data"},  # data: to recognise a sensor
+    "model": {"lidar", "diffusion", "experiment", "scan_model"},
+    "gan_model": {"lidar", "diffusion", "experiment", "models", "scan_model"},
+    "upsampling_model": {"lidar", "models", "experiment", "scan_model"},
+    "interpolation_model": {"lidar", "models", "scan_model"},
+    "scan_model": {"hub", "lidar", "experiment", "data"},  # data: to recognise a sensor
     "loading": {"build", "experiment", "models", "model", "gan_model", "upsampling_model", "interpolation_model"}
     | {"scan_model", "weights"},
     "training": EVERYTHING,

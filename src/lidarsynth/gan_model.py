@@ -10,37 +10,29 @@ import torch
 from torch import Tensor
 
 from lidarsynth.diffusion.samplers import generators
-from lidarsynth.experiment import Adversarial, Experiment, with_fields
-from lidarsynth.hub import push
+from lidarsynth.experiment import Adversarial, Experiment
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.models.inverse_depth import to_inverse_depth
 from lidarsynth.models.inversion import invert, unit_rms
 from lidarsynth.models.scan_generator import ScanGenerator
-from lidarsynth.scan_model import OnStep, image_in, known_pixels, sensor_that_made, sparse_image, with_known
+from lidarsynth.scan_model import OnStep, ScanModel, imaged_by, known_pixels, with_known
 
 METHODS = ("auto", "inversion")
 STEPS = 500  # of an inversion, as published
 
 
 @dataclass(frozen=True)
-class GanModel:
+class GanModel(ScanModel):
     """A trained GAN with its sensor: Vanilla GAN, DUSty v1 or DUSty v2. It knows range only: reflectance is 0.
 
-    network     the bare torch module: (latents (B, Z), uniform noise) -> images (B, 1, H, W) of inverse depth
-    sensor      the beams and columns of its images
-    experiment  what it is and how it was trained
+    network  (latents (B, Z), uniform noise) -> images (B, 1, H, W) of inverse depth
     """
 
     network: ScanGenerator
     sensor: Sensor
     experiment: Experiment
-
-    def to(self, device: str | torch.device) -> GanModel:
-        """The same model with its network on another device."""
-        self.network.to(device)
-        return self
 
     def into(self, sensor: Sensor | str) -> GanModel:
         """The same weights with images of another sensor, for DUSty v2, which renders any ray angles.
@@ -55,25 +47,8 @@ class GanModel:
             raise ValueError(f"{self.experiment.name}: expected beams and columns divisible by 16, at least 32, "
                              f"found {sensor.height} x {sensor.width}")  # fmt: skip
         angles = torch.from_numpy(sensor.ray_angles())[None].to(self._device)
-        fields = {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width}
         network = ScanGenerator(self.network.generator, angles).eval()
-        return GanModel(network, sensor, with_fields(self.experiment, fields))
-
-    def generate(
-        self,
-        n: int = 1,
-        steps: int | None = None,
-        seed: int = 0,
-        sampler: str | None = None,
-        batch_size: int = 4,
-        on_step: OnStep = None,
-    ) -> list[RangeImage]:
-        """`n` new scans as range images, of one evaluation each; scan i depends on seed + i only.
-
-        Whether a ray returns is decided by the same noise in all scans, as in DUSty's evaluation. Raises ValueError for
-        a sampler, for more than one step and for counts below 1.
-        """
-        return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
+        return GanModel(network, sensor, imaged_by(self.experiment, sensor))
 
     def stream(
         self,
@@ -85,7 +60,11 @@ class GanModel:
         first: int = 0,
         on_step: OnStep = None,
     ) -> Iterator[RangeImage]:
-        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
+        """Scans `first` .. n - 1 of `generate`, of one evaluation each, in the memory of one batch.
+
+        Whether a ray returns is decided by the same noise in all scans, as in DUSty's evaluation. Raises ValueError for
+        a sampler, for more than one step and for counts below 1.
+        """
         self.generation_steps(steps, sampler)
         if n < 1 or batch_size < 1:
             raise ValueError(f"expected n and batch_size of at least 1, found {n} and {batch_size}")
@@ -129,32 +108,6 @@ class GanModel:
         with torch.no_grad():
             images = self.network.synthesize(w, torch.full((1, 1, 1, 1), 0.5, device=self._device)).image
         return with_known(self._image(images[0]), image, known, keep_reflectance=False)
-
-    def upsample(
-        self,
-        scan: Scan,
-        sensor_in: Sensor | str | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor: `complete` of it.
-
-        sensor_in  the sensor that made the scan; None = recognised from the points
-
-        Raises ValueError when the sensor is not recognised or sees nothing that the model does.
-        """
-        image, known = sparse_image(scan, sensor_that_made(scan, sensor_in), self.sensor)
-        return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
-
-    def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
-        """Upload the model to `owner/name` of the Hugging Face hub and return its address, as `LidarModel` does."""
-        return push(self.experiment, self.network, repo_id, private, half)
-
-    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
-        """The scan in this model's image. Raises ValueError for an image of another size."""
-        return image_in(scan, self.sensor, self.experiment.data.projection)
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """1, how often `generate` evaluates the network per batch. Raises ValueError for other wishes."""

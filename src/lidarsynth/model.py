@@ -13,25 +13,22 @@ from lidarsynth.diffusion import langevin, repaint
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import STEPS, Rng, State, even_log_snr, generators, sample, starting_noise
 from lidarsynth.experiment import Experiment, Score
-from lidarsynth.hub import push
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.scan_model import OnStep, image_in, known_pixels, sensor_that_made, sparse_image, with_known
+from lidarsynth.scan_model import OnStep, ScanModel, known_pixels, with_known
 
 METHODS = ("auto", "conditional", "repaint", "posterior")
 SAMPLERS = (*STEPS, "langevin")
 
 
 @dataclass(frozen=True)
-class LidarModel:
-    """A trained model with its sensor.
+class LidarModel(ScanModel):
+    """A trained denoiser with its sensor.
 
-    network     the bare torch module: raw prediction (B, 2, H, W) from x_t (B, 2, H, W) and log_snr (B,)
-    denoiser    (x_t, t) -> x_0_hat
-    sensor      the beams and columns of its images
-    experiment  what it is and how it was trained
+    network   raw prediction (B, 2, H, W) from x_t (B, 2, H, W) and log_snr (B,)
+    denoiser  (x_t, t) -> x_0_hat
     """
 
     network: nn.Module
@@ -44,30 +41,6 @@ class LidarModel:
         """Whether the network can be told the known pixels."""
         return self.experiment.model.network == "conditional-unet"
 
-    def to(self, device: str | torch.device) -> LidarModel:
-        """The same model with its network on another device."""
-        self.network.to(device)
-        return self
-
-    def generate(
-        self,
-        n: int = 1,
-        steps: int | None = None,
-        seed: int = 0,
-        sampler: str | None = None,
-        batch_size: int = 4,
-        on_step: OnStep = None,
-    ) -> list[RangeImage]:
-        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
-
-        steps    network evaluations per scan (twice as many for `heun`; for `langevin` at most as many, in whole noise
-                 levels); default 32, or 1161 for `langevin`: 232 levels x 5 and a final denoising
-        sampler  ddpm | ddim | dpmpp-2m | heun | langevin; default ddpm, or langevin after score matching
-
-        Raises ValueError for an unknown sampler or counts below 1, or below 11 for `langevin`.
-        """
-        return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
-
     def stream(
         self,
         n: int,
@@ -78,7 +51,14 @@ class LidarModel:
         first: int = 0,
         on_step: OnStep = None,
     ) -> Iterator[RangeImage]:
-        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
+
+        steps    network evaluations per scan (twice as many for `heun`; for `langevin` at most as many, in whole noise
+                 levels); default 32, or 1161 for `langevin`: 232 levels x 5 and a final denoising
+        sampler  ddpm | ddim | dpmpp-2m | heun | langevin; default ddpm, or langevin after score matching
+
+        Raises ValueError for an unknown sampler or counts below 1, or below 11 for `langevin`.
+        """
         sampler, steps = self._sampler(sampler), self.generation_steps(steps, sampler)
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
@@ -121,39 +101,6 @@ class LidarModel:
         states = self._completion(x_0, mask, self._method(method), steps, resamples, sampler, generators(seed, 1))
         filled = self._image(_last(states, on_step, calls)[0])
         return with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
-
-    def upsample(
-        self,
-        scan: Scan,
-        sensor_in: Sensor | str | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor.
-
-        sensor_in  the sensor that made the scan; None = recognised from the points. Its beams tell which rows of the
-                   image were looked at; points outside this model's view are left out.
-
-        Raises ValueError when the sensor is not recognised or sees nothing that the model does.
-        """
-        image, known = sparse_image(scan, sensor_that_made(scan, sensor_in), self.sensor)
-        return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
-
-    def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
-        """Upload the model, with a card filled in from its experiment, to `owner/name` of the Hugging Face hub.
-
-        half  weights in float16, at half the size
-
-        Returns the address; `load("owner/name")` then gives the model anywhere. Needs the extra `hub` and a token.
-        Raises ValueError in one line when the hub refuses or cannot be reached.
-        """
-        return push(self.experiment, self.network, repo_id, private, half)
-
-    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
-        """The scan in this model's image. Raises ValueError for an image of another size."""
-        return image_in(scan, self.sensor, self.experiment.data.projection)
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How many steps of the sampler `generate` takes per batch."""

@@ -2,48 +2,48 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
 from torch import nn
 
 from lidarsynth.data.recognise import recognise
-from lidarsynth.experiment import Experiment
+from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.hub import push
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 OnStep = Callable[[], object] | None  # called after every network step, for progress bars
 
 
-class ScanModel(Protocol):
+class ScanModel(ABC):
     """A trained model with its sensor, as `load` returns it.
 
-    A model that cannot do what is asked, such as a GAN that is asked for a number of steps, raises ValueError. `steps`,
-    `sampler` and `method` of None or `auto` are the model's own.
+    network     the bare torch module
+    sensor      the beams and columns of its images
+    experiment  what it is and how it was trained
+
+    Each kind is a frozen record of these and of what else it needs. One that cannot do what is asked, such as a GAN
+    that is asked for a number of steps, raises ValueError. `steps`, `sampler` and `method` of None or `auto` are the
+    model's own.
     """
 
-    @property
-    def network(self) -> nn.Module:
-        """The bare torch module."""
-        ...
+    network: nn.Module
+    sensor: Sensor
+    experiment: Experiment
 
-    @property
-    def sensor(self) -> Sensor:
-        """The beams and columns of its images."""
-        ...
-
-    @property
-    def experiment(self) -> Experiment:
-        """What it is and how it was trained."""
-        ...
-
-    def to(self, device: str | torch.device) -> ScanModel:
+    def to(self, device: str | torch.device) -> Self:
         """The same model with its network on another device."""
-        ...
+        self.network.to(device)
+        return self
 
     def generate(
         self,
@@ -54,9 +54,13 @@ class ScanModel(Protocol):
         batch_size: int = 4,
         on_step: OnStep = None,
     ) -> list[RangeImage]:
-        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size."""
-        ...
+        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
 
+        Raises ValueError as `stream` does.
+        """
+        return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
+
+    @abstractmethod
     def stream(
         self,
         n: int,
@@ -68,8 +72,8 @@ class ScanModel(Protocol):
         on_step: OnStep = None,
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
-        ...
 
+    @abstractmethod
     def complete(
         self,
         scan: Scan | RangeImage,
@@ -82,7 +86,6 @@ class ScanModel(Protocol):
         on_step: OnStep = None,
     ) -> RangeImage:
         """Fill what was not measured; pixels of `known` (H, W) bool come back exactly as they were."""
-        ...
 
     def upsample(
         self,
@@ -93,29 +96,76 @@ class ScanModel(Protocol):
         seed: int = 0,
         on_step: OnStep = None,
     ) -> RangeImage:
-        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor."""
-        ...
+        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor.
+
+        sensor_in  the sensor that made the scan; None = recognised from the points. Its beams tell which rows of the
+                   image were looked at; points outside this model's view are left out.
+
+        Raises ValueError when the sensor is not recognised or sees nothing that the model does.
+        """
+        image, known = sparse_image(scan, sensor_that_made(scan, sensor_in), self.sensor)
+        return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
 
     def image_of(self, scan: Scan | RangeImage) -> RangeImage:
-        """The scan in this model's image."""
-        ...
+        """The scan in this model's image. Raises ValueError for an image of another size."""
+        if isinstance(scan, Scan):
+            return project(scan, self.sensor, self.experiment.data.projection)
+        if scan.shape != (self.sensor.height, self.sensor.width):
+            raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
+        return scan
 
+    @abstractmethod
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch."""
-        ...
 
+    @abstractmethod
     def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
         """How often `complete` calls `on_step`."""
-        ...
+
+    def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
+        """Upload the model, with a card filled in from its experiment, to `owner/name` of the Hugging Face hub.
+
+        half  weights in float16, at half the size
+
+        Returns the address; `load("owner/name")` then gives the model anywhere. Needs the extra `hub` and a token.
+        Raises ValueError in one line when the hub refuses or cannot be reached.
+        """
+        return push(self.experiment, self.network, repo_id, private, half)
 
 
-def image_in(scan: Scan | RangeImage, sensor: Sensor, projection: str) -> RangeImage:
-    """The scan in an image of `sensor`. Raises ValueError for an image of another size."""
-    if isinstance(scan, Scan):
-        return project(scan, sensor, projection)
-    if scan.shape != (sensor.height, sensor.width):
-        raise ValueError(f"expected an image of {sensor.height} x {sensor.width}, found {scan.shape}")
-    return scan
+class Completer(ScanModel, ABC):
+    """A model that fills scans and makes none from noise."""
+
+    kind: ClassVar[str] = "one that completes scans"
+
+    def stream(
+        self,
+        n: int,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Raises ValueError: it makes no scans."""
+        raise self._generates_nothing()
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """Raises ValueError, as `stream`."""
+        raise self._generates_nothing()
+
+    def _generates_nothing(self) -> ValueError:
+        return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found "
+                          f"{self.kind}; use complete or upsample")  # fmt: skip
+
+
+def imaged_by(experiment: Experiment, sensor: Sensor) -> Experiment:
+    """The experiment with images of another sensor."""
+    return with_fields(
+        experiment,
+        {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width},
+    )
 
 
 def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:

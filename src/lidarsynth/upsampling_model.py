@@ -5,43 +5,36 @@ Images of these networks begin with the lowest beam, ours with the highest; both
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.experiment import Experiment, Upsampling, with_fields
-from lidarsynth.hub import push
+from lidarsynth.experiment import Experiment, Upsampling
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.models.iln import ILN, LIIF
 from lidarsynth.models.lidar_sr import LidarSR, mc_dropout, remove_uncertain
-from lidarsynth.scan_model import OnStep, image_in, known_pixels, sensor_that_made, sparse_image, with_known
+from lidarsynth.scan_model import Completer, OnStep, imaged_by, known_pixels, sensor_that_made, sparse_image, with_known
 
 HARDLY = 0.02  # share of a row's pixels; of a beam with fewer known ones nothing is known
 PIECE = 16_384  # queries at once: what bounds the memory of ILN
 
 
 @dataclass(frozen=True)
-class UpsamplingModel:
+class UpsamplingModel(Completer):
     """A trained network with the sensor of its images.
 
-    network     the bare torch module: LiDAR-SR fills a grid, ILN and LIIF answer any direction
-    sensor      the beams and columns of its images
-    experiment  what it is and how it was trained; its group `upsampling` tells which beams are known
+    LiDAR-SR fills a grid, ILN and LIIF answer any direction. The experiment's group `upsampling` tells which beams are
+    known.
     """
 
     network: LidarSR | ILN | LIIF
     sensor: Sensor
     experiment: Experiment
-
-    def to(self, device: str | torch.device) -> UpsamplingModel:
-        """The same model with its network on another device."""
-        self.network.to(device)
-        return self
 
     def into(self, sensor: Sensor | str) -> UpsamplingModel:
         """The same network with images of another sensor. Raises ValueError where LiDAR-SR cannot have that size."""
@@ -49,33 +42,7 @@ class UpsamplingModel:
         if isinstance(self.network, LidarSR) and (sensor.height % 16 or sensor.width % 16):
             raise ValueError(f"{self.experiment.name}: expected a sensor whose beams and columns are divisible by 16, "
                              f"found {sensor.height} x {sensor.width}")  # fmt: skip
-        fields = {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width}
-        return replace(self, sensor=sensor, experiment=with_fields(self.experiment, fields))
-
-    def generate(
-        self,
-        n: int = 1,
-        steps: int | None = None,
-        seed: int = 0,
-        sampler: str | None = None,
-        batch_size: int = 4,
-        on_step: OnStep = None,
-    ) -> list[RangeImage]:
-        """Raises ValueError: these networks complete scans, and make none."""
-        raise self._generates_nothing()
-
-    def stream(
-        self,
-        n: int,
-        steps: int | None = None,
-        seed: int = 0,
-        sampler: str | None = None,
-        batch_size: int = 4,
-        first: int = 0,
-        on_step: OnStep = None,
-    ) -> Iterator[RangeImage]:
-        """Raises ValueError, as `generate`."""
-        raise self._generates_nothing()
+        return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor))
 
     def complete(
         self,
@@ -145,18 +112,6 @@ class UpsamplingModel:
             filled = self._asked(low, row, column, on_step)
         return with_known(self._image(filled), image, known, keep_reflectance=True)
 
-    def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
-        """Upload the model to `owner/name` of the Hugging Face hub, as `LidarModel` does; returns the address."""
-        return push(self.experiment, self.network, repo_id, private, half)
-
-    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
-        """The scan in this model's image. Raises ValueError for an image of another size."""
-        return image_in(scan, self.sensor, self.experiment.data.projection)
-
-    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
-        """Raises ValueError, as `generate`."""
-        raise self._generates_nothing()
-
     def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
         """How many passes of the network `complete` takes. Raises ValueError for what it cannot do."""
         return self._passes(method, steps) or 1
@@ -164,10 +119,6 @@ class UpsamplingModel:
     @property
     def _group(self) -> Upsampling:
         return self.experiment.upsampling or Upsampling()
-
-    def _generates_nothing(self) -> ValueError:
-        return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found one that "
-                          f"completes scans; use complete or upsample")  # fmt: skip
 
     def _passes(self, method: str, steps: int | None, sampler: str | None = None) -> int | None:
         """How many passes under dropout, or None for one without it. Raises ValueError for what it cannot do."""
