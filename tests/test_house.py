@@ -57,7 +57,7 @@ ARROWS: dict[str, set[str]] = {
     "model": {"lidar", "diffusion", "experiment", "scan_model"},
     "gan_model": {"lidar", "diffusion", "experiment", "models", "scan_model"},
     "upsampling_model": {"lidar", "models", "experiment", "scan_model"},
-    "interpolation_model": {"lidar", "models", "scan_model"},
+    "interpolation_model": {"lidar", "models", "experiment", "scan_model"},
     "scan_model": {"hub", "lidar", "experiment", "data"},  # data: to recognise a sensor
     "loading": {"build", "experiment", "models", "model", "gan_model", "upsampling_model", "interpolation_model"}
     | {"scan_model", "weights"},
