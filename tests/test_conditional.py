@@ -5,7 +5,7 @@ import torch
 
 from lidarsynth.models.conditional import ConditionalUNet
 from lidarsynth.models.efficient_unet import EfficientUNet
-from lidarsynth.models.interpolation import fill_in
+from lidarsynth.models.interpolation import fill_in, interpolate
 
 
 @pytest.fixture
@@ -60,6 +60,19 @@ def test_candidates_replace_the_interpolation_where_the_network_says_so(chooser,
         torch.testing.assert_close(chooser(**case)[0, :, 6], expected)
 
 
+def test_the_nearest_in_any_direction_is_a_seventh_candidate(case):
+    torch.manual_seed(0)
+    unet = EfficientUNet(8, 16, (16, 64), 8, None, (1, 1, 2, 2), (1, 1, 1, 1), stem=(2, 4))
+    net = ConditionalUNet(unet).eval().requires_grad_(False)
+    bias = next(value for name, value in unet.out_conv.named_parameters() if name.endswith("bias")).view(16, 8)
+    bias[14:16] = 100.0
+    expected = interpolate(case["known"], case["mask"], "nearest")
+    out = net(**case)
+    torch.testing.assert_close(out[1, 0], expected[1, 0])  # scattered points
+    torch.testing.assert_close(out[0], expected[0])  # every fourth beam
+    assert torch.equal(out[2], torch.zeros(2, 16, 64)), "nothing known in sample 2"
+
+
 def test_candidates_need_known_pixels(chooser, case):
     assert torch.equal(chooser(case["x_t"], case["log_snr"]), torch.zeros(3, 2, 16, 64))
     assert torch.equal(chooser(**case)[2], torch.zeros(2, 16, 64)), "nothing known in sample 2"
@@ -69,7 +82,7 @@ def test_candidates_need_known_pixels(chooser, case):
 
 def test_a_network_of_another_width_is_refused():
     unet = EfficientUNet(8, 3, (16, 64), 8, None, (1, 1, 2, 2), (1, 1, 1, 1), stem=(2, 4))
-    with pytest.raises(ValueError, match="out_channels = C or 7 C, got 8 and 3"):
+    with pytest.raises(ValueError, match="out_channels = C, 7 C or 8 C, got 8 and 3"):
         ConditionalUNet(unet)
 
 
@@ -109,5 +122,5 @@ def test_impossible_inputs_are_refused(net, case):
         net(**{**case, "mask": None})
     with pytest.raises(ValueError, match=r"known must have the shape of x_t, .* got \(3, 1, 16, 64\)"):
         net(**{**case, "known": case["known"][:, :1]})
-    with pytest.raises(ValueError, match="out_channels = C or 7 C, got 2 and 2"):
+    with pytest.raises(ValueError, match="out_channels = C, 7 C or 8 C, got 2 and 2"):
         ConditionalUNet(EfficientUNet(resolution=(16, 64), base_channels=8))

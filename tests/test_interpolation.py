@@ -9,6 +9,7 @@ from lidarsynth.models.interpolation import (
     fill_in,
     interpolate,
     nearest_along_axes,
+    nearest_around,
     resize_rows,
     sample_queries,
 )
@@ -105,6 +106,29 @@ def test_nearest_is_at_the_euclidean_distance(density):
         found = (rows - taken[b, c] // 16) ** 2 + torch.minimum(found_dx, 16 - found_dx) ** 2
         torch.testing.assert_close(found, squared.min(-1).values)
         assert mask[b, c].flatten()[taken[b, c].flatten()].all()
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3, 16])
+def test_nearest_around_looks_no_farther_than_its_radius(radius):
+    known, mask = random_case(0.1, seed=2)
+    mask = mask.bool()
+    mask[1, 1] = False
+    values, found = nearest_around(known, mask, radius)
+    torch.testing.assert_close(values, interpolate(known, mask, "nearest") * found)
+    steps = range(-radius, radius + 1)
+    near = [
+        mask.roll(dx, 3).roll(dy, 2) & _rows_left(mask, dy)
+        for dx in steps
+        for dy in steps
+        if dx**2 + dy**2 <= radius**2
+    ]
+    assert torch.equal(found, torch.stack(near).any(0))
+
+
+def _rows_left(mask: torch.Tensor, dy: int) -> torch.Tensor:
+    """Bool: pixels into which a shift by dy rows does not wrap."""
+    row = torch.arange(mask.shape[2])[:, None] - dy
+    return ((row >= 0) & (row < mask.shape[2])).expand_as(mask)
 
 
 def test_bicubic_has_the_weights_of_keys_kernel_half_way():

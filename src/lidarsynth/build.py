@@ -84,7 +84,8 @@ def _refinenet(experiment: Experiment, sensor: Sensor) -> RefineNet:
 
 
 def _conditional(experiment: Experiment, sensor: Sensor) -> ConditionalUNet:
-    return ConditionalUNet(_unet(experiment, sensor, 8, 2 * (1 + CANDIDATES) if experiment.model.candidates else 2))
+    model = experiment.model
+    return ConditionalUNet(_unet(experiment, sensor, 8, 2 * (1 + CANDIDATES + model.around) if model.candidates else 2))
 
 
 def _rangenet(experiment: Experiment, sensor: Sensor) -> RangeNet:

@@ -40,6 +40,7 @@ class Model:
     ring: bool = True  # circular in width
     stem: tuple[int, int] = (1, 1)  # patch of pixels that becomes channels, (1, 1) = R2DM
     candidates: bool = False  # conditional-unet: chooses among the nearest known values, not only corrects their mean
+    around: bool = False  # and the nearest known value in any direction
     dropout: float = 0.0
 
 

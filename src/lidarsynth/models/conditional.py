@@ -4,9 +4,10 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.models.efficient_unet import EfficientUNet
-from lidarsynth.models.interpolation import fill_in, nearest_along_axes
+from lidarsynth.models.interpolation import fill_in, nearest_along_axes, nearest_around
 
 CANDIDATES = 6  # interpolation, left, right, above, below, nothing returned
+RADIUS = 8  # pixels, of a seventh: the nearest in any direction, where points are scattered
 
 
 class ConditionalUNet(nn.Module):
@@ -15,7 +16,8 @@ class ConditionalUNet(nn.Module):
     `unet` takes four times as many channels as it gives, C. It corrects the interpolation of the known pixels. If it
     gives C + 6 C channels, the other 6 C choose, by a softmax per channel and pixel, what is corrected: the
     interpolation, one of the nearest known values (left, right, above, below), or -1, nothing returned; so that an edge
-    is where one candidate gives way to another, and not a slope between them.
+    is where one candidate gives way to another, and not a slope between them. With C + 7 C channels it chooses the
+    nearest known value in any direction too, within 8 pixels.
 
     Its last layer starts at zero, so an untrained network returns (nearly, with candidates) the interpolation of the
     known pixels; where nothing is known it predicts all of x_0.
@@ -28,9 +30,10 @@ class ConditionalUNet(nn.Module):
     def __init__(self, unet: EfficientUNet):
         super().__init__()
         channels = unet.in_channels // 4
-        if unet.in_channels % 4 or unet.out_channels not in (channels, channels * (1 + CANDIDATES)):
+        possible = [channels * count for count in (1, 1 + CANDIDATES, 2 + CANDIDATES)]
+        if unet.in_channels % 4 or unet.out_channels not in possible:
             raise ValueError(
-                f"unet must have in_channels = 4 C and out_channels = C or {1 + CANDIDATES} C, "
+                f"unet must have in_channels = 4 C and out_channels = C, {1 + CANDIDATES} C or {2 + CANDIDATES} C, "
                 f"got {unet.in_channels} and {unet.out_channels}"
             )
         self.unet = unet
@@ -51,18 +54,22 @@ class ConditionalUNet(nn.Module):
         if self.unet.out_channels == x_t.shape[1]:
             return output + fill
         correction, scores = output.float().split([x_t.shape[1], output.shape[1] - x_t.shape[1]], dim=1)
-        return correction + _chosen(scores.unflatten(1, (CANDIDATES, x_t.shape[1])), known, mask, fill)
+        return correction + _chosen(scores.unflatten(1, (-1, x_t.shape[1])), known, mask, fill)
 
 
 def _chosen(scores: Tensor, known: Tensor, mask: Tensor, fill: Tensor) -> Tensor:
-    """Mean (B,C,H,W) of the candidates by `scores` (B,6,C,H,W); 0 where a channel has no known pixel."""
+    """Mean (B,C,H,W) of the candidates by `scores` (B,6 or 7,C,H,W); 0 where a channel has no known pixel."""
     values, found = nearest_along_axes(known, mask)
     some = mask.flatten(2).any(2)[:, :, None, None].expand(known.shape)
-    candidates = torch.stack([fill, *values, torch.full_like(fill, -1)], dim=1)
-    possible = torch.stack([torch.ones_like(some), *found, some], dim=1)
-    prior = scores.new_tensor([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])[:, None, None, None]
-    weights = (scores + prior).masked_fill(~possible, -torch.inf).softmax(dim=1)
-    return (weights * candidates).sum(dim=1)
+    candidates = [fill, *values, torch.full_like(fill, -1)]
+    possible = [torch.ones_like(some), *found, some]
+    if scores.shape[1] > CANDIDATES:
+        around, near = nearest_around(known, mask, RADIUS)
+        candidates.append(around)
+        possible.append(near)
+    prior = scores.new_tensor([3.0] + [0.0] * (scores.shape[1] - 1))[:, None, None, None]
+    weights = (scores + prior).masked_fill(~torch.stack(possible, dim=1), -torch.inf).softmax(dim=1)
+    return (weights * torch.stack(candidates, dim=1)).sum(dim=1)
 
 
 def _check(x_t: Tensor, known: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,7 @@ def interpolate(known: Tensor, mask: Tensor, method: str = "bilinear") -> Tensor
     rows = mask.all(3)
     if torch.equal(rows, mask.any(3)):
         return torch.where(mask, known, _interpolate_rows(known, rows, method))
-    return _nearest(known, mask) if method == "nearest" else fill_in(known, mask)
+    return _nearest(known, mask, known.shape[3])[0] if method == "nearest" else fill_in(known, mask)
 
 
 class Interpolation(nn.Module):
@@ -103,6 +103,19 @@ def nearest_along_axes(known: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     above, below = ((v.transpose(2, 3), f.transpose(2, 3)) for v, f in _nearest_sides(*upright, ring=False))
     values, found = zip(left, right, above, below, strict=True)
     return torch.stack(values), torch.stack(found)
+
+
+@torch.no_grad()
+def nearest_around(known: Tensor, mask: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """The known pixel nearest to each pixel in any direction, itself where it is known, if within `radius` pixels.
+
+    `known` and `mask` (B,C,H,W) as in `fill_in`. Returns values (B,C,H,W), 0 where there is none, and whether there is
+    one, bool of that shape. Distances are Euclidean and go around the ring. Raises ValueError if the shapes differ.
+    """
+    known, mask = _check(known, mask)
+    value, distance = _nearest(known, mask, radius)
+    found = distance <= radius**2
+    return value * found, found
 
 
 def _nearest_sides(known: Tensor, mask: Tensor, ring: bool) -> list[tuple[Tensor, Tensor]]:
@@ -195,8 +208,11 @@ def _cubic(distance: Tensor, a: float = -0.75) -> Tensor:
     return torch.where(distance <= 1, near, far)
 
 
-def _nearest(known: Tensor, mask: Tensor) -> Tensor:
-    """Value of the nearest known pixel: exact Euclidean distance transform, columns first, then around the ring."""
+def _nearest(known: Tensor, mask: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Value of the nearest known pixel and its squared distance, exact up to `radius`; 0 in a channel without any.
+
+    Euclidean distance transform, columns first, then around the ring.
+    """
     position, before, after = _sides(mask.transpose(2, 3).contiguous())
     height, width = known.shape[2:]
     take_after = (after < height) & ((before < 0) | (after - position < position - before))
@@ -205,7 +221,7 @@ def _nearest(known: Tensor, mask: Tensor) -> Tensor:
     value = known.gather(2, source.clamp(0, height - 1).long().transpose(2, 3))
     best, best_value = distance, value
     empty = ~mask.flatten(2).any(2)[:, :, None, None]
-    for shift in range(1, width // 2 + 1):
+    for shift in range(1, min(radius, width // 2) + 1):
         if not bool(((best > shift**2) & ~empty).any()):
             break
         for signed in (shift, -shift):
@@ -213,7 +229,7 @@ def _nearest(known: Tensor, mask: Tensor) -> Tensor:
             closer = candidate < best
             best = torch.where(closer, candidate, best)
             best_value = torch.where(closer, value.roll(signed, 3), best_value)
-    return torch.where(mask, known, best_value).masked_fill(empty, 0)
+    return best_value.masked_fill(empty, 0), best
 
 
 def _check(known: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from lidarsynth.build import GANS, UPSAMPLERS, load_weights
 from lidarsynth.experiment import Experiment
 
 # Fields of the model that do not change what weights mean; residual blocks more than the weights have begin as identity
-FREE = ("model.network", "model.ring", "model.dropout", "model.candidates", "model.num_residual_blocks")
+FREE = ("model.network", "model.ring", "model.dropout", "model.candidates", "model.around", "model.num_residual_blocks")
 MEANING = ("data.codec", "diffusion.kind", "diffusion.schedule")  # fields outside the model that do
 FIRST = "in_conv.weight"
 LAST = "out_conv."
