@@ -21,7 +21,7 @@ from lidarsynth.build import build_network, build_sensor
 from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.experiment import Experiment, with_fields
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.training.examples import Examples, Streets, load_batches, open_images
+from lidarsynth.training.examples import Examples, Learned, Streets, load_batches, open_images
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.machine import accelerator_of, workers_of
 from lidarsynth.training.options import Options
@@ -42,7 +42,7 @@ def noise_cache(folder: Path, experiment: Experiment, count: int = 64) -> Cached
     return CachedImages(folder)
 
 
-def loader_speed(experiment: Experiment, images: CachedImages | Streets, workers: int, steps: int) -> float:
+def loader_speed(experiment: Experiment, images: Learned, workers: int, steps: int) -> float:
     """Samples per second of one process's loader when nobody trains."""
     batches = load_batches(Examples(experiment, images, 1), 0, range(1), workers)
     next(batches)
@@ -76,7 +76,7 @@ def main() -> None:
         measure(experiment, images, options, args.steps)
 
 
-def measure(experiment: Experiment, images: CachedImages | Streets, options: Options, steps: int) -> None:
+def measure(experiment: Experiment, images: Learned, options: Options, steps: int) -> None:
     """Train for a while and print the table."""
     accelerator = accelerator_of(options)
     on_gpu = accelerator.device.type == "cuda"

@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from torch.utils.data import DataLoader
 
 from lidarsynth.cli import main
 from lidarsynth.data import cache
-from lidarsynth.data.dataset import CachedImages, read_index, verify, write_cache
+from lidarsynth.data.dataset import CachedImages, SeveralCaches, read_index, verify, write_cache
 from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, prepare, summary
 from lidarsynth.lidar.depth import CODECS, to_x_0
 from lidarsynth.lidar.projection import project, thin
@@ -118,6 +120,30 @@ def test_open_files_and_memory_do_not_grow_with_the_cache(tmp_path: Path, monkey
     assert len(os.listdir("/proc/self/fd")) == before
     torch.testing.assert_close(*batches, rtol=0, atol=0)
     assert "0000299.npy" not in Path("/proc/self/maps").read_text()
+
+
+def test_several_caches_are_one_of_which_each_is_seen_equally_often(tmp_path: Path):
+    folders = [tmp_path / "five", tmp_path / "two"]
+    list(write_cache(folders[0], image, 5, SENSOR, {"name": "five", "projection": "auto"}, name=name))
+    list(write_cache(folders[1], lambda i: image(10 + i), 2, SENSOR, {"name": "two", "projection": "auto"}))
+    one, five, two = SeveralCaches(folders), CachedImages(folders[0]), CachedImages(folders[1])
+    expected = [five[0], two[0], five[1], two[1], five[2], two[0], five[3], two[1], five[4], two[0]]
+    assert len(one) == 10 and one.sensor == SENSOR
+    for found, truth in zip(one.take([*range(10)]), expected, strict=True):
+        np.testing.assert_array_equal(found.range, truth.range)
+    torch.testing.assert_close(one.x_0([1, 2, 3]), torch.cat([two.x_0([0]), five.x_0([1]), two.x_0([1])]))
+    assert (one.name(2), one.name(7)) == (five.name(1), two.name(1))
+    assert one.source == {"name": "several caches (5 of five and 2 of two)", "projection": "auto"}
+    for wrong in (-1, 10):
+        with pytest.raises(IndexError, match=rf"0\.\.9, got {wrong}"):
+            one[wrong]
+    for other, source in ((replace(SENSOR, max_range=70.0), "auto"), (SENSOR, "unfolding")):
+        write = write_cache(tmp_path / "o", lambda i, s=other: replace(image(i), sensor=s), 1, other,
+                            {"name": "o", "projection": source})  # fmt: skip
+        list(write)
+        with pytest.raises(ValueError, match=r"o: expected the sensor and the projection of .*five, eight of 8 x 32"):
+            SeveralCaches([folders[0], tmp_path / "o"])
+        shutil.rmtree(tmp_path / "o")
 
 
 def test_a_cache_of_the_first_format_is_read_and_continued(tmp_path: Path):

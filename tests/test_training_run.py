@@ -120,6 +120,22 @@ def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
     torch.testing.assert_close(theirs, ours, rtol=1e-3, atol=1e-4)
 
 
+def test_a_run_on_several_caches_says_so(cache: Path, tmp_path: Path):
+    few = tmp_path / "few"
+    list(write_cache(few, lambda i: noise_image(100 + i), 3, SENSOR, {"name": "few"}))
+    list(
+        run(
+            resolve("tiny", ("training.steps=2",), data=f"{cache},{few}"),
+            f"{cache},{few}",
+            tmp_path / "run",
+            options=QUIET,
+        )
+    )
+    assert load(tmp_path / "run")[0].card.data == "48 images of several caches (24 of noise and 3 of few)"
+    with pytest.raises(ValueError, match="nowhere"):
+        list(run(tiny(2), f"{cache},nowhere", tmp_path / "other", options=QUIET))
+
+
 def test_a_run_s_folder_loads_and_keeps_the_last_checkpoints(cache: Path, tmp_path: Path):
     options = Options(save_every=2, keep=2, log_every=2, sample_every=4, workers=0)
     steps = [p.step for p in run(tiny(8), cache, tmp_path, options=options)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,8 @@ from lidarsynth.lidar.depth import encode
 from lidarsynth.lidar.scan import RangeImage
 
 __all__ = [
-    "INDEX", "RANGE_STEP", "REPORT", "SHARD", "CachedImages", "pack", "read_index", "record_type", "verify",
-    "write_cache",
+    "INDEX", "RANGE_STEP", "REPORT", "SHARD", "CachedImages", "SeveralCaches", "pack", "read_index", "record_type",
+    "verify", "write_cache",
 ]  # fmt: skip
 
 
@@ -96,6 +97,55 @@ class CachedImages:
             np.take(code, record["range"], out=sample[0], mode="clip")  # every code is in the table; clip spares a copy
             np.take(reflectance, record["reflectance"], out=sample[1], mode="clip")
         return torch.from_numpy(x_0)
+
+
+class SeveralCaches:
+    """The images of several caches of one sensor as one, of each equally many: those of a small cache come again.
+
+    Used like `CachedImages`. Raises ValueError when the caches' sensors or projections differ.
+    """
+
+    def __init__(self, folders: Sequence[str | Path]):
+        self._parts = [CachedImages(folder) for folder in folders]
+        first, sources = self._parts[0], [part.source for part in self._parts]
+        projection = sources[0].get("projection")
+        for folder, part in zip(folders, self._parts, strict=True):
+            if part.sensor != first.sensor or part.source.get("projection") != projection:
+                raise ValueError(
+                    f"{folder}: expected the sensor and the projection of {folders[0]}, {first.sensor.name} of "
+                    f"{first.sensor.height} x {first.sensor.width} and {projection}, found {part.sensor.name} of "
+                    f"{part.sensor.height} x {part.sensor.width} and {part.source.get('projection')}"
+                )
+        self.sensor = first.sensor
+        named = " and ".join(f"{len(part):,} of {part.source['name']}" for part in self._parts)
+        self.source = {"name": f"several caches ({named})"} | ({"projection": projection} if projection else {})
+
+    def __len__(self) -> int:
+        return len(self._parts) * max(map(len, self._parts))
+
+    def _place(self, i: int) -> tuple[CachedImages, int]:
+        """The cache of image i, and its number there."""
+        if not 0 <= i < len(self):
+            raise IndexError(f"expected an image number in 0..{len(self) - 1}, got {i}")
+        part = self._parts[i % len(self._parts)]
+        return part, i // len(self._parts) % len(part)
+
+    def name(self, i: int) -> Name:
+        """Source, sequence and frame of image i."""
+        part, place = self._place(i)
+        return part.name(place)
+
+    def __getitem__(self, i: int) -> RangeImage:
+        part, place = self._place(i)
+        return part[place]
+
+    def take(self, indices: list[int]) -> list[RangeImage]:
+        """Images by their numbers."""
+        return [self[i] for i in indices]
+
+    def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
+        """(B, 2, H, W) float32 in [-1, 1]."""
+        return torch.cat([part.x_0([place], codec) for part, place in map(self._place, indices)])
 
 
 def _tables(sensor: sensors.Sensor, codec: str) -> tuple[np.ndarray, np.ndarray]:

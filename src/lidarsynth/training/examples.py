@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from lidarsynth.build import build_sensor
-from lidarsynth.data.dataset import CachedImages
+from lidarsynth.data.dataset import CachedImages, SeveralCaches
 from lidarsynth.data.frames import Name
 from lidarsynth.experiment import Experiment, Training
 from lidarsynth.lidar.depth import to_x_0
@@ -62,13 +62,18 @@ class Streets:
         return torch.stack([to_x_0(image, codec) for image in self.take(indices)])
 
 
-def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> CachedImages | Streets:
+Learned = CachedImages | SeveralCaches | Streets  # what a network can learn from
+
+
+def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> Learned:
     """The images of a cache folder, or streets of `seed` (default the experiment's) for the word `synthetic`.
 
-    Raises ValueError when the folder is no cache.
+    Several folders, with commas between them, are seen equally often. Raises ValueError when one is no cache.
     """
     if str(data) == SYNTHETIC:
         return Streets(experiment.training.seed if seed is None else seed, build_sensor(experiment))
+    if "," in str(data) and not Path(data).exists():
+        return SeveralCaches(str(data).split(","))
     return CachedImages(data)
 
 
@@ -78,7 +83,7 @@ def epoch_order(seed: int, epoch: int, length: int) -> Tensor:
     return torch.randperm(length, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
 
 
-def batch_indices(training: Training, step: int, images: CachedImages | Streets) -> list[int]:
+def batch_indices(training: Training, step: int, images: Learned) -> list[int]:
     """Which images the global batch of step `step` holds: each epoch visits every image of a cache once."""
     if isinstance(images, Streets):
         return images.indices(step, training.batch_size)
@@ -93,7 +98,7 @@ class Examples(Dataset):
     `parts` is processes times passes of gradient accumulation. Raises ValueError unless it divides the batch size.
     """
 
-    def __init__(self, experiment: Experiment, images: CachedImages | Streets, parts: int):
+    def __init__(self, experiment: Experiment, images: Learned, parts: int):
         size = experiment.training.batch_size
         if size % parts:
             raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")

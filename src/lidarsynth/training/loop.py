@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.data.dataset import CachedImages
 from lidarsynth.experiment import Experiment, Training
 from lidarsynth.models.conditional import ConditionalUNet
-from lidarsynth.training.examples import Examples, Streets, load_batches
+from lidarsynth.training.examples import Examples, Learned, Streets, load_batches
 from lidarsynth.training.machine import accelerator_of, fixed_randomness, workers_of
 from lidarsynth.training.options import Options
 from lidarsynth.training.task import Phase
@@ -114,7 +113,7 @@ def update_ema(ema: nn.Module, network: nn.Module, decay: float, buffers: bool =
 def train(
     experiment: Experiment,
     run: Run,
-    images: CachedImages | Streets,
+    images: Learned,
     options: Options | None = None,
     accelerator: Accelerator | None = None,
 ) -> Iterator[Progress]:
@@ -147,7 +146,7 @@ def train(
 
 
 def _batches(
-    experiment: Experiment, images: CachedImages | Streets, step: int, options: Options, accelerator: Accelerator
+    experiment: Experiment, images: Learned, step: int, options: Options, accelerator: Accelerator
 ) -> tuple[Iterator[Any], Examples]:
     """This process's batches from `step` on, one per pass, and what makes them."""
     examples = Examples(experiment, images, accelerator.num_processes * accelerator.gradient_accumulation_steps)

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lidarsynth.build import build_network, build_sensor, read_experiment
-from lidarsynth.data.dataset import CachedImages
 from lidarsynth.data.index import PLACE
 from lidarsynth.experiment import Card, Experiment, with_fields
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.presets import preset
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
-from lidarsynth.training.examples import Streets, open_images
+from lidarsynth.training.examples import Learned, Streets, open_images
 from lidarsynth.training.finetune import transfer
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
@@ -111,7 +110,7 @@ def run(
 
 def _begin(
     experiment: Experiment,
-    images: CachedImages | Streets,
+    images: Learned,
     out: Path,
     weights: str | None,
     resume: bool,
@@ -147,7 +146,7 @@ def _begin(
     return replace(experiment, card=card), state
 
 
-def _learned_from(images: CachedImages | Streets) -> str:
+def _learned_from(images: Learned) -> str:
     """What a card says of the images: how many of what, and not where they lie on this disk."""
     count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
     details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
