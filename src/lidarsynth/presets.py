@@ -157,16 +157,18 @@ def default() -> Experiment:
             num_residual_blocks=(2, 2, 2, 2),
             stem=(4, 1),  # whole columns: edges need every azimuth step
             candidates=True,
+            around=True,
         ),
         diffusion=Diffusion(kind="x_0", floor=1.0, mean_weight=False),
         training=Training(
-            steps=5_000,
+            steps=10_000,
             batch_size=4,
             learning_rate=1e-3,
             warmup=200,
             ema_decay=0.98,  # a short run: average over 500 steps
             ema_start=500,
             generation_share=0.5,
+            upsampling_share=0.4,
         ),
     )
 
@@ -177,16 +179,16 @@ def kitti() -> Experiment:
     return replace(
         start,
         name="kitti",
-        data=replace(start.data, mend=False, roll=True, mirror=True, scale=0.15),
+        data=replace(start.data, mend=False, roll=True, mirror=True, scale=0.15, mix=0.8),
         training=replace(
             start.training,
-            steps=5_200,
+            steps=5_000,
             batch_size=2,
             learning_rate=2e-3,
             warmup=50,
             ema_start=100,
             generation_share=0.1,
-            upsampling_share=0.85,
+            upsampling_share=0.75,
             metres_weight=0.2,
         ),
         card=Card(
