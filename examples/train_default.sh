@@ -2,7 +2,7 @@
 # From nothing to the default weights, in chunks of under ten minutes; run again, it goes on where it was.
 # Usage: train_default.sh OUT [--cpu]
 #   with a GPU  as many steps of $BATCH (64) as it does in $MINUTES (22), by a short measurement, on $IMAGES streets
-#   --cpu       the first 5,000 steps of 4 of the shipped weights
+#   --cpu       preset default as it is, about the budget of the shipped weights
 set -euo pipefail
 here=$(dirname "$0")
 out=$1

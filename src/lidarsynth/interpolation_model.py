@@ -12,7 +12,7 @@ from lidarsynth.experiment import Experiment
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.models.interpolation import Interpolation, interpolate
-from lidarsynth.scan_model import Completer, OnStep, imaged_by, known_pixels, with_known
+from lidarsynth.scan_model import OnStep, ScanModel, imaged_by, known_pixels, with_known
 
 
 def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImage:
@@ -27,7 +27,7 @@ def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImag
 
 
 @dataclass(frozen=True)
-class InterpolationModel(Completer):
+class InterpolationModel(ScanModel):
     """An interpolation with the sensor of its images.
 
     Its network has no parameters; the name of its experiment is the method.

@@ -39,6 +39,7 @@ class ScanModel(ABC):
     network: nn.Module
     sensor: Sensor
     experiment: Experiment
+    kind: ClassVar[str] = "one that completes scans"  # said of those that generate nothing
 
     def to(self, device: str | torch.device) -> Self:
         """The same model with its network on another device."""
@@ -60,7 +61,6 @@ class ScanModel(ABC):
         """
         return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
 
-    @abstractmethod
     def stream(
         self,
         n: int,
@@ -71,7 +71,11 @@ class ScanModel(ABC):
         first: int = 0,
         on_step: OnStep = None,
     ) -> Iterator[RangeImage]:
-        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch."""
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
+
+        Raises ValueError where the model only completes scans.
+        """
+        raise self._generates_nothing()
 
     @abstractmethod
     def complete(
@@ -114,9 +118,9 @@ class ScanModel(ABC):
             raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
         return scan
 
-    @abstractmethod
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
-        """How often `generate` calls `on_step` per batch."""
+        """How often `generate` calls `on_step` per batch. Raises ValueError as `stream` does."""
+        raise self._generates_nothing()
 
     @abstractmethod
     def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
@@ -131,29 +135,6 @@ class ScanModel(ABC):
         Raises ValueError in one line when the hub refuses or cannot be reached.
         """
         return push(self.experiment, self.network, repo_id, private, half)
-
-
-class Completer(ScanModel, ABC):
-    """A model that fills scans and makes none from noise."""
-
-    kind: ClassVar[str] = "one that completes scans"
-
-    def stream(
-        self,
-        n: int,
-        steps: int | None = None,
-        seed: int = 0,
-        sampler: str | None = None,
-        batch_size: int = 4,
-        first: int = 0,
-        on_step: OnStep = None,
-    ) -> Iterator[RangeImage]:
-        """Raises ValueError: it makes no scans."""
-        raise self._generates_nothing()
-
-    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
-        """Raises ValueError, as `stream`."""
-        raise self._generates_nothing()
 
     def _generates_nothing(self) -> ValueError:
         return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found "

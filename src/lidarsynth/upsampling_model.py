@@ -18,14 +18,14 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.models.iln import ILN, LIIF
 from lidarsynth.models.lidar_sr import LidarSR, mc_dropout, remove_uncertain
-from lidarsynth.scan_model import Completer, OnStep, imaged_by, known_pixels, sensor_that_made, sparse_image, with_known
+from lidarsynth.scan_model import OnStep, ScanModel, imaged_by, known_pixels, sensor_that_made, sparse_image, with_known
 
 HARDLY = 0.02  # share of a row's pixels; of a beam with fewer known ones nothing is known
 PIECE = 16_384  # queries at once: what bounds the memory of ILN
 
 
 @dataclass(frozen=True)
-class UpsamplingModel(Completer):
+class UpsamplingModel(ScanModel):
     """A trained network with the sensor of its images.
 
     LiDAR-SR fills a grid, ILN and LIIF answer any direction. The experiment's group `upsampling` tells which beams are
