@@ -177,9 +177,9 @@ def test_optional_packages_are_imported_where_they_are_used(path: Path):
 @pytest.mark.parametrize("path", FILES, ids=short)
 def test_files_and_functions_are_short(path: Path):
     lines = path.read_text().splitlines()
-    assert len(lines) <= 350, f"{short(path)} has {len(lines)} lines"
-    long = {f.name: n for f in functions(path) if (n := (f.end_lineno or 0) - f.lineno + 1) > 40}
-    assert not long, f"{short(path)}: functions over 40 lines: {long}"
+    assert len(lines) <= 400, f"{short(path)} has {len(lines)} lines"
+    long = {f.name: n for f in functions(path) if (n := (f.end_lineno or 0) - f.lineno + 1) > 60}
+    assert not long, f"{short(path)}: functions over 60 lines: {long}"
 
 
 def test_modules_are_named_by_what_they_hold():

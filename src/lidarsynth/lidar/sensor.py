@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,10 @@ class Sensor:
     offsets     height in metres of each beam's origin above the sensor's origin, or () for all zero
     edges       True: row angles are the upper edges and column angles the left edges of their pixels (the KITTI-360
                 grid of R2DM); False: they are centres
-    mount       height of the sensor above the road in metres, used by synthetic streets and pictures
+    mount       height of the sensor above the road in metres, used by synthetic streets, pictures and networks
+    tilt        pitch (nose up) and roll (left side up) of the sensor against the road, in degrees
+    blocked     rays that end on the carrier and never return, as (row, first column, last column), columns included;
+                a run whose first column is behind its last goes around the seam
 
     Raises ValueError when a value makes no sense.
     """
@@ -42,6 +45,8 @@ class Sensor:
     offsets: tuple[float, ...] = ()
     edges: bool = False
     mount: float = 1.73
+    tilt: tuple[float, float] = (0.0, 0.0)
+    blocked: tuple[tuple[int, int, int], ...] = ()
 
     def __post_init__(self):
         steps = np.diff(self.elevations)
@@ -56,6 +61,13 @@ class Sensor:
         if self.offsets and len(self.offsets) != len(self.elevations):
             raise ValueError(f"sensor {self.name}: offsets must have one height per beam ({len(self.elevations)}), "
                              f"got {len(self.offsets)}")  # fmt: skip
+        if len(self.tilt) != 2 or not all(abs(angle) < 90 for angle in self.tilt):
+            raise ValueError(f"sensor {self.name}: expected a tilt of two angles within 90 degrees, got {self.tilt}")
+        for run in self.blocked:
+            inside = len(run) == 3 and 0 <= run[0] < self.height and all(0 <= c < self.width for c in run[1:])
+            if not inside:
+                raise ValueError(f"sensor {self.name}: expected blocked (row, first, last) within {self.height} rows "
+                                 f"and {self.width} columns, got {run}")  # fmt: skip
 
     @property
     def height(self) -> int:
@@ -90,6 +102,14 @@ class Sensor:
         points[..., 2] += height
         return np.where(distance[..., None] > 0, points, np.float32(0))
 
+    def blocked_rays(self) -> np.ndarray:
+        """(H, W) bool: rays that end on the carrier and never return."""
+        rays = np.zeros((self.height, self.width), bool)
+        columns = np.arange(self.width)
+        for row, first, last in self.blocked:
+            rays[row] |= np.mod(columns - first, self.width) <= np.mod(last - first, self.width)
+        return rays
+
     def resized(self, height: int | None = None, width: int | None = None) -> Sensor:
         """The sensor with `width` columns and, by taking evenly spaced beams, `height` rows (a divisor of its own)."""
         height, width = height or self.height, width or self.width
@@ -102,7 +122,14 @@ class Sensor:
         name = self.name if len(rows) == self.height else f"{self.name}/{len(rows)}"
         pick = tuple(self.elevations[i] for i in rows)
         offsets = tuple(self.offsets[i] for i in rows) if self.offsets else ()
-        return Sensor(name, pick, width or self.width, self.min_range, self.max_range, offsets, self.edges, self.mount)
+        width = width or self.width
+        place, scale = {row: i for i, row in enumerate(rows)}, width / self.width
+        blocked = tuple(
+            (place[row], int(first * scale), min(int((last + 1) * scale), width) - 1)
+            for row, first, last in self.blocked
+            if row in place and (first > last or int(first * scale) < int((last + 1) * scale))
+        )
+        return replace(self, name=name, elevations=pick, width=width, offsets=offsets, blocked=blocked)
 
     def to_dict(self) -> dict:
         """Plain lists and numbers, the inverse of `from_dict`."""
@@ -134,6 +161,7 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
     if offsets and len(offsets) == len(elevations):  # each height goes with its beam
         elevations, offsets = zip(*sorted(zip(elevations, offsets, strict=True), reverse=True), strict=True)
     values |= {"elevations": tuple(sorted(elevations, reverse=True)), "offsets": tuple(offsets)}
+    values |= {"tilt": tuple(_numbers(values.get("tilt", (0.0, 0.0)), source)), "blocked": _runs(values, source)}
     try:
         return Sensor(**{"name": source, **values})
     except TypeError as error:
@@ -145,6 +173,15 @@ def _numbers(values: Any, source: str) -> Sequence[float]:
         return [float(value) for value in values]
     except (TypeError, ValueError):
         raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values!r:.60}") from None
+
+
+def _runs(values: dict, source: str) -> tuple[tuple[int, ...], ...]:
+    runs = values.get("blocked", ())
+    if not all(isinstance(run, list | tuple) and all(type(number) is int for number in run) for run in runs):
+        raise ValueError(
+            f"{source}: expected blocked as a list of [row, first column, last column], found {runs!r:.60}"
+        )
+    return tuple(map(tuple, runs))
 
 
 def read_sensor(path: str | Path) -> Sensor:

@@ -78,6 +78,9 @@ def own_car(sensor: Sensor) -> np.ndarray:
     return hidden
 
 
+Table = tuple[float, ...]
+
+
 class Lasers(NamedTuple):
     """Per ray: signal lost (N,), signal lost at 4 to 6 m (N,), metres read too far (N,), laser number (N,)."""
 
@@ -88,9 +91,17 @@ class Lasers(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def lasers(sensor: Sensor) -> Lasers:
-    """For each ray of the sensor's image that its own car does not hide, row by row; zeros for sensors not measured."""
-    seen = ~own_car(sensor).reshape(-1)
-    tables = [RING_LOSS, RING_DIP, RING_SHIFT] if sensor.name == NAME else [np.zeros(sensor.height)] * 3
-    spread = [np.repeat(np.asarray(table, np.float32), sensor.width)[seen] for table in tables]
+def lasers(sensor: Sensor, loss: Table = (), dip: Table = (), shift: Table = ()) -> Lasers:
+    """For each ray of the sensor's image that nothing blocks, row by row; zeros for tables that are not given.
+
+    loss, dip, shift  one number per beam; those of `hdl-64e-kitti` where nothing is given for it
+    """
+    seen = ~hidden(sensor).reshape(-1)
+    tables = (RING_LOSS, RING_DIP, RING_SHIFT) if sensor.name == NAME and not loss else (loss, dip, shift)
+    spread = [np.repeat(np.asarray(table or [0.0] * sensor.height, np.float32), sensor.width)[seen] for table in tables]
     return Lasers(*spread, number=np.repeat(np.arange(sensor.height, dtype=np.uint32), sensor.width)[seen])
+
+
+def hidden(sensor: Sensor) -> np.ndarray:
+    """(H, W) bool: rays that end on the carrier: those blocked by name, and those of KITTI's own car."""
+    return own_car(sensor) | sensor.blocked_rays()

@@ -11,12 +11,29 @@ from lidarsynth.data.synthetic import hdl64e
 from lidarsynth.data.synthetic.layout import build
 from lidarsynth.data.synthetic.materials import LABEL
 from lidarsynth.data.synthetic.raycast import Caster
-from lidarsynth.data.synthetic.sensor_model import Returns, sense
+from lidarsynth.data.synthetic.sensor_model import OPTICS, Optics, Returns, sense
 from lidarsynth.data.synthetic.world import POSES, THING, World, visible
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 
 FULL_TURN = 2083  # azimuth steps per turn of KITTI's sensor at 10 Hz
+
+
+class Worlds:
+    """Worlds of a seed by number, without what `sensor` cannot see; the last two are kept."""
+
+    def __init__(self, seed: int, sensor: Sensor, without: tuple[str, ...] = ()):
+        self.seed, self.sensor, self.without = seed, sensor, without
+        self._kept: dict[int, tuple[World, Caster]] = {}
+
+    def __getitem__(self, number: int) -> tuple[World, Caster]:
+        if number not in self._kept:
+            world = visible(build(np.random.default_rng((self.seed, number))), self.sensor)
+            world = _emptied(world, [LABEL[word] for word in self.without])
+            if len(self._kept) >= 2:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[number] = (world, Caster(world.corners))
+        return self._kept[number]
 
 
 class SyntheticStreets:
@@ -26,7 +43,8 @@ class SyntheticStreets:
     length  number of scans; scan i does not depend on it
     sensor  beams, offsets, range limits, columns and mounting height
     without words of SemanticKITTI classes, such as `car`: things of these are taken away, all else stays where it is
-
+    optics  how well the sensor sees
+    worlds  of this seed, to share with other sensors
     apart   every scan has a world of its own, as statistics of independent scans want it
 
     Else sixteen consecutive scans are sixteen places in one world, and reading in order builds each world once.
@@ -40,6 +58,8 @@ class SyntheticStreets:
         sensor: Sensor = SENSORS["hdl-64e-kitti"],
         without: tuple[str, ...] = (),
         apart: bool = False,
+        optics: Optics = OPTICS,
+        worlds: Worlds | None = None,
     ):
         if seed < 0 or length < 1:
             raise ValueError(f"expected seed >= 0 and length >= 1, got seed {seed} and length {length}")
@@ -47,10 +67,11 @@ class SyntheticStreets:
             raise ValueError(f"expected classes of {', '.join(LABEL)}, found {unknown[0]!r}")
         self.without = without
         self.apart = apart
+        self.optics = optics
         self.seed = seed
         self.length = length
         self.sensor = sensor
-        self._worlds: dict[int, tuple[World, Caster]] = {}
+        self._worlds = worlds or Worlds(seed, sensor, without)
 
     def __len__(self) -> int:
         return self.length
@@ -89,34 +110,28 @@ class SyntheticStreets:
             points[..., 2] += np.where(distance > 0, np.asarray(sensor.offsets, np.float32)[:, None], 0)
         return points
 
-    def _world(self, number: int) -> tuple[World, Caster]:
-        if number not in self._worlds:
-            world = visible(build(np.random.default_rng((self.seed, number))), self.sensor)
-            world = _emptied(world, [LABEL[word] for word in self.without])
-            if len(self._worlds) >= 2:
-                self._worlds.pop(next(iter(self._worlds)))
-            self._worlds[number] = (world, Caster(world.corners))
-        return self._worlds[number]
-
     def _shoot(self, index: int, sensor: Sensor) -> tuple[Returns, np.ndarray]:
         """Returns of all H * W rays, and the rays (H, W, 3) in the sensor frame."""
         if not 0 <= index < self.length:
             raise IndexError(f"expected a scan number in 0..{self.length - 1}, got {index}")
         if self.apart:
             index = POSES * index + index % POSES
-        world, caster = self._world(index // POSES)
+        world, caster = self._worlds[index // POSES]
         rng = np.random.default_rng((self.seed, index, 1))
         rays = _jittered(sensor, rng)
         turn, place = _pose(world.poses[index % POSES])
+        if any(sensor.tilt):
+            turn = turn @ _pose(np.array([0, 0, 0, 0, *np.radians(sensor.tilt)]))[0]
         start = np.zeros((sensor.height, 3), np.float32)
         start[:, 2] = sensor.mount
         if sensor.offsets:
             start[:, 2] += np.asarray(sensor.offsets, np.float32)
-        visible_rays = ~hdl64e.own_car(sensor)
+        visible_rays = ~hdl64e.hidden(sensor)
         seen = visible_rays.reshape(-1)
         origins = np.repeat(start @ turn.T + place, visible_rays.sum(axis=1), axis=0)
         directions = rays.reshape(-1, 3)[seen] @ turn.T
-        found = sense(world, caster, origins, directions, hdl64e.lasers(sensor), rng, sensor.max_range)
+        lasers = hdl64e.lasers(sensor, self.optics.loss, self.optics.dip, self.optics.shift)
+        found = sense(world, caster, origins, directions, lasers, rng, sensor.max_range, self.optics)
         kept = found.distance >= sensor.min_range
         whole = []
         for values in (found.distance, found.reflectance, found.label):

@@ -65,6 +65,34 @@ ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.08, "stone": 0.02, "bark":
 
 
 @dataclass(frozen=True)
+class Optics:
+    """How well a sensor sees. The defaults are those of the sensor that the streets were fitted to.
+
+    loss, dip, shift  per beam, or () for none: signal lost; signal lost at 4 to 6 m; metres read too far
+    noise             factor of the range noise
+    strength          signal above that sensor's: more of it, fewer drop-outs
+    gamma, scale      reported reflectance = scale * reflectance ** gamma, at most 1
+    """
+
+    loss: tuple[float, ...] = ()
+    dip: tuple[float, ...] = ()
+    shift: tuple[float, ...] = ()
+    noise: float = 1.0
+    strength: float = 0.0
+    gamma: float = 1.0
+    scale: float = 1.0
+
+    def reported(self, reflectance: np.ndarray) -> np.ndarray:
+        """Reflectance (N,) in [0, 1] as this sensor reports it."""
+        if self.gamma == 1 and self.scale == 1:
+            return reflectance
+        return np.minimum(np.float32(self.scale) * reflectance ** np.float32(self.gamma), np.float32(1))
+
+
+OPTICS = Optics()
+
+
+@dataclass(frozen=True)
 class Returns:
     """What N beams brought back: distance (N,) float32 m along the ray, 0 for none; reflectance and label (N,)."""
 
@@ -81,6 +109,7 @@ def sense(
     lasers: Lasers,
     rng: np.random.Generator,
     max_range: float,
+    eye: Optics = OPTICS,
 ) -> Returns:
     """Sends N rays and reports their returns.
 
@@ -103,12 +132,18 @@ def sense(
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
     doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
-    gone = (strength + doubt < VANISH) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
-    distance = distance + depth / np.maximum(cosine, 0.12) + noise[0] * _spread(material, distance) + lasers.shift
+    gone = (strength + doubt < VANISH - eye.strength) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
+    distance = (
+        distance
+        + depth / np.maximum(cosine, 0.12)
+        + noise[0] * np.float32(eye.noise) * _spread(material, distance)
+        + lasers.shift
+    )
     gone |= ~(distance < max_range)
     # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
     grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
     reflectance = REPORTED[np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.int32)]
+    reflectance = eye.reported(reflectance)
     zero = np.float32(0)
     return Returns(np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
 
