@@ -20,18 +20,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lidarsynth.build import build_denoiser, build_network, build_sensor, save
 from lidarsynth.data.dataset import CachedImages, write_cache
-from lidarsynth.data.synthetic.reader import SyntheticStreets
-from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.bev import bev_histograms
 from lidarsynth.metrics.distributions import gaussian_mmd, jensen_shannon_distance
-from lidarsynth.model import LidarModel
-from lidarsynth.presets import preset
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.build import build_denoiser, build_network
+from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.systems.diffusion.validation import fixed_losses
+from lidarsynth.systems.tasks import task_of
 from lidarsynth.training.checkpoint import load_run, save_run
 from lidarsynth.training.loop import Run, start, train
-from lidarsynth.training.validation import fixed_losses
 
 ROWS = "abcdefgh"
 STEPS_AT_MOST = 1_000_000  # where the budget is time
@@ -65,7 +68,7 @@ def streets(folder: Path, experiment: Experiment, count: int, seed: int) -> Cach
 def trained(experiment: Experiment, images: CachedImages, folder: Path, seconds: float) -> tuple[Run, float]:
     """The run after its budget of steps or seconds, and the seconds of this call; continued where it was stopped."""
     torch.manual_seed(0)
-    run = start(experiment, build_network(experiment))
+    run = start(experiment, build_network(experiment), task_of(experiment))
     state = folder / "state.pt"
     if state.exists():
         load_run(state, run)

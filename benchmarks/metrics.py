@@ -22,8 +22,8 @@ import torch
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.metrics.bev import bev_histograms
 from lidarsynth.metrics.distributions import Moments, frechet_distance, gaussian_mmd, jensen_shannon_distance
-from lidarsynth.metrics.pointnet import PointNet, point_features
-from lidarsynth.metrics.rangenet import RangeNet, frechet_features
+from lidarsynth.networks.pointnet import PointNet, point_features
+from lidarsynth.networks.rangenet import RangeNet, frechet_features
 
 SENSOR = SENSORS["hdl-64e"]  # 64 x 1024
 T = TypeVar("T")

@@ -19,12 +19,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from lidarsynth.build import GANS, build_discriminator, build_network, build_sensor
-from lidarsynth.experiment import Experiment, with_fields
-from lidarsynth.metrics.pointnet import PointNet
-from lidarsynth.models.interpolation import METHODS
-from lidarsynth.presets import PRESETS, preset
-from lidarsynth.upsampling_model import queries_at
+from lidarsynth.experiment.presets import PRESETS, preset
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.networks.interpolation import METHODS
+from lidarsynth.networks.pointnet import PointNet
+from lidarsynth.systems.build import GANS, build_discriminator, build_network
+from lidarsynth.systems.upsampling.model import queries_at
 
 ROWS = (
     *("r2dm-h", "default", "lidargen", "r2dm-refinenet", "vanilla-gan", "dusty-v1", "dusty-v2"),

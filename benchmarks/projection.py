@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.files import read, write
+from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS

@@ -19,20 +19,20 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from lidarsynth.data.files import read
-from lidarsynth.data.synthetic.reader import SyntheticStreets
-from lidarsynth.gathering import Loaded, load_networks
-from lidarsynth.lidar.colours import CLASSES
+from lidarsynth.evaluation.accumulation import Loaded, load_networks
+from lidarsynth.evaluation.protocols import EvaluationProtocol, get_protocol
+from lidarsynth.evaluation.report import Result, results_of
+from lidarsynth.evaluation.statistics import Statistics
+from lidarsynth.files.formats import read
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.metrics.evaluate import Result, results_of
-from lidarsynth.metrics.protocols import EvaluationProtocol, get_protocol
-from lidarsynth.metrics.rangenet import RangeNet
 from lidarsynth.metrics.reconstruction import accuracy, class_iou
-from lidarsynth.metrics.statistics import Statistics
-from lidarsynth.training.segmentation import confusion
-from lidarsynth.weights import load_parts
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.segmentation.training import confusion
+from lidarsynth.weights.load import load_parts
 
 WORD = "street-1"  # of the protocol and of its shipped network
 SENSOR = SENSORS["hdl-64e-kitti"]

@@ -16,17 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.files import write
-from lidarsynth.data.synthetic.materials import LABEL
-from lidarsynth.data.synthetic.reader import SyntheticStreets
-from lidarsynth.lidar.colours import label_colours
-from lidarsynth.lidar.figure import compare as figure
-from lidarsynth.lidar.figure import panel
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.render import bev as bev_picture
-from lidarsynth.lidar.render import label_strip, range_strip, save_png
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.pictures.colours import label_colours
+from lidarsynth.pictures.figure import compare as figure
+from lidarsynth.pictures.figure import panel
+from lidarsynth.pictures.render import bev as bev_picture
+from lidarsynth.pictures.render import label_strip, range_strip, save_png
+from lidarsynth.streets.materials import LABEL
+from lidarsynth.streets.reader import SyntheticStreets
 
 SENSOR = SENSORS["hdl-64e-kitti"]
 PER_WORLD = 16

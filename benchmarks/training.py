@@ -17,15 +17,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lidarsynth.build import build_network, build_sensor
 from lidarsynth.data.dataset import CachedImages, write_cache
-from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.tasks import task_of
 from lidarsynth.training.examples import Examples, Learned, Streets, load_batches, open_images
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.machine import accelerator_of, workers_of
 from lidarsynth.training.options import Options
-from lidarsynth.training.run import resolve
+from lidarsynth.verbs.training import resolve
 
 WARM_UP = 5  # steps that are not timed
 
@@ -44,7 +46,7 @@ def noise_cache(folder: Path, experiment: Experiment, count: int = 64) -> Cached
 
 def loader_speed(experiment: Experiment, images: Learned, workers: int, steps: int) -> float:
     """Samples per second of one process's loader when nobody trains."""
-    batches = load_batches(Examples(experiment, images, 1), 0, range(1), workers)
+    batches = load_batches(Examples(experiment, images, 1, task_of(experiment).draw), 0, range(1), workers)
     next(batches)
     began = time.perf_counter()
     count = sum(len(batch.x_0) for batch in islice(batches, steps))
@@ -82,7 +84,7 @@ def measure(experiment: Experiment, images: Learned, options: Options, steps: in
     on_gpu = accelerator.device.type == "cuda"
     workers = workers_of(options, on_gpu or isinstance(images, Streets))
     loader = loader_speed(experiment, images, workers, steps)
-    run = start(experiment, build_network(experiment), accelerator.scaler)
+    run = start(experiment, build_network(experiment), task_of(experiment), accelerator.scaler)
     timed = list(train(experiment, run, images, options, accelerator))[WARM_UP:]
     if not accelerator.is_main_process:
         return

@@ -3,9 +3,9 @@
 import sys
 
 import lidarsynth as ls
-from lidarsynth.lidar.figure import panel
-from lidarsynth.lidar.perspective import perspective
-from lidarsynth.lidar.render import range_strip, save_png
+from lidarsynth.pictures.figure import panel
+from lidarsynth.pictures.perspective import perspective
+from lidarsynth.pictures.render import range_strip, save_png
 
 source, target, *name = sys.argv[1:]
 model = ls.load(name[0] if name else "default")

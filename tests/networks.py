@@ -2,8 +2,8 @@
 
 import torch
 
-from lidarsynth.build import build_network
-from lidarsynth.experiment import Experiment
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.systems.build import build_network
 
 
 def trained(experiment: Experiment, seed: int = 0) -> torch.nn.Module:

@@ -7,7 +7,7 @@ import torch
 from test_gan import check_structure
 from torch.testing import assert_close
 
-from lidarsynth.models.adaptive_augmentation import (
+from lidarsynth.networks.gan.adaptive_augmentation import (
     SYM2,
     SYM6,
     AdaptiveAugmentation,
@@ -19,9 +19,9 @@ from lidarsynth.models.adaptive_augmentation import (
     transform_colour,
     transform_geometry,
 )
-from lidarsynth.models.adversarial import r1_penalty
-from lidarsynth.models.dusty2 import Discriminator
-from lidarsynth.models.grid_sampling import sample_bilinear
+from lidarsynth.networks.gan.dusty2 import Discriminator
+from lidarsynth.networks.gan.grid_sampling import sample_bilinear
+from lidarsynth.networks.gan.losses import r1_penalty
 
 
 def rolled(count: int, seed: int) -> Dice:

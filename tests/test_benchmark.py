@@ -15,7 +15,6 @@ from networks import trained
 from PIL import Image
 
 import lidarsynth as ls
-from lidarsynth import build
 from lidarsynth.benchmark import drawings, run
 from lidarsynth.benchmark.config import read_config, rows
 from lidarsynth.benchmark.published import PUBLISHED, published, why_not
@@ -23,16 +22,17 @@ from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.run import benchmark
 from lidarsynth.benchmark.store import Seconds
 from lidarsynth.benchmark.tables import Column, table
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import CachedImages, write_cache
-from lidarsynth.interpolation_model import interpolated
+from lidarsynth.evaluation.protocols import R2DM_UPSAMPLING
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.metrics.protocols import R2DM_UPSAMPLING
-from lidarsynth.metrics.rangenet import RangeNet
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.presets import preset
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.systems.interpolation.model import interpolated
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
@@ -86,7 +86,7 @@ def data(tmp_path: Path) -> Path:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model folder of the preset `tiny`, 16 x 64 pixels."""
     experiment = preset("tiny")
-    return build.save(tmp_path_factory.mktemp("model"), experiment, trained(experiment))
+    return save(tmp_path_factory.mktemp("model"), experiment, trained(experiment))
 
 
 @dataclass

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from broken import BODY, BROKEN, points
 
-from lidarsynth.data import files
-from lidarsynth.data.files import read, read_image, read_with_report, write
-from lidarsynth.data.labels import read_labels
+from lidarsynth.files import formats as files
+from lidarsynth.files.formats import read, read_image, read_with_report, write
+from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
 
 

@@ -16,13 +16,13 @@ import pytest
 from broken import BROKEN
 from networks import trained
 
-from lidarsynth import build
-from lidarsynth.cli import VERBS, main
-from lidarsynth.data.files import read, read_image, write
+from lidarsynth.cli.main import VERBS, main
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.files.formats import read, read_image, write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.presets import preset
 
 
 class Answer(NamedTuple):
@@ -53,7 +53,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model folder of the preset `tiny`, 16 x 64 pixels."""
     experiment = preset("tiny")
-    return build.save(tmp_path_factory.mktemp("model"), experiment, trained(experiment))
+    return save(tmp_path_factory.mktemp("model"), experiment, trained(experiment))
 
 
 def street(name: str = "hdl-64e-kitti") -> Scan:
@@ -177,8 +177,8 @@ def test_a_folder_made_with_other_settings_is_refused(run: Run, tiny: Path, tmp_
 
 def test_a_folder_of_other_weights_is_refused_and_one_of_the_same_is_not(run: Run, tiny: Path, tmp_path: Path):
     experiment = preset("tiny")
-    same = build.save(tmp_path / "same", experiment, trained(experiment))
-    other = build.save(tmp_path / "other", experiment, trained(experiment, seed=1))
+    same = save(tmp_path / "same", experiment, trained(experiment))
+    other = save(tmp_path / "other", experiment, trained(experiment, seed=1))
     words = ("generate", "-n", 1, "--out", tmp_path / "g", "--steps", 2, "--no-picture", "--model")
     assert run(*words, tiny).code == 0
     assert "0 of them new" in run(*words, same).out

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from networks import trained
 
-from lidarsynth.completion import complete_scan, interpolated, judged, named_sensor, upsample_scan, with_measured
+from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.loading import assemble
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.model import LidarModel
-from lidarsynth.presets import preset
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.verbs.completion import complete_scan, interpolated, judged, named_sensor, upsample_scan, with_measured
 
 FLAT = Sensor("flat", (2.0, 0.0, -2.0, -4.0), width=8, min_range=1.0, max_range=50.0)
 

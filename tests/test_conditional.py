@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from lidarsynth.models.conditional import ConditionalUNet
-from lidarsynth.models.efficient_unet import EfficientUNet
-from lidarsynth.models.interpolation import fill_in, interpolate
+from lidarsynth.networks.conditional import ConditionalUNet
+from lidarsynth.networks.efficient_unet import EfficientUNet
+from lidarsynth.networks.interpolation import fill_in, interpolate
 
 
 @pytest.fixture

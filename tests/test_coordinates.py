@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lidarsynth.models.coordinates import ENCODINGS, coordinate_encoding, default_angles, patch_angles
+from lidarsynth.networks.coordinates import ENCODINGS, coordinate_encoding, default_angles, patch_angles
 
 SIZES = [(16, 64), (24, 32)]
 

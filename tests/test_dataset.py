@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 from lidarsynth.data import cache
 from lidarsynth.data.dataset import CachedImages, SeveralCaches, read_index, verify, write_cache
 from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, prepare, summary
@@ -337,8 +337,8 @@ def test_synthetic_streets_have_labels(tmp_path: Path):
 
 def test_streets_apart_are_those_of_other_worlds(tmp_path: Path):
     pytest.importorskip("embreex")
-    from lidarsynth.data.synthetic.reader import SyntheticStreets
-    from lidarsynth.data.synthetic.world import POSES
+    from lidarsynth.streets.reader import SyntheticStreets
+    from lidarsynth.streets.world import POSES
 
     assert list(cache_synthetic(tmp_path / "apart", 2, width=64, seed=3, apart=True)) == [(2, 2)]
     apart = CachedImages(tmp_path / "apart")

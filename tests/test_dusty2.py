@@ -8,8 +8,8 @@ import torch
 from test_gan import TOLERANCE, check_discriminator, check_structure, load
 from torch.testing import assert_close
 
-from lidarsynth.models.dusty2 import Discriminator, Generator, unshift
-from lidarsynth.models.modulated import RandomFourierFeatures, circle, resize_angles
+from lidarsynth.networks.gan.dusty2 import Discriminator, Generator, unshift
+from lidarsynth.networks.gan.modulated import RandomFourierFeatures, circle, resize_angles
 
 SMALL, FULL = "gan_dusty_v2_small", "gan_dusty_v2_full"
 

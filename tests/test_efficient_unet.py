@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from lidarsynth.models.efficient_unet import EfficientUNet
+from lidarsynth.networks.efficient_unet import EfficientUNet
 
 SMALL = {
     "resolution": (16, 64),

@@ -14,18 +14,19 @@ import pytest
 import torch
 
 import lidarsynth as ls
-from lidarsynth import evaluation, gathering
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import write_cache
-from lidarsynth.data.files import write
-from lidarsynth.image_sets import image_set
+from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation import evaluate as evaluation
+from lidarsynth.evaluation.image_sets import image_set
+from lidarsynth.evaluation.pairs import Pairs
+from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING
+from lidarsynth.evaluation.statistics import load_statistics
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import thin
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.metrics.pairs import Pairs
-from lidarsynth.metrics.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING
-from lidarsynth.metrics.rangenet import RangeNet
-from lidarsynth.metrics.statistics import load_statistics
+from lidarsynth.networks.rangenet import RangeNet
 
 SENSOR = SENSORS["hdl-64e"].resized(width=64)
 
@@ -50,7 +51,7 @@ REAL = [street(i) for i in range(100, 108)]
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder, and files that cannot be downloaded, at once."""
     monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(gathering, "URLS", dict.fromkeys(gathering.URLS, (tmp_path / "nowhere").as_uri()))
+    monkeypatch.setattr(accumulation, "URLS", dict.fromkeys(accumulation.URLS, (tmp_path / "nowhere").as_uri()))
     return tmp_path / "cache"
 
 
@@ -211,8 +212,9 @@ def test_parts_of_a_reference_become_one_file_to_share(tmp_path: Path, real: Pat
 
 KILLED = """
 import os, signal, sys
-from lidarsynth import evaluation, gathering
-gathering.SAVE_EVERY = 0.0
+from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation import evaluate as evaluation
+accumulation.SAVE_EVERY = 0.0
 def kill(what, done, total):
     if done == 4:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -242,7 +244,7 @@ def test_a_killed_evaluation_goes_on(protocol: str, tmp_path: Path, real: Path, 
 def test_a_stopped_evaluation_goes_on(tmp_path: Path, real: Path, cache: Path, monkeypatch: pytest.MonkeyPatch):
     samples = saved(tmp_path / "samples", STREETS)
     expected = ls.evaluate(STREETS, real)
-    monkeypatch.setattr(gathering, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr(accumulation, "SAVE_EVERY", 0.0)
     seen: list[int] = []
 
     def stop(what: str, done: int, total: int) -> None:
@@ -269,7 +271,7 @@ def test_networks_are_downloaded_or_make_rows_na(
     assert f"without a network, put the file at {cache / 'cls_model_39.pth'}" in str(report)
     assert "N/A: FPD, FPD squared MMD: file:" in str(report), "the reason stands there once"
     assert "no official rangenet for 64 columns, only for 2048, 1024, 512" in str(report)
-    monkeypatch.setitem(gathering.URLS, "pointnet", (shared / "fixtures/pointnet").as_uri())
+    monkeypatch.setitem(accumulation.URLS, "pointnet", (shared / "fixtures/pointnet").as_uri())
     report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
     assert report.values["FPD"] is not None and report.values["FPD squared MMD"] is not None
     assert len(report.hashes["pointnet"]) == 64
@@ -285,19 +287,19 @@ def test_another_rangenet_than_the_protocols_is_refused(cache: Path, shared: Pat
     cache.mkdir()
     (cache / "darknet53-1024.tar.gz").symlink_to(shared / "fixtures/rangenet/darknet21.tar.gz")
     with pytest.raises(ValueError, match="expected RangeNet-53, found RangeNet-21"):
-        gathering.load_networks(R2DM, 1024)
+        accumulation.load_networks(R2DM, 1024)
 
 
 def test_protocols_choose_the_images_that_their_programs_choose():
-    r2dm = gathering.select(R2DM, "real", [str(i) for i in range(10_037)])
+    r2dm = accumulation.select(R2DM, "real", [str(i) for i in range(10_037)])
     assert len(r2dm.features) == 10_037 and len(r2dm.bev) == 10_000
-    few = gathering.select(replace(R2DM, real_bev=5), "real", [str(i) for i in range(37)])
+    few = accumulation.select(replace(R2DM, real_bev=5), "real", [str(i) for i in range(37)])
     assert few.bev == {0, 19, 14, 21, 22}, "Random(0).shuffle of 37, metrics/values.json"
     names = [f"2013_05_28_drive_{s:04d}_sync/{i}" for s in range(4) for i in range(10)]
-    chosen = gathering.select(LIDARGEN, "real", names, samples=7)
+    chosen = accumulation.select(LIDARGEN, "real", names, samples=7)
     assert len(chosen.features) == 7 and chosen.features < set(range(20))
     assert chosen.bev == {*range(10), *range(20, 30)}
-    samples = gathering.select(LIDARGEN, "samples", [str(i) for i in range(2000)])
+    samples = accumulation.select(LIDARGEN, "samples", [str(i) for i in range(2000)])
     assert samples.features == set(range(1100)) and len(samples.bev) == 2000
 
 

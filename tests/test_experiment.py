@@ -7,10 +7,13 @@ import pytest
 import torch
 from networks import trained
 
-from lidarsynth.build import build_denoiser, build_network, build_sensor, load, read_experiment, save
-from lidarsynth.experiment import Data, Training, from_dict, with_fields
+from lidarsynth.experiment.folder import read_experiment, save
+from lidarsynth.experiment.presets import PRESETS, preset
+from lidarsynth.experiment.record import Data, Training, from_dict, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.presets import PRESETS, preset
+from lidarsynth.systems.build import build_denoiser, build_network
+from lidarsynth.systems.build import load_folder as load
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -197,7 +200,7 @@ def test_a_failed_save_leaves_the_old_model(tmp_path, monkeypatch):
     experiment, network = preset("tiny"), trained(preset("tiny"))
     folder = save(tmp_path, experiment, network)
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    monkeypatch.setattr("lidarsynth.build.json.dumps", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("lidarsynth.experiment.folder.json.dumps", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         save(tmp_path, experiment, trained(experiment, seed=1))
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before

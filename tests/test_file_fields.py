@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from full_scan import N, full_scan, same
 
-from lidarsynth.data.fields import NAMES, reflectance_from, rings_from_top, seconds_from
-from lidarsynth.data.files import read, read_with_report, write
-from lidarsynth.data.labels import CLASS_OF_RAW, read_labels
+from lidarsynth.files.fields import NAMES, reflectance_from, rings_from_top, seconds_from
+from lidarsynth.files.formats import read, read_with_report, write
+from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW
 from lidarsynth.lidar.sensor import SENSORS
 
 

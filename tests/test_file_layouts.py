@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from full_scan import N, full_scan, same
 
-from lidarsynth.data.files import read, read_with_report
-from lidarsynth.data.lzf import decompress
+from lidarsynth.files.formats import read, read_with_report
+from lidarsynth.files.lzf import decompress
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from full_scan import full_scan, same
 
-from lidarsynth.data.files import READERS, WRITERS, read, read_image, read_with_report, write
+from lidarsynth.files.formats import READERS, WRITERS, read, read_image, read_with_report, write
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
 

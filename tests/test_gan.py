@@ -8,16 +8,16 @@ import torch
 from procedural_weights import gan_weights, procedural_uniform
 from torch.testing import assert_close
 
-from lidarsynth.models.adversarial import (
+from lidarsynth.networks.gan.dcgan import Discriminator, Generator
+from lidarsynth.networks.gan.layers import HEIGHT, WIDTH, BlurVH, MinibatchStdDev, Pad, Resample
+from lidarsynth.networks.gan.losses import (
     discriminator_loss,
     generator_loss,
     path_length_penalty,
     path_lengths,
     r1_penalty,
 )
-from lidarsynth.models.gan import Discriminator, Generator
-from lidarsynth.models.gan_layers import HEIGHT, WIDTH, BlurVH, MinibatchStdDev, Pad, Resample
-from lidarsynth.models.raydrop import relaxed_bernoulli
+from lidarsynth.networks.gan.raydrop import relaxed_bernoulli
 
 SMALL = ["gan_vanilla_small", "gan_dusty_v1_small"]
 FULL = ["gan_vanilla_full", "gan_dusty_v1_full"]

@@ -14,22 +14,25 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import lidarsynth
-from lidarsynth.build import build_network, build_sensor, save
-from lidarsynth.cli import main
-from lidarsynth.experiment import Experiment, with_fields
-from lidarsynth.gan_model import GanModel
+from lidarsynth.cli.main import main
+from lidarsynth.evaluation.pairs import Pairs
+from lidarsynth.evaluation.protocols import R2DM, R2DM_UPSAMPLING
+from lidarsynth.evaluation.report import results_of
+from lidarsynth.evaluation.statistics import Statistics
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.depth import decode, encode
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.loading import assemble
-from lidarsynth.metrics.evaluate import results_of
-from lidarsynth.metrics.pairs import Pairs
-from lidarsynth.metrics.protocols import R2DM, R2DM_UPSAMPLING
-from lidarsynth.metrics.statistics import Statistics
-from lidarsynth.presets import preset
-from lidarsynth.report import describe
-from lidarsynth.weights import load_parts, read_official
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.gan.model import GanModel
+from lidarsynth.verbs.description import describe
+from lidarsynth.weights.load import load_parts
+from lidarsynth.weights.official import read_official
 
 WORDS = ("vanilla-gan", "dusty-v1", "dusty-v2")
 TOLERANCE = {"atol": 2e-5, "rtol": 1e-4}

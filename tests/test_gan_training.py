@@ -14,25 +14,27 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from lidarsynth.build import build_discriminator, build_network, build_sensor, load
 from lidarsynth.data.dataset import write_cache
 from lidarsynth.data.frames import Name
-from lidarsynth.experiment import Experiment, with_fields
-from lidarsynth.gan_model import GanModel
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.models.adversarial import r1_penalty
-from lidarsynth.models.scan_generator import ScanGenerator
-from lidarsynth.presets import preset
-from lidarsynth.training import adversarial
-from lidarsynth.training.adversarial import ADVERSARIAL, Players
-from lidarsynth.training.adversarial_batch import Batch, draw, warmup_drop
-from lidarsynth.training.finetune import transfer
+from lidarsynth.networks.gan.losses import r1_penalty
+from lidarsynth.networks.gan.scan_generator import ScanGenerator
+from lidarsynth.systems.build import build_discriminator, build_network
+from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.finetune import transfer
+from lidarsynth.systems.gan import training as adversarial
+from lidarsynth.systems.gan.batch import Batch, draw, warmup_drop
+from lidarsynth.systems.gan.model import GanModel
+from lidarsynth.systems.gan.training import ADVERSARIAL, Players
+from lidarsynth.systems.tasks import task_of
 from lidarsynth.training.loop import Run, start, train, update_ema
 from lidarsynth.training.machine import accelerator_of
 from lidarsynth.training.options import Options
-from lidarsynth.training.run import run
-from lidarsynth.training.tasks import task_of
+from lidarsynth.verbs.training import run
 
 WORDS = ("vanilla-gan", "dusty-v1", "dusty-v2")
 SENSOR = SENSORS["hdl-64e-kitti"].resized(32, 64)
@@ -66,7 +68,7 @@ def plain(word: str = "vanilla-gan", **changes) -> Experiment:
 
 def started(experiment: Experiment) -> Run:
     torch.manual_seed(experiment.training.seed)
-    return start(experiment, build_network(experiment))
+    return start(experiment, build_network(experiment), task_of(experiment))
 
 
 def players_of(experiment: Experiment) -> Players:

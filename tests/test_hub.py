@@ -10,14 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from lidarsynth.build import build_network
-from lidarsynth.experiment import Card, Data, with_fields
-from lidarsynth.hub import card_text, fetch, is_repository
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Card, Data, with_fields
 from lidarsynth.lidar.sensor import from_dict
-from lidarsynth.loading import assemble, load
-from lidarsynth.model import LidarModel
-from lidarsynth.presets import preset
-from lidarsynth.weights import load_parts
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.systems.hub import fetch, is_repository
+from lidarsynth.systems.model_card import card_text
+from lidarsynth.weights.load import load, load_parts
 
 CARD = Card("MIT", "200 scans of one street", ("20 steps of 4 on 1 x cpu",), ("range MAE 1.5 m",))
 
@@ -87,7 +88,7 @@ def test_half_of_the_size_and_revisions(hub: Repositories, model: LidarModel):
 
 
 def test_a_local_folder_goes_before_the_hub(hub: Repositories, model: LidarModel, tmp_path: Path, monkeypatch):
-    from lidarsynth.build import save
+    from lidarsynth.experiment.folder import save
 
     monkeypatch.chdir(tmp_path)
     save("runs/mine", with_fields(model.experiment, {"training.seed": 7}), model.network)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarsynth.models.interpolation import (
+from lidarsynth.networks.interpolation import (
     METHODS,
     fill_in,
     interpolate,

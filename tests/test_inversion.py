@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lidarsynth.models.gan import Generator
-from lidarsynth.models.inverse_depth import to_depth, to_inverse_depth, to_points
-from lidarsynth.models.inversion import (
+from lidarsynth.networks.gan.dcgan import Generator
+from lidarsynth.networks.gan.inverse_depth import to_depth, to_inverse_depth, to_points
+from lidarsynth.networks.gan.inversion import (
     geocross,
     invert,
     learning_rate_factor,

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lidarsynth.models.adversarial import r1_penalty
-from lidarsynth.models.gan import Discriminator, Generator
-from lidarsynth.models.iros21 import discriminator_weights, generator_weights, uniform_noise
+from lidarsynth.networks.gan.dcgan import Discriminator, Generator
+from lidarsynth.networks.gan.iros21 import discriminator_weights, generator_weights, uniform_noise
+from lidarsynth.networks.gan.losses import r1_penalty
 
 TOLERANCE = {"atol": 1e-5, "rtol": 1e-5}
 

@@ -12,7 +12,7 @@ from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.langevin import evaluations, langevin, langevin_posterior, starting_uniform
 from lidarsynth.diffusion.samplers import even_log_snr, starting_noise
 from lidarsynth.diffusion.schedule import Schedule, cosine, ve
-from lidarsynth.models.refinenet import from_official
+from lidarsynth.networks.refinenet import from_official
 
 
 def assert_net(actual: Tensor, expected: Tensor) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from lidarsynth.models.layers import (
+from lidarsynth.networks.layers import (
     AdaGroupNorm,
     Conv3x3,
     Downsample,

@@ -7,7 +7,7 @@ import torch
 from procedural import uniforms, upsampling_weights
 from torch import Tensor
 
-from lidarsynth.models.lidar_sr import LidarSR, copy_measured, from_keras, from_official, mc_dropout, remove_uncertain
+from lidarsynth.networks.lidar_sr import LidarSR, copy_measured, from_keras, from_official, mc_dropout, remove_uncertain
 
 SMALL = {"lsr_4h1w_small": (4, 1), "lsr_8h2w_small": (8, 2)}
 STAGES = ("up_scale", "down1", "down3", "downup", "up1", "up3")

@@ -17,35 +17,37 @@ from networks import trained
 from torch import Tensor, nn
 
 import lidarsynth
-from lidarsynth.build import build_denoiser, build_network, load
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import write_cache
-from lidarsynth.data.files import write
 from lidarsynth.diffusion import langevin
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.repaint import repaint
 from lidarsynth.diffusion.samplers import STEPS, even_log_snr, generators, starting_noise
 from lidarsynth.diffusion.schedule import ve
-from lidarsynth.experiment import Score, from_dict, with_fields
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Score, from_dict, with_fields
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.depth import decode, encode, from_x_0, to_x_0
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, get_sensor
-from lidarsynth.loading import assemble
-from lidarsynth.model import LidarModel
-from lidarsynth.models.refinenet import geometric_sigmas
-from lidarsynth.presets import preset
-from lidarsynth.report import describe
-from lidarsynth.training import score as matching
+from lidarsynth.networks.refinenet import geometric_sigmas
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.build import build_denoiser, build_network
+from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.diffusion import score_matching as matching
+from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.systems.diffusion.score_matching import SCORE, ScoreMatching
+from lidarsynth.systems.diffusion.validation import TIMES, fixed_losses
+from lidarsynth.systems.tasks import task_of
 from lidarsynth.training.checkpoint import checkpoints
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.options import Options
-from lidarsynth.training.run import run
-from lidarsynth.training.score import SCORE, ScoreMatching
-from lidarsynth.training.tasks import task_of
-from lidarsynth.training.validation import TIMES, fixed_losses
-from lidarsynth.weights import read_official
+from lidarsynth.verbs.description import describe
+from lidarsynth.verbs.training import run
+from lidarsynth.weights.official import read_official
 
 TINY = preset("lidargen-tiny")
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
@@ -167,7 +169,7 @@ def test_official_weights_generate_and_save_as_ours(official, tmp_path):
     small = with_fields(experiment, {"data.height": 16, "data.width": 64})
     (image,) = assemble(small, network).generate(1, steps=11)
     assert image.shape == (16, 64)
-    lidarsynth.build.save(tmp_path, small, network)
+    save(tmp_path, small, network)
     again, same = load(tmp_path)
     assert again == small
     torch.testing.assert_close(same.state_dict(), network.state_dict())
@@ -301,7 +303,7 @@ class Walls:
 def test_training_lowers_the_error_at_every_level():
     experiment, images = with_fields(TINY, {"training.steps": 20, "training.learning_rate": 3e-3}), Walls(4)
     torch.manual_seed(0)
-    state = start(experiment, build_network(experiment))
+    state = start(experiment, build_network(experiment), task_of(experiment))
     before = fixed_losses(experiment, state.network, images.x_0([0, 1]))
     losses = [p.losses["loss"] for p in train(experiment, state, images, QUIET)]  # type: ignore[arg-type]
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
@@ -313,7 +315,7 @@ def test_training_lowers_the_error_at_every_level():
 
 def test_the_average_is_that_of_the_parameters_alone():
     experiment = with_fields(TINY, {"training.steps": 2, "training.ema_decay": 0.75})
-    state = start(experiment, build_network(experiment))
+    state = start(experiment, build_network(experiment), task_of(experiment))
     first = {name: p.detach().clone() for name, p in state.network.named_parameters()}
     expected = first
     for _ in train(experiment, state, Walls(4), QUIET):  # type: ignore[arg-type]
@@ -346,7 +348,7 @@ def test_accumulated_passes_give_the_curve_of_one():
         torch.manual_seed(0)
         steps = train(
             experiment,
-            start(experiment, build_network(experiment)),
+            start(experiment, build_network(experiment), task_of(experiment)),
             Walls(8),  # type: ignore[arg-type]
             replace(QUIET, accumulate=passes),
         )
@@ -401,7 +403,7 @@ def test_the_network_is_also_a_noise_predictor():
          "training.steps": 16, "training.batch_size": 4, "training.warmup": 1, "training.learning_rate": 5e-3},
     )  # fmt: skip
     torch.manual_seed(0)
-    state = start(experiment, build_network(experiment))
+    state = start(experiment, build_network(experiment), task_of(experiment))
     losses = [p.losses["loss"] for p in train(experiment, state, Walls(4), QUIET)]  # type: ignore[arg-type]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:3])
     made = assemble(experiment, state.network)

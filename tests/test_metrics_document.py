@@ -7,9 +7,9 @@ import pytest
 from test_evaluate import REAL, STREETS, saved
 from test_readme import REPO_ROOT, blocks, commands
 
-from lidarsynth import gathering
-from lidarsynth.cli import main
-from lidarsynth.metrics.protocols import PROTOCOLS
+from lidarsynth.cli.main import main
+from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation.protocols import PROTOCOLS
 
 DOC = REPO_ROOT / "docs" / "metrics.md"
 TEXT = DOC.read_text()
@@ -30,7 +30,7 @@ def test_the_document_names_every_protocol_and_its_rows():
 def test_commands_and_python_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(gathering, "URLS", {})
+    monkeypatch.setattr(accumulation, "URLS", {})
     saved(tmp_path / "out", STREETS)
     saved(tmp_path / "real", REAL)
     said = []

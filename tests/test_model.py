@@ -9,16 +9,16 @@ from networks import trained
 
 import lidarsynth
 from lidarsynth.diffusion.samplers import STEPS
-from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.loading import assemble
-from lidarsynth.model import LidarModel
-from lidarsynth.presets import preset
-from lidarsynth.scan_model import sparse_image
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.systems.scan_model import sparse_image
 
 
 def model_of(experiment: Experiment) -> LidarModel:

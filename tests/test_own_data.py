@@ -11,13 +11,15 @@ from pathlib import Path
 import pytest
 from test_readme import REPO_ROOT, blocks, commands, smaller
 
-from lidarsynth.build import build_network, load, save
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import CachedImages
-from lidarsynth.data.files import read, write
-from lidarsynth.experiment import with_fields
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import with_fields
+from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.sensor import read_sensor
-from lidarsynth.presets import preset
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.build import load_folder as load
 
 DOC = REPO_ROOT / "docs" / "own-data.md"
 SHOWN = blocks(DOC.read_text())
@@ -40,7 +42,7 @@ def small(words: list[str]) -> list[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the user stands: scans of one street, scans of another, the sensor as the document writes it."""
     pytest.importorskip("embreex", reason="needs lidarsynth[synthetic]")
-    from lidarsynth.data.synthetic.reader import SyntheticStreets
+    from lidarsynth.streets.reader import SyntheticStreets
 
     folder = tmp_path_factory.mktemp("own-data")
     (toml,) = ("\n".join(block.lines) for block in SHOWN if block.language == "toml")

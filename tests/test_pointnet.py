@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarsynth.metrics.pointnet import PointNet, point_features, read_pointnet
+from lidarsynth.networks.pointnet import PointNet, point_features, read_pointnet
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from lidarsynth.evaluation.processes import over_processes
 from lidarsynth.metrics.distributions import Moments, moments
-from lidarsynth.metrics.processes import over_processes
 
 GATHER = """
 import sys
 import numpy as np, torch, torch.distributed as dist
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import Moments
-from lidarsynth.metrics.processes import over_processes
-from lidarsynth.metrics.protocols import BEV_1
-from lidarsynth.metrics.statistics import Statistics
+from lidarsynth.evaluation.processes import over_processes
+from lidarsynth.evaluation.protocols import BEV_1
+from lidarsynth.evaluation.statistics import Statistics
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.lidar.scan import RangeImage
 folder, rank = sys.argv[1], int(sys.argv[2])

@@ -10,14 +10,15 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from lidarsynth.evaluation import pairs
+from lidarsynth.evaluation import report as evaluate
+from lidarsynth.evaluation.protocols import BEV_1, LIDARGEN, PROTOCOLS, R2DM, Network, get_protocol
+from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.metrics import evaluate, pairs
 from lidarsynth.metrics.distributions import kernel_distance
-from lidarsynth.metrics.pointnet import read_pointnet
-from lidarsynth.metrics.protocols import BEV_1, LIDARGEN, PROTOCOLS, R2DM, Network, get_protocol
-from lidarsynth.metrics.rangenet import RangeNet, read_rangenet
-from lidarsynth.metrics.statistics import Statistics, definition, load_statistics, save_statistics
+from lidarsynth.networks.pointnet import read_pointnet
+from lidarsynth.networks.rangenet import RangeNet, read_rangenet
 
 GRID = Sensor("grid", (2.0, 0.0, -2.0, -4.0, -8.0, -12.0, -16.0, -20.0), 32, 0.1, 100.0)
 

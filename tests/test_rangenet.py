@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.checkpoint import load_state
 from lidarsynth.metrics.knn import knn_labels, smooth_labels
-from lidarsynth.metrics.rangenet import RangeNet, frechet_features, frechet_positions, read_rangenet
+from lidarsynth.networks.rangenet import RangeNet, frechet_features, frechet_positions, read_rangenet
+from lidarsynth.networks.tensors import load_state
 
 
 def assert_net(actual: Tensor, expected: Tensor) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarsynth.data.files import read
-from lidarsynth.data.recognise import elevations_of, recognise, rings_in_order
+from lidarsynth.files.formats import read
+from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 

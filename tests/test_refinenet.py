@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.models.refinenet import (
+from lidarsynth.networks.refinenet import (
     ChainedPooling,
     ConvMeanPool,
     InstanceNormPlus,

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lidarsynth.lidar.colours import (
-    CLASSES,
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.pictures.colours import (
     NEAREST,
     TURBO,
     VIRIDIS,
@@ -19,9 +21,9 @@ from lidarsynth.lidar.colours import (
     reflectance_colours,
     turbo,
 )
-from lidarsynth.lidar.figure import colour_bar, compare, compare_3d, panel
-from lidarsynth.lidar.perspective import Camera, perspective
-from lidarsynth.lidar.render import (
+from lidarsynth.pictures.figure import colour_bar, compare, compare_3d, panel
+from lidarsynth.pictures.perspective import Camera, perspective
+from lidarsynth.pictures.render import (
     BACKGROUNDS,
     EMPTY,
     bev,
@@ -31,8 +33,6 @@ from lidarsynth.lidar.render import (
     reflectance_strip,
     save_png,
 )
-from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
 
 SMALL = Sensor("small", (2.0, 0.0, -5.0, -15.0), 32, 1.0, 50.0)
 

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 from networks import trained
 
-from lidarsynth import build
-from lidarsynth.data.files import write
-from lidarsynth.experiment import Card
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import PRESETS, preset
+from lidarsynth.experiment.record import Card
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.metrics.reconstruction import Errors
-from lidarsynth.presets import PRESETS, preset
-from lidarsynth.report import describe, describe_sensor, errors_table, mean_table
+from lidarsynth.systems.build import build_network
+from lidarsynth.verbs.description import describe, describe_sensor, errors_table, mean_table
 
 
 def table(text: str) -> dict[str, str]:
@@ -37,14 +38,14 @@ def test_scan(tmp_path: Path):
 def test_preset_without_weights(name: str):
     said = table(describe(name))
     assert said["from"] == "preset, no weights"
-    network = build.build_network(preset(name))
+    network = build_network(preset(name))
     assert said["parameters"] == f"{sum(p.numel() for p in network.parameters()):,}"
 
 
 def test_model_folder_says_its_card(tmp_path: Path):
     card = Card("MIT", "streets of our own", ("20 steps on a laptop",), ("MAE 1.5 m",))
     experiment = replace(preset("tiny"), name="mine", card=card)
-    build.save(tmp_path / "m", experiment, trained(experiment))
+    save(tmp_path / "m", experiment, trained(experiment))
     text = describe(str(tmp_path / "m"))
     assert text.splitlines()[0] == "mine"
     for words in ("MIT", "streets of our own", "20 steps on a laptop", "MAE 1.5 m", "16 x 64", "hdl-64e-kitti"):
@@ -54,7 +55,7 @@ def test_model_folder_says_its_card(tmp_path: Path):
 
 def test_a_model_folder_may_be_named_like_a_scan_or_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     experiment = preset("tiny")
-    build.save(tmp_path / "run.bin", experiment, trained(experiment))
+    save(tmp_path / "run.bin", experiment, trained(experiment))
     assert "conditional-unet" in describe(str(tmp_path / "run.bin"))
 
 

@@ -25,7 +25,7 @@ from lidarsynth.diffusion.samplers import (
     starting_noise,
 )
 from lidarsynth.diffusion.schedule import SCHEDULES, cosine, flow, ve
-from lidarsynth.models.efficient_unet import EfficientUNet
+from lidarsynth.networks.efficient_unet import EfficientUNet
 
 DOUBLE = torch.float64
 

@@ -8,20 +8,20 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.build import build_network, load, save
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 from lidarsynth.data.cache import write_cache
 from lidarsynth.data.dataset import CachedImages
-from lidarsynth.experiment import Experiment, from_dict, with_fields
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, from_dict, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.loading import assemble
-from lidarsynth.metrics.rangenet import RangeNet
-from lidarsynth.presets import preset
-from lidarsynth.training.finetune import transfer
-from lidarsynth.training.loop import start, train
-from lidarsynth.training.options import Options
-from lidarsynth.training.segmentation import (
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.finetune import transfer
+from lidarsynth.systems.segmentation.training import (
     Batch,
     CrossEntropy,
     augment,
@@ -33,8 +33,10 @@ from lidarsynth.training.segmentation import (
     judge,
     pictures,
 )
-from lidarsynth.training.steps import sample_rng
-from lidarsynth.training.tasks import task_of
+from lidarsynth.systems.tasks import task_of
+from lidarsynth.training.loop import start, train
+from lidarsynth.training.options import Options
+from lidarsynth.training.randomness import sample_rng
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 CLASSES_THERE = (1, 9, 13, 15)
@@ -195,7 +197,7 @@ def test_images_without_labels_are_refused(tmp_path: Path):
 
 
 def trained(experiment: Experiment, cache: Path, stop: int | None = None, state: dict | None = None):
-    run = start(experiment, network(experiment))
+    run = start(experiment, network(experiment), task_of(experiment))
     if state:
         run.load_state_dict(state)
     losses = []

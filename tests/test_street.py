@@ -11,20 +11,20 @@ import pytest
 import torch
 
 import lidarsynth as ls
-from lidarsynth import gathering
-from lidarsynth.cli import main
-from lidarsynth.data.files import write
-from lidarsynth.gathering import load_networks
+from lidarsynth.cli.main import main
+from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation.accumulation import load_networks
+from lidarsynth.evaluation.protocols import STREET_1
+from lidarsynth.evaluation.report import results_of
+from lidarsynth.evaluation.statistics import Statistics, definition
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.metrics.evaluate import results_of
-from lidarsynth.metrics.protocols import STREET_1
-from lidarsynth.metrics.rangenet import RangeNet
-from lidarsynth.metrics.statistics import Statistics, definition
-from lidarsynth.metrics.street import StreetFeatures
-from lidarsynth.training.segmentation import judge, pixels
-from lidarsynth.weights import load_parts, shipped
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.networks.street_features import StreetFeatures
+from lidarsynth.systems.segmentation.training import judge, pixels
+from lidarsynth.weights.load import load_parts, shipped
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
 SENSOR = SENSORS["hdl-64e-kitti"]
@@ -37,7 +37,7 @@ DEFINITION = "v1 fc7ac3a76ca63ff9"
 def offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty cache folder, and nothing that can be downloaded."""
     monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(gathering, "URLS", dict.fromkeys(gathering.URLS, (tmp_path / "nowhere").as_uri()))
+    monkeypatch.setattr(accumulation, "URLS", dict.fromkeys(accumulation.URLS, (tmp_path / "nowhere").as_uri()))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_the_shipped_network_knows_streets(street: RangeImage):
 
 def test_streets_without_cars_are_the_same_streets():
     pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
-    from lidarsynth.data.synthetic.reader import SyntheticStreets
+    from lidarsynth.streets.reader import SyntheticStreets
 
     full, empty = (SyntheticStreets(12, 32, SENSOR, without).image(5) for without in ((), ("car",)))
     assert full.label is not None and empty.label is not None
@@ -132,7 +132,7 @@ def test_streets_without_cars_are_the_same_streets():
 def test_worse_scans_get_worse_scores(network: StreetFeatures):
     pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
     benchmark = runpy.run_path(str(REPO_ROOT / "benchmarks/street.py"))
-    judge_of = benchmark["Judge"](STREET_1, gathering.Loaded({"rangenet": network}, {"rangenet": WEIGHTS}))
+    judge_of = benchmark["Judge"](STREET_1, accumulation.Loaded({"rangenet": network}, {"rangenet": WEIGHTS}))
     scans = list(benchmark["streets"](3000, 4))
     real = judge_of.gather(scans, "real")
 

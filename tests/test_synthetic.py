@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from lidarsynth.data.synthetic import hdl64e
-from lidarsynth.data.synthetic.facades import shade
-from lidarsynth.data.synthetic.ground import Ground, Road
-from lidarsynth.data.synthetic.materials import MATERIALS, NUMBER, TABLE
-from lidarsynth.data.synthetic.objects import library
-from lidarsynth.data.synthetic.reader import SyntheticStreets
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.streets import hdl64e
+from lidarsynth.streets.facades import shade
+from lidarsynth.streets.ground import Ground, Road
+from lidarsynth.streets.materials import MATERIALS, NUMBER, TABLE
+from lidarsynth.streets.objects import library
+from lidarsynth.streets.reader import SyntheticStreets
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 

@@ -10,18 +10,20 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.build import build_denoiser, build_network
 from lidarsynth.data.frames import Name
-from lidarsynth.experiment import Experiment, Training, with_fields
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, Training, with_fields
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.presets import preset
+from lidarsynth.systems.build import build_denoiser, build_network
+from lidarsynth.systems.diffusion.training import Batch, Objective, draw, draw_images, random_known, scaled
+from lidarsynth.systems.diffusion.validation import TIMES, fixed_losses
+from lidarsynth.systems.tasks import task_of
 from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
 from lidarsynth.training.loop import learning_rate, start, train, update_ema
 from lidarsynth.training.options import Options
-from lidarsynth.training.steps import Batch, Objective, augment, draw, draw_images, random_known, scaled
+from lidarsynth.training.randomness import augment
 from lidarsynth.training.task import ema_decay, ema_due
-from lidarsynth.training.validation import TIMES, fixed_losses
 
 TINY = preset("tiny")
 
@@ -101,7 +103,7 @@ def test_every_epoch_visits_every_image_once():
 
 def test_streets_never_repeat_and_a_step_mixes_worlds():
     pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
-    from lidarsynth.data.synthetic.world import POSES
+    from lidarsynth.streets.world import POSES
 
     streets = Streets(0, sensor=None)  # type: ignore[arg-type]
     steps = [streets.indices(step, 4) for step in range(3 * POSES)]
@@ -266,7 +268,7 @@ def test_r2dm_s_mean_weight_is_that_of_the_global_batch():
 
 def curve(passes: int = 1, workers: int = 0, steps: int = 4, **changes) -> list[float]:
     experiment = with_fields(TINY, {"training.steps": steps, "diffusion.mean_weight": True, **changes})
-    run = start(experiment, network(experiment))
+    run = start(experiment, network(experiment), task_of(experiment))
     options = Options(accumulate=passes, workers=workers)
     return [p.losses["loss"] for p in train(experiment, run, Noise(), options)]  # type: ignore[arg-type]
 
@@ -285,7 +287,7 @@ def test_dropout_is_reproducible_and_leaves_global_randomness_alone():
     torch.manual_seed(99)
     expected = torch.get_rng_state()
     experiment = with_fields(TINY, {"training.steps": 1, **changes})
-    run = start(experiment, network(experiment))
+    run = start(experiment, network(experiment), task_of(experiment))
     torch.set_rng_state(expected)
     list(train(experiment, run, Noise()))  # type: ignore[arg-type]
     assert torch.equal(torch.get_rng_state(), expected)
@@ -294,13 +296,13 @@ def test_dropout_is_reproducible_and_leaves_global_randomness_alone():
 
 def test_batches_must_share_equally():
     with pytest.raises(ValueError, match="that 3 processes x passes share equally, found 4"):
-        Examples(TINY, Noise(), 3)  # type: ignore[arg-type]
+        Examples(TINY, Noise(), 3, draw_images)  # type: ignore[arg-type]
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_and_scans():
     experiment = with_fields(TINY, {"training.steps": 10})
     images = Noise(20, broken=batch_indices(experiment.training, 2, Noise(20))[1])  # type: ignore[arg-type]
-    run = start(experiment, network())
+    run = start(experiment, network(), task_of(experiment))
     steps = train(experiment, run, images)  # type: ignore[arg-type]
     assert [next(steps).step, next(steps).step] == [1, 2]
     with pytest.raises(FloatingPointError, match=rf"step 3: expected a finite loss .* noise/{images.broken}\b"):
@@ -311,7 +313,7 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_scans():
 def test_training_lowers_the_loss_on_fixed_noise():
     changes = {"training.steps": 60, "training.learning_rate": 3e-3, "data.roll": False, "data.mirror": False}
     experiment, images = with_fields(TINY, changes), Noise(1)
-    run = start(experiment, network(experiment))
+    run = start(experiment, network(experiment), task_of(experiment))
     before = fixed_losses(experiment, run.network.eval(), images.x_0([0]))
     list(train(experiment, run, images))  # type: ignore[arg-type]
     after = fixed_losses(experiment, run.network.eval(), images.x_0([0]))
@@ -323,5 +325,5 @@ def test_training_lowers_the_loss_on_fixed_noise():
 
 def test_batches_travel_through_the_loader_in_order():
     experiment = replace(TINY, training=replace(TINY.training, steps=3))
-    batches = list(load_batches(Examples(experiment, Noise(), 2), 1, range(2)))  # type: ignore[arg-type]
+    batches = list(load_batches(Examples(experiment, Noise(), 2, draw_images), 1, range(2)))  # type: ignore[arg-type]
     assert len(batches) == 4 and all(isinstance(b, Batch) and len(b.x_0) == 2 for b in batches)

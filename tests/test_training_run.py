@@ -15,16 +15,17 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from lidarsynth.build import build_network, load
 from lidarsynth.data.dataset import write_cache
-from lidarsynth.experiment import Experiment, with_fields
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.presets import preset
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.finetune import transfer
 from lidarsynth.training.checkpoint import checkpoints
-from lidarsynth.training.finetune import transfer
 from lidarsynth.training.options import Options
-from lidarsynth.training.run import resolve, run
+from lidarsynth.verbs.training import resolve, run
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 QUIET = Options(sample_every=0, workers=0)

@@ -10,21 +10,22 @@ import torch
 from torch import Tensor
 
 import lidarsynth
-from lidarsynth.build import build_network, save
-from lidarsynth.completion import complete_scan, into_sensor, upsample_scan
-from lidarsynth.experiment import with_fields
-from lidarsynth.interpolation_model import InterpolationModel, interpolated
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.loading import assemble
-from lidarsynth.models.iln import ILN, LIIF, angle_queries
-from lidarsynth.models.lidar_sr import LidarSR, mc_dropout, remove_uncertain
-from lidarsynth.presets import preset
-from lidarsynth.report import describe
-from lidarsynth.training.tasks import TASKS
-from lidarsynth.upsampling_model import UpsamplingModel, places, queries_at, scaled
+from lidarsynth.networks.iln import ILN, LIIF, angle_queries
+from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated
+from lidarsynth.systems.tasks import TASKS
+from lidarsynth.systems.upsampling.model import UpsamplingModel, places, queries_at, scaled
+from lidarsynth.verbs.completion import complete_scan, into_sensor, upsample_scan
+from lidarsynth.verbs.description import describe
 
 WORDS = ("lidar-sr", "iln", "liif")
 

@@ -8,20 +8,22 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from lidarsynth.build import build_network, build_sensor, load
 from lidarsynth.data.dataset import write_cache
 from lidarsynth.data.frames import Name
-from lidarsynth.experiment import Experiment, Training, with_fields
-from lidarsynth.interpolation_model import interpolated
+from lidarsynth.experiment.presets import PRESETS, preset
+from lidarsynth.experiment.record import Experiment, Training, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.presets import PRESETS, preset
-from lidarsynth.training.finetune import transfer
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.finetune import transfer
+from lidarsynth.systems.interpolation.model import interpolated
+from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.upsampling.training import Asked, Pair, draw_pairs, draw_queries
 from lidarsynth.training.loop import Run, learning_rate, start, train
 from lidarsynth.training.options import Options
-from lidarsynth.training.run import run as run_in
-from lidarsynth.training.tasks import task_of
-from lidarsynth.training.upsampling import Asked, Pair, draw_pairs, draw_queries
+from lidarsynth.verbs.training import run as run_in
 
 LIIF = {"model.network": "liif"}
 KINDS = {"lidar-sr": ("lidar-sr-tiny", {}), "iln": ("iln-tiny", {}), "liif": ("iln-tiny", LIIF)}
@@ -61,7 +63,7 @@ def tiny(kind: str, **changes) -> Experiment:
 
 def fresh(experiment: Experiment) -> Run:
     torch.manual_seed(0)
-    return start(experiment, build_network(experiment))
+    return start(experiment, build_network(experiment), task_of(experiment))
 
 
 # ---------------------------------------------------------------- what a step sees
@@ -190,7 +192,7 @@ def test_a_stopped_run_continues_bit_by_bit(kind):
     torch.save(broken.state_dict(), file)
     file.seek(0)
     torch.manual_seed(5)  # nothing may hang on the global generator
-    resumed = start(experiment, build_network(experiment))
+    resumed = start(experiment, build_network(experiment), task_of(experiment))
     resumed.load_state_dict(torch.load(file, weights_only=True))
     assert first + [p.losses["loss"] for p in train(experiment, resumed, Walls(), Options(workers=0))] == curve
     for key, value in whole.network.state_dict().items():

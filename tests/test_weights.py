@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from lidarsynth import weights
-from lidarsynth.build import build_network, build_sensor, save
-from lidarsynth.experiment import Data, Model
-from lidarsynth.loading import assemble
-from lidarsynth.presets import preset
-from lidarsynth.weights import RELEASES, cache_folder, download, load_parts, read_official, shipped
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Data, Model
+from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.systems.assemble import assemble
+from lidarsynth.systems.build import build_network
+from lidarsynth.weights import load as weights
+from lidarsynth.weights.download import cache_folder, download
+from lidarsynth.weights.load import RELEASES, load_parts, shipped
+from lidarsynth.weights.official import read_official
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 

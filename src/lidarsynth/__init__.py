@@ -7,22 +7,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lidarsynth.data.files import read, read_image, write
-    from lidarsynth.evaluation import evaluate
+    from lidarsynth.evaluation.evaluate import evaluate
+    from lidarsynth.files.formats import read, read_image, write
     from lidarsynth.lidar.corruption import corrupt
     from lidarsynth.lidar.projection import project
     from lidarsynth.lidar.scan import RangeImage, Scan
     from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor, read_sensor
-    from lidarsynth.loading import load
-    from lidarsynth.model import LidarModel
+    from lidarsynth.systems.diffusion.model import LidarModel
+    from lidarsynth.weights.load import load
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "read": "lidarsynth.data.files",
-    "read_image": "lidarsynth.data.files",
-    "write": "lidarsynth.data.files",
-    "evaluate": "lidarsynth.evaluation",
+    "read": "lidarsynth.files.formats",
+    "read_image": "lidarsynth.files.formats",
+    "write": "lidarsynth.files.formats",
+    "evaluate": "lidarsynth.evaluation.evaluate",
     "corrupt": "lidarsynth.lidar.corruption",
     "project": "lidarsynth.lidar.projection",
     "RangeImage": "lidarsynth.lidar.scan",
@@ -31,8 +31,8 @@ _HOME = {
     "Sensor": "lidarsynth.lidar.sensor",
     "get_sensor": "lidarsynth.lidar.sensor",
     "read_sensor": "lidarsynth.lidar.sensor",
-    "LidarModel": "lidarsynth.model",
-    "load": "lidarsynth.loading",
+    "LidarModel": "lidarsynth.systems.diffusion.model",
+    "load": "lidarsynth.weights.load",
 }
 
 __all__ = [

@@ -1,5 +1,5 @@
 """`python -m lidarsynth`."""
 
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 
 main()

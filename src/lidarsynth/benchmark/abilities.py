@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lidarsynth.benchmark.config import GenerationMethod, UpsamplingMethod
-from lidarsynth.scan_model import ScanModel
+from lidarsynth.systems.scan_model import ScanModel
 
 
 def has_reflectance(model: ScanModel) -> bool:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lidarsynth.experiment import from_dict
-from lidarsynth.models.interpolation import METHODS as INTERPOLATIONS
+from lidarsynth.experiment.record import from_dict
+from lidarsynth.networks.interpolation import METHODS as INTERPOLATIONS
 
 if sys.version_info >= (3, 11):
     import tomllib

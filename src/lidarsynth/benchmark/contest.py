@@ -12,11 +12,11 @@ from typing import Any
 from lidarsynth.benchmark.config import Generation, GenerationMethod, Upsampling, UpsamplingMethod, protocols_of
 from lidarsynth.benchmark.store import Store, open_store
 from lidarsynth.data.cache import sha256 as sha256_of_file
-from lidarsynth.gathering import Loaded, OnImages, load_networks
-from lidarsynth.generation import fingerprint
-from lidarsynth.metrics.protocols import get_protocol
-from lidarsynth.metrics.rangenet import read_rangenet
-from lidarsynth.scan_model import ScanModel
+from lidarsynth.evaluation.accumulation import Loaded, OnImages, load_networks
+from lidarsynth.evaluation.protocols import get_protocol
+from lidarsynth.networks.rangenet import read_rangenet
+from lidarsynth.systems.fingerprint import fingerprint
+from lidarsynth.systems.scan_model import ScanModel
 
 Load = Callable[[str], ScanModel]
 

@@ -12,13 +12,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.data.index import whole
-from lidarsynth.lidar.colours import CLASS_COLOURS, CLASSES
-from lidarsynth.lidar.figure import GAP, Picture, colour_bar, panel
-from lidarsynth.lidar.perspective import Camera, perspective
+from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.metrics.protocols import get_protocol
-from lidarsynth.metrics.rangenet import RangeNet
-from lidarsynth.pictures import STRIP, strips
+from lidarsynth.lidar.semantic_kitti import CLASS_COLOURS, CLASSES
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.pictures.figure import GAP, Picture, colour_bar, panel
+from lidarsynth.pictures.perspective import Camera, perspective
+from lidarsynth.pictures.portrait import STRIP, strips
 
 VIEW = Camera(azimuth=205.0, elevation=24.0, distance=30.0, target=(7.0, 0.0, -1.0))  # nearer than a portrait's
 COLUMNS = 3  # views beside each other

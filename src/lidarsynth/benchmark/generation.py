@@ -17,14 +17,14 @@ from lidarsynth.benchmark.published import published
 from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.sources import located
 from lidarsynth.benchmark.store import Seconds, Store
-from lidarsynth.evaluation import evaluate
-from lidarsynth.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.evaluation.evaluate import evaluate
+from lidarsynth.evaluation.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.evaluation.protocols import get_protocol
+from lidarsynth.evaluation.statistics import definition
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.metrics.protocols import get_protocol
-from lidarsynth.metrics.statistics import definition
-from lidarsynth.scan_model import ScanModel
+from lidarsynth.systems.scan_model import ScanModel
 
 Draw = Callable[[int, int], list[RangeImage]]  # seed of the first scan, how many -> scans
 DECIDING = ("noise", "steps", "sampler")  # keys of a method that decide its scans

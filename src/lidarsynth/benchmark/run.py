@@ -19,14 +19,14 @@ from lidarsynth.benchmark.sources import corrupted, located
 from lidarsynth.benchmark.store import write_text
 from lidarsynth.benchmark.tables import page
 from lidarsynth.benchmark.upsampling import Problem, upsampling_row
-from lidarsynth.gathering import OnImages
-from lidarsynth.image_sets import image_set, sensor_of
-from lidarsynth.lidar.render import save_png
+from lidarsynth.evaluation.accumulation import OnImages
+from lidarsynth.evaluation.image_sets import image_set, sensor_of
+from lidarsynth.evaluation.pairs import classes_of
+from lidarsynth.evaluation.protocols import R2DM_UPSAMPLING, get_protocol
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.metrics.pairs import classes_of
-from lidarsynth.metrics.protocols import R2DM_UPSAMPLING, get_protocol
 from lidarsynth.metrics.reconstruction import reconstruction_errors
+from lidarsynth.pictures.render import save_png
 
 RESULTS, TABLE, FIGURE, SCORES = "results.json", "table.md", "figure.png", "scores.png"
 

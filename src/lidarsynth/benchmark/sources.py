@@ -11,13 +11,13 @@ import numpy as np
 
 from lidarsynth.benchmark.config import Upsampling, protocols_of
 from lidarsynth.data.sources import SYNTHETIC, cache_synthetic
-from lidarsynth.gathering import OnImages
-from lidarsynth.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.evaluation.accumulation import OnImages
+from lidarsynth.evaluation.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import PROJECTIONS
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
-from lidarsynth.metrics.protocols import get_protocol
 
 STREET = "street"  # the scan that comes with the package
 

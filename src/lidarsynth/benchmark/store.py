@@ -13,8 +13,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarsynth.data.files import read_image, write
 from lidarsynth.data.index import sweep, whole
+from lidarsynth.files.formats import read_image, write
 from lidarsynth.lidar.scan import RangeImage
 
 

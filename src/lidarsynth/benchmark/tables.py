@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.benchmark.rows import Row
-from lidarsynth.metrics.protocols import get_protocol
+from lidarsynth.evaluation.protocols import get_protocol
 
 RANK: dict[
     str, Callable[[float], float]

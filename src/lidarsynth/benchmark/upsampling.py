@@ -15,13 +15,13 @@ from lidarsynth.benchmark.published import published
 from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.sources import Corrupted
 from lidarsynth.benchmark.store import Seconds, Store
-from lidarsynth.interpolation_model import interpolated
+from lidarsynth.evaluation.pairs import Pairs, classes_of
+from lidarsynth.evaluation.protocols import get_protocol
+from lidarsynth.evaluation.statistics import definition
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.metrics.pairs import Pairs, classes_of
-from lidarsynth.metrics.protocols import get_protocol
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.metrics.statistics import definition
-from lidarsynth.scan_model import ScanModel
+from lidarsynth.systems.interpolation.model import interpolated
+from lidarsynth.systems.scan_model import ScanModel
 
 Fill = Callable[[RangeImage, np.ndarray, int], RangeImage]  # image without the hidden pixels, known (H, W), seed
 ERRORS = ("range MAE", "reflectance MAE", "hidden range MAE", "hidden reflectance MAE")  # of each scan

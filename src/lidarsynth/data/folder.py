@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lidarsynth.data.files import READERS
 from lidarsynth.data.frames import Frame, Frames
+from lidarsynth.files.formats import READERS
 
 
 def folder(root: str | Path, intensity: str = "auto") -> Frames:

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from lidarsynth.data.fields import MAX_METRES
-from lidarsynth.data.files import read
+from lidarsynth.files.fields import MAX_METRES
+from lidarsynth.files.formats import read
 from lidarsynth.lidar.scan import Scan
 
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.fields import FileError
-from lidarsynth.data.files import read_with_report
 from lidarsynth.data.frames import Frame, Name, choose
+from lidarsynth.files.fields import FileError
+from lidarsynth.files.formats import read_with_report
 from lidarsynth.lidar.scan import Scan
 
 SPLITS = ("all", "mini", "trainval", "test")  # the versions of the tables; all = the only one there is

@@ -15,8 +15,8 @@ from lidarsynth.data.index import REPORT, read_index, report
 from lidarsynth.data.kitti import kitti
 from lidarsynth.data.kitti360 import kitti360
 from lidarsynth.data.nuscenes import nuscenes
-from lidarsynth.data.recognise import recognise
 from lidarsynth.lidar.projection import PROJECTIONS, project, thin
+from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
@@ -142,7 +142,7 @@ def cache_synthetic(
 
     apart  a world for each of them, for sets that are compared; else sixteen places in each, many times faster
     """
-    from lidarsynth.data.synthetic.reader import SyntheticStreets
+    from lidarsynth.streets.reader import SyntheticStreets
 
     spec = _sensor(sensor, width)
     streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart)

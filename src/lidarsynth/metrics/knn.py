@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.lidar.colours import CLASSES
+from lidarsynth.lidar.semantic_kitti import CLASSES
 
 
 def knn_labels(

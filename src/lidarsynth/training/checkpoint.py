@@ -16,8 +16,8 @@ from pathlib import Path
 
 import torch
 
-from lidarsynth.build import save
-from lidarsynth.experiment import Experiment
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.record import Experiment
 from lidarsynth.training.loop import Run
 
 FOLDER, LATEST, STATE = "checkpoints", "latest", "state.pt"

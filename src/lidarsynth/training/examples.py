@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lidarsynth.build import build_sensor
 from lidarsynth.data.dataset import CachedImages, SeveralCaches
 from lidarsynth.data.frames import Name
-from lidarsynth.experiment import Experiment, Training
+from lidarsynth.experiment.record import Experiment, Training
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.depth import to_x_0
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.training.tasks import task_of
+from lidarsynth.training.task import Draw
 
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
 
@@ -39,7 +39,7 @@ class Streets:
 
     def indices(self, step: int, batch_size: int) -> list[int]:
         """The scans of a step, each from another world; steps in a row go through the places of their worlds."""
-        from lidarsynth.data.synthetic.world import POSES
+        from lidarsynth.streets.world import POSES
 
         return [(step // POSES * batch_size + p) * POSES + step % POSES for p in range(batch_size)]
 
@@ -49,7 +49,7 @@ class Streets:
 
     def take(self, indices: list[int]) -> list[RangeImage]:
         """Scans as images, with labels."""
-        from lidarsynth.data.synthetic.reader import SyntheticStreets
+        from lidarsynth.streets.reader import SyntheticStreets
 
         images = []
         for slot, index in enumerate(indices):  # a reader per slot, because a reader remembers only two worlds
@@ -98,13 +98,14 @@ class Examples(Dataset):
     `parts` is processes times passes of gradient accumulation. Raises ValueError unless it divides the batch size.
     """
 
-    def __init__(self, experiment: Experiment, images: Learned, parts: int):
+    def __init__(self, experiment: Experiment, images: Learned, parts: int, draw: Draw):
         size = experiment.training.batch_size
         if size % parts:
             raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")
         self.experiment = experiment
         self.images = images
         self.parts = parts
+        self.draw = draw
 
     def names(self, step: int) -> str:
         """The scans of a step, as a person looks for them."""
@@ -116,8 +117,7 @@ class Examples(Dataset):
         training = self.experiment.training
         indices = batch_indices(training, step, self.images)
         positions = list(range(part, training.batch_size, self.parts))
-        task = task_of(self.experiment)
-        return task.draw(self.experiment, self.images, [indices[p] for p in positions], step, positions)
+        return self.draw(self.experiment, self.images, [indices[p] for p in positions], step, positions)
 
 
 def load_batches(examples: Examples, first: int, parts: range, workers: int = 0, pinned: bool = False) -> Iterator[Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.lidar.render import save_png
+from lidarsynth.pictures.render import save_png
 from lidarsynth.training.loop import Progress
 
 TABLE = "losses.csv"

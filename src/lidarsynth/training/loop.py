@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.experiment import Experiment, Training
-from lidarsynth.models.conditional import ConditionalUNet
+from lidarsynth.experiment.record import Experiment, Training
+from lidarsynth.networks.conditional import ConditionalUNet
 from lidarsynth.training.examples import Examples, Learned, Streets, load_batches
 from lidarsynth.training.machine import accelerator_of, fixed_randomness, workers_of
 from lidarsynth.training.options import Options
-from lidarsynth.training.task import Phase
-from lidarsynth.training.tasks import task_of
+from lidarsynth.training.task import Phase, Task
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -32,12 +31,14 @@ class Run:
     product     the network that the model needs, a part of `network` or all of it
     ema         its moving average
     optimizers  by the names that the task's phases use
+    task        how this kind of network is trained
     """
 
     network: nn.Module
     product: nn.Module
     ema: nn.Module
     optimizers: dict[str, torch.optim.Optimizer]
+    task: Task
     step: int = 0
     scaler: torch.amp.GradScaler | None = None  # of fp16
 
@@ -74,13 +75,12 @@ class Progress:
     waited: float = 0.0  # seconds of these spent waiting for data
 
 
-def start(experiment: Experiment, network: nn.Module, scaler: torch.amp.GradScaler | None = None) -> Run:
+def start(experiment: Experiment, network: nn.Module, task: Task, scaler: torch.amp.GradScaler | None = None) -> Run:
     """A fresh run from the network's present weights; `scaler` is accelerate's, for fp16."""
-    task = task_of(experiment)
     with fixed_randomness(experiment.training.seed):
         trained = task.around(experiment, network)
     ema = copy.deepcopy(network).requires_grad_(False)
-    return Run(trained, network, ema, task.optimizers(experiment, trained), scaler=scaler)
+    return Run(trained, network, ema, task.optimizers(experiment, trained), task, scaler=scaler)
 
 
 def learning_rate(training: Training, step: int) -> float:
@@ -125,8 +125,8 @@ def train(
     """
     options = options or Options(workers=0)
     accelerator = accelerator or accelerator_of(options)
-    training, task = experiment.training, task_of(experiment)
-    batches, examples = _batches(experiment, images, run.step, options, accelerator)
+    training, task = experiment.training, run.task
+    batches, examples = _batches(experiment, images, run, options, accelerator)
     run.ema.to(accelerator.device)
     run.network.to(accelerator.device).train()
     if options.compile:
@@ -146,14 +146,15 @@ def train(
 
 
 def _batches(
-    experiment: Experiment, images: Learned, step: int, options: Options, accelerator: Accelerator
+    experiment: Experiment, images: Learned, run: Run, options: Options, accelerator: Accelerator
 ) -> tuple[Iterator[Any], Examples]:
-    """This process's batches from `step` on, one per pass, and what makes them."""
-    examples = Examples(experiment, images, accelerator.num_processes * accelerator.gradient_accumulation_steps)
-    parts = range(accelerator.process_index, examples.parts, accelerator.num_processes)
+    """This process's batches from the run's step on, one per pass, and what makes them."""
+    parts = accelerator.num_processes * accelerator.gradient_accumulation_steps
+    examples = Examples(experiment, images, parts, run.task.draw)
+    own = range(accelerator.process_index, parts, accelerator.num_processes)
     pinned = accelerator.device.type == "cuda"
     workers = workers_of(options, pinned or isinstance(images, Streets))
-    return load_batches(examples, step, parts, workers, pinned), examples
+    return load_batches(examples, run.step, own, workers, pinned), examples
 
 
 class _Turn(NamedTuple):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.data.frames import Name
-from lidarsynth.experiment import Experiment, Training
+from lidarsynth.experiment.record import Experiment, Training
 from lidarsynth.lidar.scan import RangeImage
 
 if TYPE_CHECKING:

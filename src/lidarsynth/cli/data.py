@@ -1,0 +1,50 @@
+"""The verb `data`: prepare a cache of range images for training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from lidarsynth.cli.arguments import Count, Positional
+from lidarsynth.cli.terminal import counted, say
+
+
+def data(
+    source: Positional[Literal["synthetic", "files", "kitti", "kitti360", "nuscenes", "nuscenes-sweeps"]],
+    root: Positional[Path],
+    cache: Positional[Path | None] = None,
+    split: str | None = None,
+    sensor: str | None = None,
+    projection: Literal["auto", "spherical", "unfolding"] | None = None,
+    width: int | None = None,
+    workers: int | None = None,
+    count: Count = 1000,
+    check: bool = False,
+    seed: int = 0,
+    intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
+    apart: bool = False,
+) -> None:
+    """Prepare a cache of range images for training; killed at any moment, the same command goes on.
+
+    Args:
+        source: synthetic streets, a folder of scan files, or a data set.
+        root: where the files are; the cache itself for synthetic streets.
+        cache: folder to write.
+        split: train, val, test or all; of nuscenes mini, trainval or test.
+        sensor: whose images: hdl-64e, ... or a .toml/.json file. This, projection and width have defaults by source;
+            the sensor of files is recognised from the first.
+        projection: how points become rows.
+        width: columns; below 1024 they are chosen from 1024, or 2048 when unfolding, as in R2DM.
+        workers: processes, one per processor core if not given.
+        count: synthetic scans.
+        check: also compare the checksums of what is there already, and make anew what is damaged.
+        seed: of the synthetic streets.
+        intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
+        apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
+    """
+    from lidarsynth.data.sources import prepare, summary
+
+    more = (workers, count, check, seed, intensity, apart)
+    for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
+        pass
+    say(f"wrote {summary(cache or root)}")

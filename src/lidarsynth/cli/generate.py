@@ -1,0 +1,39 @@
+"""The verb `generate`: scans from noise into a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, Source, arg
+from lidarsynth.cli.terminal import at_least, load_with_bar, say, step_bar
+
+
+def generate(
+    count: Count = 4,
+    out: Annotated[Path, arg(help="folder to write to.")] = Path("out"),
+    model: Source = "default",
+    format: Annotated[Format, arg(help="of the files.")] = "ply",
+    steps: GenerationSteps = None,
+    sampler: Annotated[Sampler | None, arg(help="of the reverse process; default ddpm.")] = None,
+    seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
+    batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one, as fast.")] = 4,
+    device: Device = "cpu",
+    picture: Picture = True,
+) -> None:
+    """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
+    from lidarsynth.systems.fingerprint import fingerprint
+    from lidarsynth.verbs.generation import batches, claim, generate_into
+
+    at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
+    at_least(0, {"seed": seed})
+    loaded = load_with_bar(model, device)
+    steps = loaded.generation_steps(steps, sampler)
+    settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
+    claim(out, settings)
+    endings = (f".{format}", ".png") if picture else (f".{format}",)
+    # Batches of other sizes round differently on a CPU, and are no faster.
+    runs = batches(out, count, endings, 1 if device == "cpu" else batch_size)
+    with step_bar("generate", len(runs) * steps) as on_step:
+        new = sum(1 for _ in generate_into(out, loaded, runs, endings, steps, sampler, seed, on_step))
+    say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -1,0 +1,177 @@
+"""How the command line speaks: lines on stdout, progress bars and one-line refusals on stderr, exit codes."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr
+from functools import partial, wraps
+from typing import TYPE_CHECKING, NoReturn
+
+import tyro
+
+if TYPE_CHECKING:
+    from lidarsynth.systems.scan_model import ScanModel
+    from lidarsynth.training.loop import Progress
+
+REFUSED, STOPPED, UNHEARD = 2, 130, 141  # exit codes; the last two as shells have them for Ctrl-C and a closed pipe
+
+
+def say(text: str) -> None:
+    """A line on stdout, at once."""
+    print(text, flush=True)
+
+
+def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
+    """Raises ValueError by the option's name unless each number is None or from `least` to 2^62."""
+    for name, number in numbers.items():
+        if number is not None and not least <= number < 2**62:
+            raise ValueError(f"expected --{name} of at least {least}, found {number}")
+
+
+@contextmanager
+def step_bar(title: str, steps: int) -> Iterator[Callable[[], object]]:
+    """A progress bar for work over two seconds; gives what to call after every network step."""
+    from tqdm import tqdm
+
+    with tqdm(total=steps, unit="step", delay=2, desc=title, leave=False) as bar:
+        yield bar.update
+
+
+@contextmanager
+def image_bar() -> Iterator[Callable[[str, int, int], object]]:
+    """A progress bar for work over two seconds; gives what to call with (what, images done, images in all)."""
+    from tqdm import tqdm
+
+    with tqdm(unit="image", delay=2, leave=False) as bar:
+
+        def on_images(what: str, done: int, total: int) -> None:
+            bar.total, bar.unit = total, {"download": "B", "compute": "row"}.get(what.split()[0], "image")
+            bar.unit_scale = bar.unit == "B"
+            bar.set_description(what, refresh=False)
+            bar.update(done - bar.n)
+
+        yield on_images
+
+
+def counted(stored: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Pass (images done, images in all) on, under a progress bar."""
+    from tqdm import tqdm
+
+    with tqdm(unit="image", delay=2) as bar:
+        for done, total in stored:
+            bar.total = total
+            bar.update(done - bar.n)
+            yield done, total
+
+
+def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
+    """The steps of a training run as they are done, under a live line with losses and speed."""
+    from tqdm import tqdm
+
+    bar = None
+    for progress in run:  # its first is where the run stands
+        bar = bar or tqdm(
+            total=steps, initial=progress.step, unit="step", mininterval=0.5 if sys.stderr.isatty() else 30
+        )
+        losses = " ".join(f"{name} {value:.4f}" for name, value in progress.losses.items())
+        bar.set_postfix_str(f"{losses} norm {progress.grad_norm:.2f} rate {progress.learning_rate:.1e}", refresh=False)
+        bar.update(progress.step - bar.n)
+        yield progress.step
+    if bar is not None:
+        bar.close()
+
+
+def load_with_bar(source: str, device: str) -> ScanModel:
+    """The model, under a progress bar where it has to be downloaded. Raises ValueError."""
+    from tqdm import tqdm
+
+    from lidarsynth.systems.assemble import assemble
+    from lidarsynth.weights.load import load_parts
+
+    with tqdm(desc=f"download {source}", unit="B", unit_scale=True, delay=2) as bar:
+
+        def on_bytes(done: int, total: int | None) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        parts = load_parts(source, on_bytes=on_bytes)
+    try:
+        return assemble(*parts).to(device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"expected a device of torch, such as cpu or cuda, found {device!r}: {error}") from None
+
+
+def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> None:
+    """Run the verb of a command line (None = the process's own) and turn every failure into one line and an exit code.
+
+    Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 141 where nobody reads stdout any more.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        codecs.register_error("lidarsynth", _sayable)
+        sys.stdout.reconfigure(errors="lidarsynth")
+    try:
+        _parsed(verbs, argv)()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        sys.exit(UNHEARD)
+    except KeyboardInterrupt:
+        print("lidarsynth: stopped", file=sys.stderr)
+        sys.exit(STOPPED)
+    except OSError as error:
+        _refuse(
+            f"{error.filename}: expected a file that can be used, found: {error.strerror}"
+            if error.filename
+            else str(error)
+        )
+    except (ValueError, ImportError, FloatingPointError) as error:
+        _refuse(str(error))
+    except RecursionError:
+        _refuse("expected a file with a few levels of brackets, found too many")
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "memory" not in str(error):
+            raise  # a fault of ours
+        _refuse(f"expected enough memory, found too little: {error}".partition("\n")[0])
+
+
+def _parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> Callable[[], None]:
+    """The verb with its arguments, not yet run; tyro's box of complaints becomes one line."""
+    box = io.StringIO()
+    try:
+        with redirect_stderr(box):
+            return tyro.extras.subcommand_cli_from_dict(
+                {name: _later(verb) for name, verb in verbs.items()},
+                prog="lidarsynth",
+                description="Generate, complete and judge LiDAR scans.",
+                args=argv,
+            )
+    except SystemExit as end:
+        if end.code:
+            lines = [line.strip(" \u2502") for line in box.getvalue().splitlines() if line[:1] not in "\u256d\u2570"]
+            text = " ".join(line for line in lines if line.strip("\u2500-"))
+            _refuse(re.split("Argument helptext:|For full helptext", text)[0])
+        raise
+
+
+def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    @wraps(verb)
+    def _with_arguments(*args, **kwargs):
+        return partial(verb, *args, **kwargs)
+
+    return _with_arguments
+
+
+def _sayable(error: UnicodeError) -> tuple[str, int]:
+    """Stands in for what the terminal's encoding lacks: tyro's bullets, and file names of other languages."""
+    assert isinstance(error, UnicodeEncodeError)
+    lacking = error.object[error.start : error.end].replace("\u2022", "*")
+    return lacking.encode("ascii", "backslashreplace").decode(), error.end
+
+
+def _refuse(reason: str) -> NoReturn:
+    print(f"lidarsynth: {' '.join(reason.split()) or 'stopped for no known reason'}", file=sys.stderr)
+    sys.exit(REFUSED)

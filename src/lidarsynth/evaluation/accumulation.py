@@ -1,0 +1,184 @@
+"""Images -> statistics of a protocol: which networks are here, which images count, and going on after a stop."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from torch import nn
+
+from lidarsynth.data.cache import sha256
+from lidarsynth.evaluation.image_sets import ImageSet
+from lidarsynth.evaluation.protocols import EvaluationProtocol, Network
+from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
+from lidarsynth.experiment.folder import WEIGHTS
+from lidarsynth.metrics.point_sets import spread
+from lidarsynth.networks.pointnet import read_pointnet
+from lidarsynth.networks.rangenet import RangeNet, read_rangenet
+from lidarsynth.networks.street_features import StreetFeatures
+from lidarsynth.weights.download import cache_folder, download
+from lidarsynth.weights.load import load_parts, shipped
+
+SAVE_EVERY = 60.0  # seconds between two writings of unfinished statistics: what a kill can cost
+OnImages: TypeAlias = Callable[[str, int, int], object] | None  # (what, images done, images in all), for progress bars
+
+# Kind of network -> where the official files lie: the RangeNet repository's models, and the copy of TreeGAN's PointNet
+# that R2DM's evaluation takes. No checksums are published; what is read is tensors only, of the right names and shapes.
+URLS: dict[str, str] = {
+    "rangenet": "https://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models",
+    "pointnet": "https://github.com/microsoft/SpareNet/raw/HEAD/Frechet",
+}
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A protocol's networks that are here, the SHA-256 of their files, and why the others are not."""
+
+    networks: dict[str, nn.Module] = field(default_factory=dict)
+    weights: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+
+
+def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu", on_images: OnImages = None) -> Loaded:
+    """A protocol's networks, shipped or downloaded once into the cache folder; of the others, why they are missing.
+
+    Raises ValueError for a damaged or another file.
+    """
+    loaded = Loaded()
+    for network in protocol.networks:
+        name = network.file(width)
+        if name is None:
+            widths = ", ".join(str(w) for w, _ in network.files)
+            loaded.missing[network.kind] = f"no official {network.kind} for {width} columns, only for {widths}"
+            continue
+        if name in (own := shipped()):
+            rangenet = _read_shipped(name)
+            loaded.networks[network.kind] = (rangenet if protocol.pairs else StreetFeatures(rangenet)).to(device)
+            loaded.weights[network.kind] = sha256(own[name] / WEIGHTS)
+            continue
+        path = cache_folder() / name
+        try:
+            for done, total in download(f"{URLS[network.kind]}/{name}", path):
+                if on_images:
+                    on_images(f"download {name}", done, total or done)
+        except ValueError as error:
+            loaded.missing[network.kind] = str(error)
+            continue
+        try:
+            loaded.networks[network.kind] = _read_network(network, path).to(device)
+        except ValueError as error:
+            raise ValueError(f"{error}; delete the file to download it again") from None
+        loaded.weights[network.kind] = sha256(path)
+    return loaded
+
+
+def _read_shipped(word: str) -> RangeNet:
+    rangenet = load_parts(word)[1]
+    assert isinstance(rangenet, RangeNet)
+    return rangenet
+
+
+def _read_network(network: Network, path: Path) -> nn.Module:
+    if network.kind == "pointnet":
+        return read_pointnet(path)
+    rangenet = read_rangenet(path)
+    if rangenet.layers != network.layers:
+        raise ValueError(f"{path}: expected RangeNet-{network.layers}, found RangeNet-{rangenet.layers}")
+    return rangenet
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Numbers of the images that count for features, for the bird's eye view, and for the measures of point sets."""
+
+    features: frozenset[int]
+    bev: frozenset[int]
+    sets: frozenset[int] = frozenset()
+
+    def numbers(self) -> list[int]:
+        return sorted(self.features | self.bev | self.sets)
+
+
+def select(
+    protocol: EvaluationProtocol, role: Literal["samples", "real"], names: Sequence[str], samples: int = 0
+) -> Selection:
+    """Which images of a set the protocol takes; `samples` is how many there are to judge.
+
+    Where no name is of the protocol's sequences all are taken; `unlike_names` tells.
+    """
+    if role == "samples":
+        limits = (protocol.samples, protocol.samples_bev)
+        features, bev = (frozenset(range(len(names))[:limit]) for limit in limits)
+        return Selection(features, bev, _spread(protocol, range(len(names))[: protocol.samples]))
+    chosen = []
+    for sequences, limit in ((protocol.sequences, protocol.real), (protocol.sequences_bev, protocol.real_bev)):
+        of_protocol = [i for i, name in enumerate(names) if any(part in name for part in sequences)]
+        numbers = of_protocol or list(range(len(names)))
+        if limit is not None:
+            random.Random(0).shuffle(numbers)  # as R2DM and LiDARGen order their real scans
+            numbers = numbers[: samples if limit == 0 else limit]
+        chosen.append(frozenset(numbers))
+    return Selection(chosen[0], chosen[1], _spread(protocol, range(len(names))))
+
+
+def _spread(protocol: EvaluationProtocol, numbers: range) -> frozenset[int]:
+    return frozenset(numbers[k] for k in spread(len(numbers), protocol.sets.images)) if protocol.sets else frozenset()
+
+
+def unlike_names(protocol: EvaluationProtocol, names: Sequence[str]) -> tuple[str, ...]:
+    """Warnings where the protocol takes some sequences of the reference only, and none of the names is theirs."""
+    wanted = sorted({*protocol.sequences, *protocol.sequences_bev})
+    if not wanted or any(part in name for name in names for part in wanted):
+        return ()
+    return (
+        f"{protocol.title} compares with the sequences {', '.join(wanted)}; the reference has none, all were taken",
+    )
+
+
+def gather(
+    images: ImageSet,
+    numbers: Sequence[int],
+    chosen: Selection,
+    empty: Statistics,
+    projection: str,
+    unfinished: Path | None = None,
+    batch_size: int = 4,
+    on_images: OnImages = None,
+) -> Statistics:
+    """Statistics of the images `numbers`, added to `empty`; killed at any moment, the next call goes on.
+
+    unfinished  where to keep what is gathered so far, or None; its name must tell images, protocol and weights apart.
+                The file stays until the caller takes it away
+    """
+    statistics, done = empty, 0
+    if unfinished and unfinished.is_file():
+        statistics, metadata = load_statistics(unfinished, empty.protocol)
+        statistics.networks, statistics.weights = empty.networks, empty.weights
+        done = int(metadata["done"])
+    saved = time.monotonic()
+    for start in range(done, len(numbers), batch_size):
+        batch = numbers[start : start + batch_size]
+        arrays = [images.image(i, empty.sensor, projection, resize=empty.role == "real") for i in batch]
+        wanted = ([i in numbered for i in batch] for numbered in (chosen.features, chosen.bev, chosen.sets))
+        statistics.update(arrays, *wanted)
+        if on_images:
+            on_images(empty.role, start + len(batch), len(numbers))
+        if unfinished and time.monotonic() - saved > SAVE_EVERY:
+            save_statistics(unfinished, statistics, {"done": str(start + len(batch))})
+            saved = time.monotonic()
+    return statistics
+
+
+def part_of(numbers: list[int], part: str | None) -> list[int]:
+    """Part `i/n` of a list, i from 1; all of it for None. Raises ValueError."""
+    if part is None:
+        return numbers
+    words = part.split("/")
+    if len(words) != 2 or not all(w.isdecimal() for w in words) or not 1 <= int(words[0]) <= int(words[1]):
+        raise ValueError(f"expected a part such as 1/2, found {part!r}")
+    i, n = map(int, words)
+    return numbers[len(numbers) * (i - 1) // n : len(numbers) * i // n]

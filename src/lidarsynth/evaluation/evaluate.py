@@ -1,0 +1,314 @@
+"""What the verb `evaluate` does: sets of images -> statistics, kept and continued in files -> a report."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from lidarsynth.data.cache import sha256 as sha256_of_file
+from lidarsynth.data.index import whole
+from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
+from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, sensor_of, stem_of
+from lidarsynth.evaluation.pairs import Pairs, classes_of
+from lidarsynth.evaluation.protocols import EvaluationProtocol, get_protocol
+from lidarsynth.evaluation.report import Report, report_of
+from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.weights.download import cache_folder
+
+ENDING = ".safetensors"  # of a file of statistics
+Role: TypeAlias = Literal["samples", "real"]
+Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
+
+
+def evaluate(
+    samples: Samples,
+    reference: Samples,
+    protocol: str | EvaluationProtocol = "bev-1",
+    sensor: str | None = None,
+    seed: int = 0,
+    batch_size: int = 4,
+    device: str = "cpu",
+    on_images: OnImages = None,
+) -> Report:
+    """Judge samples against a reference under a named protocol (`metrics.protocols.PROTOCOLS`).
+
+    samples    a folder of scans, of our `.npz` images, of official R2DM or LiDARGen `.pth` samples; a cache; a list of
+               range images; or files of statistics that `gather_part` wrote, which are merged
+    reference  the same. What is gathered of it stays in the cache folder, as a file of statistics to share
+    sensor     of samples that are points or tensors, where neither the reference nor the protocol tells
+    seed       of the subsets of the squared MMDs
+
+    Rows whose network is not there are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values
+    that are not finite, statistics of another protocol.
+    """
+    start = time.monotonic()
+    record = get_protocol(protocol) if isinstance(protocol, str) else protocol
+    judge = _judge_pairs if record.pairs else _judge_sets
+    report = judge(_Run(record, sensor, batch_size, device, on_images), _single(samples), _single(reference), seed)
+    return replace(report, seconds=time.monotonic() - start)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What all steps of one evaluation share."""
+
+    protocol: EvaluationProtocol
+    sensor: str | None
+    batch_size: int
+    device: str
+    on_images: OnImages
+
+    def fallback(self) -> Sensor:
+        """Of points and tensors, where nothing else tells."""
+        p = self.protocol
+        return get_sensor(self.sensor) if self.sensor else resized(get_sensor(p.sensor), p.height, p.width)
+
+    def sensor_like(self, reference: Samples | None) -> Sensor:
+        """Of points and tensors that are judged against this."""
+        if reference is None or self.sensor:
+            return self.fallback()
+        if files := _statistics_files(_single(reference)):
+            return load_statistics(files[0], self.protocol)[0].sensor
+        return sensor_of(image_set(reference).item(0), self.fallback())
+
+    def networks(self, sensor: Sensor) -> Loaded:
+        return load_networks(self.protocol, sensor.width, self.device, self.on_images)
+
+    def pairs(self, judged: ImageSet, truth: ImageSet, sensor: Sensor, loaded: Loaded) -> Pairs:
+        """All images beside their truths; stopped, the next call goes on."""
+        pairs, projection = Pairs(self.protocol, classes_of(loaded.networks)), self.protocol.projection
+        identity = [definition(self.protocol), sensor.to_dict(), judged.stamp, truth.stamp, loaded.weights]
+        key = sha256(repr(identity).encode()).hexdigest()[:16]
+        stamped = judged.stamp and truth.stamp
+        unfinished = cache_folder() / "statistics" / f"unfinished-{self.protocol.name}-{key}.json" if stamped else None
+        if unfinished and unfinished.is_file():
+            pairs.restore(json.loads(unfinished.read_text()))
+        saved = time.monotonic()
+        for start in range(len(pairs.errors), len(judged), self.batch_size):
+            numbers = range(start, min(start + self.batch_size, len(judged)))
+            batch = ([of.image(i, sensor, projection, of is truth) for i in numbers] for of in (judged, truth))
+            pairs.update(*batch)
+            if self.on_images:
+                self.on_images("pairs", numbers.stop, len(judged))
+            if unfinished and time.monotonic() - saved > accumulation.SAVE_EVERY:
+                _write(unfinished, json.dumps(pairs.state()))
+                saved = time.monotonic()
+        if unfinished:
+            unfinished.unlink(missing_ok=True)
+        return pairs
+
+    def statistics(
+        self,
+        images: ImageSet,
+        sensor: Sensor,
+        role: Role,
+        loaded: Loaded,
+        count: int = 0,
+        part: str | None = None,
+    ) -> tuple[Statistics, Path | None]:
+        """Gathered, or where they are of the reference, taken from and left in the cache folder; and their file."""
+        chosen = select(self.protocol, role, images.names, count)
+        numbers = part_of(chosen.numbers(), part)
+        identity = [definition(self.protocol), role, sensor.to_dict(), images.stamp, loaded.weights, numbers]
+        limits = [sorted(part) for part in (chosen.features, chosen.bev, chosen.sets)]
+        key = sha256(repr([*identity, *limits]).encode()).hexdigest()[:16]
+        kept = cache_folder() / "statistics" / f"{self.protocol.name}-{key}{ENDING}" if images.stamp else None
+        if kept and kept.is_file():
+            return load_statistics(kept, self.protocol)[0], kept
+        unfinished = kept.with_name(f"unfinished-{kept.name}") if kept else None
+        empty = Statistics(self.protocol, sensor, role, loaded.networks, loaded.weights)
+        projection = self.protocol.projection if sensor.name == self.protocol.sensor else "auto"
+        statistics = gather(
+            images, numbers, chosen, empty, projection, unfinished, self.batch_size, self.on_images
+        )  # fmt: skip
+        if kept and role == "real":
+            save_statistics(kept, statistics, {"source": images.source})
+        if unfinished:
+            unfinished.unlink(missing_ok=True)
+        return statistics, kept if role == "real" else None
+
+
+def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
+    files, real_files = _statistics_files(samples), _statistics_files(reference)
+    warnings, hashes, told = (), {}, {}
+    real, truth = None, None
+    if real_files:
+        real, warnings = merged(real_files, run.protocol)
+        told["reference"] = ", ".join(map(str, real_files))
+    else:
+        truth = image_set(reference)
+        told["reference"] = truth.source
+        warnings = unlike_names(run.protocol, truth.names)
+    fallback = real.sensor if real else run.fallback()
+    if truth and not run.sensor:
+        fallback = sensor_of(truth.item(0), fallback)
+    loaded = Loaded()
+    if files:
+        fake, more = merged(files, run.protocol)
+        told["samples"], warnings = ", ".join(map(str, files)), warnings + more
+        if truth:
+            loaded = run.networks(fake.sensor)
+    else:
+        judged = image_set(samples)
+        sensor = sensor_of(judged.item(0), fallback)
+        loaded, told["samples"] = run.networks(sensor), judged.source
+        fake, _ = run.statistics(judged, sensor, "samples", loaded)
+    if truth:
+        sensor = _at_size(sensor_of(truth.item(0), fake.sensor), fake.sensor)
+        real, kept = run.statistics(truth, sensor, "real", loaded, fake.count)
+        real_files = [kept] if kept else []
+    assert real
+    report = report_of(fake, real, loaded.missing, seed, run.on_images)
+    if real_files:
+        told["reference statistics"] = ", ".join(map(str, real_files))
+        hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
+    hashes = {**report.hashes, **hashes}
+    return replace(
+        report, sources=told, hashes=hashes, warnings=report.warnings + warnings, images=_size_of(fake.sensor)
+    )
+
+
+def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
+    if _statistics_files(samples) or _statistics_files(reference):
+        raise ValueError(f"{run.protocol.title} compares images one by one: expected images, found statistics")
+    judged, truth = image_set(samples), image_set(reference)
+    if len(judged) != len(truth):
+        raise ValueError(f"{run.protocol.title} compares sample i with reference i: expected as many of both, found "
+                         f"{len(judged)} and {len(truth)}")  # fmt: skip
+    sensor = sensor_of(judged.item(0), sensor_of(truth.item(0), run.fallback()))
+    loaded = run.networks(sensor)
+    pairs = run.pairs(judged, truth, sensor, loaded)
+    report = pairs.report(loaded.missing, loaded.weights)
+    sources = {"samples": judged.source, "reference": truth.source}
+    warnings = report.warnings + _unlike_pairs(judged.names, truth.names)
+    return replace(report, sources=sources, warnings=warnings, images=_size_of(sensor))
+
+
+def _unlike_pairs(names: Sequence[str], true_names: Sequence[str]) -> tuple[str, ...]:
+    """A warning where sample i does not have the name of reference i, endings left out."""
+    other = [(own, its) for own, its in zip(names, true_names, strict=True) if stem_of(own) != stem_of(its)]
+    if not other:
+        return ()
+    first = " with ".join(other[0])
+    return (f"{len(other)} of {len(names)} samples are compared with a reference of another name, first {first}",)
+
+
+def _size_of(sensor: Sensor) -> str:
+    return f"{sensor.height} x {sensor.width} of {sensor.name}"
+
+
+def gather_part(
+    samples: Samples,
+    part: str,
+    out: str | Path,
+    protocol: str | EvaluationProtocol = "bev-1",
+    sensor: str | None = None,
+    batch_size: int = 4,
+    device: str = "cpu",
+    on_images: OnImages = None,
+    side: Literal["samples", "reference"] = "samples",
+    reference: Samples | None = None,
+) -> str:
+    """Write the statistics of part `i/n` of the samples to a `.safetensors` file; returns the SHA-256 of its content.
+
+    `evaluate` merges such files, of several machines too; so does this, into one file, given files and the part 1/1.
+    side       what the images are: samples to judge, or a reference
+    reference  what they will be judged against, if it is here: tells the sensor of points, as in `evaluate`
+    Raises ValueError as `evaluate` does.
+    """
+    record, out = get_protocol(protocol) if isinstance(protocol, str) else protocol, Path(out)
+    samples = _single(samples)
+    if out.suffix != ENDING or record.pairs:
+        raise ValueError(f"{out}: expected a name that ends in {ENDING} and a protocol of sets, "
+                         f"found {out.name[-20:]!r} and {record.name}")  # fmt: skip
+    if files := _statistics_files(samples):
+        statistics, lacking = merged(files, record)
+        if lacking or part != "1/1":
+            raise ValueError(*lacking or [f"expected the part 1/1 to merge files of statistics, found {part}"])
+        return save_statistics(out, statistics, {"source": ", ".join(map(str, files)), "part": part})
+    if side == "reference" and 0 in (record.real, record.real_bev):
+        raise ValueError(f"{record.title} takes as many of the reference as there are samples: expected it to be "
+                         "gathered with them, found it alone")  # fmt: skip
+    run, images = _Run(record, sensor, batch_size, device, on_images), image_set(samples)
+    spec = sensor_of(images.item(0), run.sensor_like(reference))
+    role: Role = "real" if side == "reference" else "samples"
+    statistics, _ = run.statistics(images, spec, role, run.networks(spec), part=part)
+    return save_statistics(out, statistics, {"source": images.source, "part": part})
+
+
+def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statistics, tuple[str, ...]]:
+    """One set of statistics of several files, and a warning where parts are lacking.
+
+    Raises ValueError where two hold the same images.
+    """
+    loaded = [load_statistics(file, protocol) for file in files]
+    parts = [tuple(map(int, metadata.get("part", "1/1").split("/"))) for _, metadata in loaded]
+    digests = [statistics.digest for statistics, _ in loaded]
+    shared = [part for part in parts if part[1] > 1]
+    for i, file in enumerate(files):
+        if digests[i] in digests[:i] or (parts[i] in shared and parts[i] in parts[:i]):
+            raise ValueError(f"{file}: expected a part of its own, found the images of another part")
+    if len({n for _, n in shared}) > 1:
+        raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in shared)}")
+    total, _ = loaded[0]
+    for other, _ in loaded[1:]:
+        total.merge(other)
+    if shared and len(shared) < (n := shared[0][1]):
+        lacking = ", ".join(f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared)
+        return total, (f"expected all parts of the images, found none of {lacking}",)
+    return total, ()
+
+
+def _single(samples: Samples) -> Samples:
+    """A list of one path as the path."""
+    if not isinstance(samples, str | Path) and len(samples) == 1 and isinstance(samples[0], str | Path):
+        return samples[0]
+    return samples
+
+
+def _statistics_files(source: Samples) -> list[Path]:
+    """The files of statistics that a source names, or [] where it names images. Raises ValueError for both at once."""
+    sources = [source] if isinstance(source, str | Path) else list(source)
+    paths = [Path(item) for item in sources if isinstance(item, str | Path)]
+    if not [path for path in paths if path.suffix == ENDING]:
+        return []
+    if len(paths) != len(sources) or not all(path.suffix == ENDING for path in paths):
+        raise ValueError(f"expected only files of statistics ({ENDING}), or none, found {', '.join(map(str, sources))}")
+    return paths
+
+
+def _at_size(sensor: Sensor, like: Sensor) -> Sensor:
+    """The reference's sensor, as its images are thinned to the samples' size. Raises ValueError where they cannot."""
+    if sensor.height % like.height or sensor.width % like.width:
+        raise ValueError(f"expected a reference of the samples' {like.height} x {like.width} pixels or a multiple, "
+                         f"found {sensor.height} x {sensor.width}")  # fmt: skip
+    return resized(sensor, like.height, like.width)
+
+
+def check_out(out: Path) -> None:
+    """Raises ValueError unless a report can be named so, OSError where its folder cannot be made."""
+    if out.suffix != ".json" or out.is_dir():
+        raise ValueError(f"{out}: expected the name of a file that ends in .json, "
+                         f"found {'a folder' if out.is_dir() else repr(out.name[-20:])}")  # fmt: skip
+    out.parent.mkdir(parents=True, exist_ok=True)
+
+
+def write_report(report: Report, out: Path) -> None:
+    """Write the report as JSON and, beside it with the ending `.md`, as Markdown. Raises ValueError as `check_out`."""
+    check_out(out)
+    _write(out, report.json())
+    _write(out.with_suffix(".md"), report.markdown())
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path, len(text)) as scratch:
+        scratch.write_text(text)

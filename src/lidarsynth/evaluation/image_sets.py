@@ -1,0 +1,212 @@
+"""Sets of range images to judge, whatever they come as: a cache, saved images, published samples, scans, a list."""
+
+from __future__ import annotations
+
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.data.dataset import INDEX, CachedImages
+from lidarsynth.files.arrays import image_of, unzip
+from lidarsynth.files.fields import FileError
+from lidarsynth.files.formats import READERS, read, read_image
+from lidarsynth.lidar.projection import project, thin
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor
+
+TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen
+Item: TypeAlias = RangeImage | Scan | Tensor
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Images, read one at a time: `len(images)`, `images[i]`.
+
+    names   one per image; `sequence/frame` in a cache. Errors begin with it
+    item    image number -> what is stored: a range image, points, or a published tensor
+    source  in words
+    stamp   changes when the files do; "" where nothing can be kept from one run to the next
+    """
+
+    names: tuple[str, ...]
+    item: Callable[[int], Item]
+    source: str
+    stamp: str
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def image(self, i: int, sensor: Sensor, projection: str, resize: bool = False) -> RangeImage:
+        """Image i in the sensor's size; points are projected, larger images thinned where `resize`.
+
+        Raises ValueError that begins with the image's name.
+        """
+        try:
+            return as_image(self.item(i), sensor, projection, resize)
+        except ValueError as error:
+            text = str(error)
+            raise ValueError(text if text.startswith(self.names[i]) else f"{self.names[i]}: {text}") from None
+
+
+def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) -> ImageSet:
+    """The images of a cache, a folder at any depth, one file, or a list. Raises ValueError when there is none."""
+    if not isinstance(source, str | Path):
+        images: list = list(source)
+        if not images:
+            raise ValueError("expected at least one range image, found an empty list")
+        if other := [image for image in images if not isinstance(image, RangeImage)]:
+            raise ValueError(
+                f"expected one folder, or a list of range images, found {len(images)} with {other[0]!r:.80}"
+            )
+        return ImageSet(tuple(f"image {i}" for i in range(len(images))), images.__getitem__, "a list of images", "")
+    path = Path(source)
+    if (path / INDEX).is_file():
+        cache = CachedImages(path)
+        names = tuple("/".join(cache.name(i)[1:]) for i in range(len(cache)))
+        return ImageSet(names, cache.__getitem__, str(path), sha256((path / INDEX).read_bytes()).hexdigest())
+    files = _files(path)
+    stats = [(str(file.relative_to(path)), file.stat()) for file in files] if path.is_dir() else [("", path.stat())]
+    stamp = sha256(repr([(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]).encode()).hexdigest()
+    items = [(file, k) for file in files for k in _numbers(file)]
+    names = tuple(str(file) if k is None else f"{file}[{k}]" for file, k in items)
+    return ImageSet(names, lambda i: read_item(*items[i]), str(path), stamp)
+
+
+def _files(path: Path) -> list[Path]:
+    """The readable files under a folder, sorted, or the file itself. Hidden files and folders are left out."""
+    known = (*READERS, *TENSORS)
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path] if path.is_file() else []
+    files = [file for file in files if file.name.lower().endswith(known)]
+    files = [file for file in files if not any(part[0] == "." for part in file.relative_to(path).parts)]
+    if not files:
+        found = "none" if path.is_dir() else "another file" if path.is_file() else "no such file or folder"
+        raise ValueError(f"{path}: expected a cache, or samples ({', '.join(known)}), found {found}")
+    stems = [file.with_name(stem_of(file.name)) for file in files]
+    if doubled := [stem for stem, count in Counter(stems).items() if count > 1]:
+        two = [file.name for file, stem in zip(files, stems, strict=True) if stem == doubled[0]][:2]
+        raise ValueError(f"{path}: expected one file per scan, found {' and '.join(two)}")
+    return files
+
+
+def stem_of(name: str) -> str:
+    """The last part of a name, without the ending of a readable file."""
+    last = name.rpartition("/")[2]
+    endings = [ending for ending in (*READERS, *TENSORS) if last.lower().endswith(ending)]
+    return last[: -len(max(endings, key=len))] if endings else last
+
+
+def _numbers(path: Path) -> Sequence[int | None]:
+    """Numbers of the images of a batch, by the header of its `.npz`; [None] for a file of one scan."""
+    if path.suffix.lower() != ".npz":
+        return [None]
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("range.npy") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape = read_header[version](file)[0]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        return [None]  # something else, or damaged: reading it says so
+    return range(shape[0]) if len(shape) == 3 else [None]
+
+
+def read_item(path: Path, number: int | None = None) -> Item:
+    """A range image (our `.npz`), points of any readable file, or the tensor of a published sample (`.pth`).
+
+    number  which image of a batch: an `.npz` whose range, reflectance, mask, and label, xyz are (B, ...). Raises
+    ValueError.
+    """
+    if number is not None:
+        arrays = {name: array if name == "sensor" else array[number] for name, array in _batch(path).items()}
+        return image_of(arrays)
+    if path.suffix.lower() in TENSORS:
+        return _read_tensor(path)
+    if path.suffix.lower() == ".npz":
+        try:
+            return read_image(path)
+        except FileError as error:
+            if "expected a saved range image" not in str(error):
+                raise
+    return read(path)
+
+
+@lru_cache(maxsize=1)  # images of a batch are read one after the other
+def _batch(path: Path) -> dict[str, np.ndarray]:
+    arrays = unzip(path.read_bytes())
+    sizes = {name: array.shape[:1] for name, array in arrays.items() if name != "sensor"}
+    if len(set(sizes.values())) != 1:
+        raise ValueError(f"{path}: expected a batch of arrays (B, ...), found {sizes}")
+    return arrays
+
+
+def _read_tensor(path: Path) -> Tensor:
+    try:
+        tensor = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged pickle raises whatever it likes
+        raise ValueError(f"{path}: expected a tensor, found a damaged or unsafe file ({error!s:.60})") from None
+    if not isinstance(tensor, Tensor):
+        raise ValueError(f"{path}: expected a tensor (5, H, W) or (2, H, W), found {type(tensor).__name__}")
+    return tensor
+
+
+def as_image(item: Item, sensor: Sensor, projection: str, resize: bool = False) -> RangeImage:
+    """Any stored form as a range image of the sensor's size. Raises ValueError for another size, NaN, other shapes."""
+    size = (sensor.height, sensor.width)
+    if isinstance(item, Scan):
+        return project(item, sensor, projection)
+    if isinstance(item, Tensor):
+        return from_tensor(item, sensor)
+    if item.shape != size and not (resize and _divides(size, item.shape)):
+        raise ValueError(f"expected images of one size, {size[0]} x {size[1]}, found one of {item.shape[0]} x "
+                         f"{item.shape[1]}")  # fmt: skip
+    return item if item.shape == size else thin(item, *size)
+
+
+def _divides(size: tuple[int, int], larger: tuple[int, int]) -> bool:
+    return all(b % a == 0 for a, b in zip(size, larger, strict=True))
+
+
+def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
+    """A published sample as a range image of the sensor.
+
+    (5, H, W): depth, x, y, z in metres, reflectance, as the official R2DM program saves; (2, H, W): LiDARGen's range
+    code log2(r + 1) / 6 and reflectance, both in [0, 1]. Raises ValueError for another shape, NaN or infinity.
+    """
+    size = (sensor.height, sensor.width)
+    if tensor.ndim != 3 or tensor.shape[0] not in (2, 5) or tuple(tensor.shape[1:]) != size:
+        raise ValueError(f"expected a tensor (5, {size[0]}, {size[1]}) or (2, ...), found {tuple(tensor.shape)}")
+    values = tensor.detach().float().numpy()
+    if not np.isfinite(values).all():
+        raise ValueError(f"expected finite values, found {np.sum(~np.isfinite(values))} of NaN or infinity")
+    distance = values[0].clip(min=0) if len(values) == 5 else np.exp2(6 * values[0].clip(0, 1)) - 1
+    mask = distance > 0
+    xyz = np.moveaxis(values[1:4], 0, -1).copy() if len(values) == 5 else None
+    return RangeImage(distance, values[-1] * mask, mask, sensor, xyz=xyz)
+
+
+def sensor_of(first: Item, fallback: Sensor) -> Sensor:
+    """The sensor of a set by its first item: an image's own; a tensor's size on `fallback`; `fallback` for points.
+
+    Raises ValueError for a tensor whose rows `fallback` cannot be thinned to.
+    """
+    if isinstance(first, RangeImage):
+        return first.sensor
+    if isinstance(first, Scan):
+        return fallback
+    if first.ndim != 3 or first.shape[0] not in (2, 5) or first.shape[2] < 4 or fallback.height % first.shape[1]:
+        raise ValueError(f"expected a tensor (5, H, W) or (2, H, W) with rows that divide {fallback.name}'s "
+                         f"{fallback.height}, found {tuple(first.shape)}")  # fmt: skip
+    return resized(fallback, first.shape[1], first.shape[2])
+
+
+def resized(sensor: Sensor, height: int, width: int) -> Sensor:
+    """The sensor at this size, by its own name."""
+    return replace(sensor.resized(height, width), name=sensor.name)

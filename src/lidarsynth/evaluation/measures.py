@@ -1,0 +1,119 @@
+"""What computes the rows of a protocol's table: statistics of both sides -> a number. A word of MEASURES each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from torch import Tensor
+
+from lidarsynth.evaluation.protocols import Row, Sets
+from lidarsynth.evaluation.statistics import Statistics
+from lidarsynth.metrics.distributions import frechet_distance, gaussian_mmd, jensen_shannon_distance, kernel_distance
+from lidarsynth.metrics.neighbours import (
+    coverage,
+    distance_matrix,
+    minimum_matching_distance,
+    nearest_neighbour_accuracy,
+)
+from lidarsynth.metrics.point_sets import earth_movers_distance, sphere_counts
+from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
+
+
+def _frechet(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    assert row.network
+    return frechet_distance(samples.moments[row.network], real.moments[row.network])
+
+
+def _kernel(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    assert row.network
+    protocol, rng = samples.protocol, np.random.RandomState(seed)  # the official programs draw from this generator
+    both = samples.features(row.network), real.features(row.network)
+    return kernel_distance(*both, rng, protocol.subsets, protocol.subset_size)
+
+
+def _bev_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    assert samples.protocol.bev
+    return gaussian_mmd(filled_scans(samples), filled_scans(real), samples.protocol.bev.width)
+
+
+def _bev_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    assert samples.bev and real.bev
+    return jensen_shannon_distance(samples.bev.pooled, real.bev.pooled)
+
+
+def filled_scans(statistics: Statistics) -> Tensor:
+    """(n, bins, bins) int32: the kept histograms of the scans that have any point in the gate."""
+    assert statistics.bev
+    scans = statistics.bev.scans
+    filled = scans.flatten(1).any(1)
+    return scans if filled.all() else scans[filled]
+
+
+def _drop_rate(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return _beams(samples, real).drop_rate_error
+
+
+def _beam_range(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return _beams(samples, real).range_error
+
+
+def _beams(samples: Statistics, real: Statistics) -> BeamReport:
+    if not samples.beams or not real.beams:
+        raise ValueError(f"{samples.protocol.title} does not count beams")
+    return compare_beams(samples.beams, real.beams)
+
+
+def _sets_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    counts = [sphere_counts(side.sets() / 2, _sets(side).bins) for side in (samples, real)]
+    return jensen_shannon_distance(*counts) ** 2 / math.log(2)
+
+
+def _sets_coverage(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return coverage(set_distances(samples, real)[1])
+
+
+def _sets_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return minimum_matching_distance(set_distances(samples, real)[1])
+
+
+def _sets_1nna(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return nearest_neighbour_accuracy(*set_distances(samples, real))
+
+
+def _sets(statistics: Statistics) -> Sets:
+    assert statistics.protocol.sets
+    return statistics.protocol.sets
+
+
+@lru_cache(maxsize=1)  # three rows need the same; `set_distances.cache_clear()` lets go of the statistics
+def set_distances(samples: Statistics, real: Statistics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Earth mover's distances among the samples, between samples and real ones, and among the real ones."""
+    record, fake, true = _sets(samples), samples.sets(), real.sets()
+    g, r = len(fake), len(true)
+    pairs = g * r + g * (g - 1) // 2 + r * (r - 1) // 2
+    if pairs > record.pairs:
+        raise ValueError(f"needs {pairs:,} earth mover's distances between sets of {record.points:,} points, at most "
+                         f"{record.pairs:,} are computed here; dusty-2023-small takes fewer points")  # fmt: skip
+    within, between, among = ((fake, fake), (fake, true), (true, true))
+    return (
+        distance_matrix(*within, earth_movers_distance),
+        distance_matrix(*between, earth_movers_distance),
+        distance_matrix(*among, earth_movers_distance),
+    )
+
+
+MEASURES: dict[str, Callable[[Row, Statistics, Statistics, int], float]] = {
+    "frechet": _frechet,
+    "kernel": _kernel,
+    "bev-mmd": _bev_mmd,
+    "bev-jsd": _bev_jsd,
+    "drop-rate": _drop_rate,
+    "beam-range": _beam_range,
+    "sets-jsd": _sets_jsd,
+    "sets-coverage": _sets_coverage,
+    "sets-mmd": _sets_mmd,
+    "sets-1nna": _sets_1nna,
+}

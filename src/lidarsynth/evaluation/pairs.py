@@ -1,0 +1,120 @@
+"""Protocols that compare image i with image i: errors of range and reflectance, agreement of classes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from lidarsynth.evaluation.protocols import EvaluationProtocol
+from lidarsynth.evaluation.report import Report, Result
+from lidarsynth.evaluation.statistics import hash_of
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.metrics.reconstruction import (
+    Errors,
+    class_iou,
+    confusion_matrix,
+    mean_errors,
+    mean_iou,
+    reconstruction_errors,
+    weighted_iou,
+)
+from lidarsynth.networks.rangenet import RangeNet
+
+
+class Pairs:
+    """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None.
+
+    Of bounded size but for a few numbers per pair; `merge` adds what another process gathered, `state` and `restore`
+    are for files.
+    """
+
+    def __init__(self, protocol: EvaluationProtocol, classes: RangeNet | None = None):
+        self.protocol, self.classes = protocol, classes
+        self.errors: list[Errors] = []
+        self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
+        self.lit = False
+        self._digests = [0, 0]
+
+    def update(self, results: Sequence[RangeImage], truths: Sequence[RangeImage]) -> None:
+        """Take in a batch of images and their truths, all pixels of both. Raises ValueError for different sizes."""
+        for result, truth in zip(results, truths, strict=True):
+            self.errors.append(reconstruction_errors(result, truth))
+            self.lit |= bool(result.reflectance.any())
+            self._add_digests([hash_of(result), hash_of(truth)])
+        if self.classes and results:
+            labels = [self._labels(images) for images in (truths, results)]
+            self.confusion += confusion_matrix(labels[0], labels[1])
+
+    def _add_digests(self, digests: Sequence[int]) -> None:
+        self._digests = [(own + its) % (1 << 128) for own, its in zip(self._digests, digests, strict=True)]
+
+    def merge(self, other: Pairs) -> None:
+        """Take in all that `other` has seen. Raises ValueError for another protocol."""
+        if self.protocol != other.protocol:
+            raise ValueError(f"expected pairs of {self.protocol.title}, found {other.protocol.title}")
+        self.restore(other.state())
+
+    def state(self) -> dict[str, Any]:
+        """Plain lists and numbers, for a file; the inverse of `restore`."""
+        errors = [list(asdict(e).values()) for e in self.errors]
+        digests = [f"{digest:032x}" for digest in self._digests]
+        return {"errors": errors, "confusion": self.confusion.tolist(), "lit": self.lit, "digests": digests}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take in what `state` of another gave."""
+        self.errors += [Errors(*values) for values in state["errors"]]
+        self.confusion += np.array(state["confusion"], np.int64)
+        self.lit |= state["lit"]
+        self._add_digests([int(digest, 16) for digest in state["digests"]])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: all but the network."""
+        return {**vars(self), "classes": None}
+
+    @torch.no_grad()
+    def _labels(self, images: Sequence[RangeImage]) -> np.ndarray:
+        """(B, H, W) class of every pixel, also of those without a return, as LiDARGen judges."""
+        assert self.classes
+        device = self.classes.means.device
+        pixels = np.stack([np.stack([i.range, *np.moveaxis(i.points(), -1, 0), i.reflectance]) for i in images])
+        masks = torch.from_numpy(np.stack([image.mask for image in images])).to(device)
+        inputs = self.classes.network_input(torch.from_numpy(pixels.astype(np.float32)).to(device), masks)
+        return self.classes(inputs).argmax(1).cpu().numpy()
+
+    def report(self, missing: Mapping[str, str] | None = None, weights: Mapping[str, str] | None = None) -> Report:
+        """The protocol's rows so far. Raises ValueError for no pair."""
+        mean, results = mean_errors(self.errors), []
+        for row in self.protocol.rows:
+            reason = ""
+            if row.network and not self.classes:
+                reason = (missing or {}).get(row.network, f"no {row.network} is here")
+            elif (row.network or row.measure == "reflectance-mae") and not self.lit:
+                reason = "the samples have no reflectance"
+            value = None if reason else MEASURES[row.measure](mean, self.confusion) * row.scale
+            results.append(Result(row.name, value, row.unit, row.digits, reason))
+        counts = {"samples": len(self.errors), "reference": len(self.errors)}
+        names = ("samples", "reference")
+        hashes = {name: f"{digest:032x}" for name, digest in zip(names, self._digests, strict=True)}
+        iou = class_iou(self.confusion, (0,)).tolist() if self.classes and self.lit else []
+        classes = {name: value for (name, _), value in zip(CLASSES[1:], iou[1:], strict=False)} or None
+        return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {}, classes=classes)
+
+
+MEASURES: dict[str, Callable[[Errors, np.ndarray], float]] = {
+    "range-mae": lambda errors, confusion: errors.range_mae,
+    "reflectance-mae": lambda errors, confusion: errors.reflectance_mae,
+    "iou": lambda errors, confusion: mean_iou(confusion),
+    "iou-weighted": lambda errors, confusion: weighted_iou(confusion),
+}
+
+
+def classes_of(networks: Mapping[str, nn.Module]) -> RangeNet | None:
+    """The segmenter among a protocol's networks, or None."""
+    network = networks.get("rangenet")
+    return network if isinstance(network, RangeNet) else None

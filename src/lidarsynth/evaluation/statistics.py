@@ -1,0 +1,292 @@
+"""What a protocol keeps of a set of images: moments, some features, histograms. Streams, merges, fits in a file."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from hashlib import blake2b, sha256
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from lidarsynth.evaluation.features import drawn_again, features, gated
+from lidarsynth.evaluation.protocols import EvaluationProtocol, Side, get_protocol
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor, from_dict
+from lidarsynth.metrics.bev import BevCounts
+from lidarsynth.metrics.distributions import Array, Moments
+from lidarsynth.metrics.point_sets import farthest_points
+from lidarsynth.metrics.sensor_report import BeamCounts
+
+FORMAT = "lidarsynth statistics 1"
+Networks = Mapping[str, nn.Module]  # kind -> a network in evaluation mode; those a protocol names and that are there
+
+
+class Statistics:
+    """Statistics of one set of images under a protocol; of bounded size, whatever the number of images.
+
+    role      "samples" or "real": a protocol may treat the two differently
+    networks  whose features are taken; without one its rows become N/A
+    weights   kind -> SHA-256 of each network's file
+    count     images so far, for features; `bev.count` is that of the histograms
+    lit       images with any reflectance above 0
+    measured  images that hold the measured points themselves; those of others lie on their pixels' rays
+    digest    hexadecimal hash of all images, whatever their order
+
+    Two sets of different images merge into what one pass over all of them gives.
+    """
+
+    def __init__(
+        self,
+        protocol: EvaluationProtocol,
+        sensor: Sensor,
+        role: Literal["samples", "real"],
+        networks: Networks | None = None,
+        weights: Mapping[str, str] | None = None,
+    ):
+        self.protocol, self.sensor = protocol, sensor
+        self.role: Side = role
+        self.networks, self.weights = dict(networks or {}), dict(weights or {})
+        self.count = self.lit = self.measured = self._digest = 0
+        self.moments: dict[str, Moments] = {}
+        self._kept: dict[str, list[Tensor]] = {}
+        self._sets: list[Tensor] = []
+        grid = protocol.bev
+        self.bev = BevCounts(grid.bins, grid.extent, grid.near, grid.far, protocol.keep) if grid else None
+        far = min(protocol.far, sensor.max_range)  # so that sensors of other limits compare
+        counted = {row.measure for row in protocol.rows} & {"drop-rate", "beam-range"}
+        self.beams = BeamCounts(replace(sensor, min_range=0.0, max_range=far), protocol.beam_step) if counted else None
+
+    @property
+    def digest(self) -> str:
+        return f"{self._digest:032x}"
+
+    def features(self, kind: str) -> Tensor:
+        """(n, D) float32: the kept features of a network, on the CPU."""
+        self._kept[kind] = [torch.cat(self._kept[kind])]
+        return self._kept[kind][0]
+
+    def sets(self) -> np.ndarray:
+        """(n, P, 3) float32: the farthest points of the images taken for the measures of point sets."""
+        size = self.protocol.sets.points if self.protocol.sets else 0
+        return torch.cat([torch.zeros(0, size, 3), *self._sets]).numpy()
+
+    def update(
+        self, images: Sequence[RangeImage], features: Sequence[bool], bev: Sequence[bool], sets: Sequence[bool] = ()
+    ) -> None:
+        """Take in a batch; `features`, `bev` and `sets` say which of the images count for which.
+
+        Raises ValueError for an image of another size than the sensor's, or with values that are not finite.
+        """
+        for image in images:
+            self._check(image)
+            self._digest = (self._digest + hash_of(image)) % (1 << 128)
+        self.update_features([i for i, n in zip(images, features, strict=True) if n],
+                             [b for b, n in zip(bev, features, strict=True) if n])  # fmt: skip
+        self.update_histograms([image for image, needed in zip(images, bev, strict=True) if needed])
+        self.update_sets([image for image, needed in zip(images, sets, strict=False) if needed])
+
+    def _check(self, image: RangeImage) -> None:
+        if image.shape != (self.sensor.height, self.sensor.width):
+            size = f"{self.sensor.height} x {self.sensor.width}"
+            raise ValueError(f"expected images of one size, {size}, found one of {image.shape[0]} x {image.shape[1]}")
+        for name in ("range", "reflectance"):
+            values = getattr(image, name)
+            if not np.isfinite(values).all():
+                raise ValueError(f"expected a finite {name}, found {np.sum(~np.isfinite(values))} pixels of NaN or "
+                                 "infinity")  # fmt: skip
+
+    def update_features(self, images: Sequence[RangeImage], keep: Sequence[bool]) -> None:
+        """Take in images for the feature networks only; the features of those to `keep` stay one by one."""
+        self.count += len(images)
+        self.lit += sum(bool((image.reflectance[image.mask] > 0).any()) for image in images)
+        self.measured += sum(image.xyz is not None for image in images)
+        if not images or not self.networks:
+            return
+        if self.protocol.reproject and self.role == "samples":
+            images = [drawn_again(image, gated(image, self.protocol, "samples")) for image in images]
+        masks = np.stack([gated(image, self.protocol, self.role) for image in images])
+        xyz = np.stack([image.points() for image in images]) * masks[..., None]
+        for kind, network in self.networks.items():
+            size = getattr(self.protocol.network(kind), "features", 0)
+            self.add_features(kind, features(network, images, xyz, masks, size), keep)
+
+    def add_features(self, kind: str, values: Array, keep: Iterable[bool]) -> None:
+        """Take in features (B, D) of a network that ran elsewhere. Raises ValueError for NaN or another D."""
+        if kind not in self.moments:  # on the network's device: a large covariance is slow to add to on a CPU
+            self.moments[kind] = Moments(values.shape[1], values.device if isinstance(values, Tensor) else "cpu")
+        self.moments[kind].update(values)
+        kept = torch.as_tensor(values).cpu().float()[torch.tensor(list(keep), dtype=torch.bool)]
+        free = self.protocol.keep - sum(map(len, self._kept.setdefault(kind, [])))
+        self._kept[kind].append(kept[: max(free, 0)])
+
+    def update_histograms(self, images: Sequence[RangeImage]) -> None:
+        """Take in images for the bird's eye view and the beams only."""
+        if not images:
+            return
+        masks = np.stack([gated(image, self.protocol, "bev") for image in images])
+        if self.bev:
+            xyz = np.stack([image.points() for image in images]) * masks[..., None]
+            self.bev.update(xyz.reshape(len(images), -1, 3))
+        if self.beams:
+            self.beams.update(np.stack([image.range for image in images]), masks)
+
+    def update_sets(self, images: Sequence[RangeImage]) -> None:
+        """Take in images for the measures of point sets only."""
+        sets = self.protocol.sets
+        if not sets:
+            return
+        for image in images:
+            xyz = (image.points() * gated(image, self.protocol, self.role)[..., None]).reshape(-1, 3) / sets.scale
+            chosen = xyz[farthest_points(xyz, sets.points, sets.clear)]
+            self._sets.append(torch.from_numpy(chosen.astype(np.float32))[None])
+
+    def merge(self, other: Statistics) -> None:
+        """Take in all that `other` has seen. Raises ValueError for another protocol, sensor, role or weights."""
+        own, its = ((s.protocol, s.sensor, s.role, s.weights, set(s.moments)) for s in (self, other))
+        if own != its:
+            wrong = next(i for i, (a, b) in enumerate(zip(own, its, strict=True)) if a != b)
+            name = ("protocol", "sensor", "role", "weights", "networks")[wrong]
+            raise ValueError(f"expected statistics of one {name}, found {own[wrong]!s:.100} and {its[wrong]!s:.100}")
+        self.count, self.lit, self.measured = (
+            self.count + other.count, self.lit + other.lit, self.measured + other.measured
+        )  # fmt: skip
+        self._digest = (self._digest + other._digest) % (1 << 128)
+        for kind, moments in other.moments.items():
+            self.moments[kind].merge(moments)
+            free = self.protocol.keep - sum(map(len, self._kept[kind]))
+            self._kept[kind].append(other.features(kind)[: max(free, 0)])
+        self._sets += other._sets
+        if self.bev and other.bev:
+            self.bev.merge(other.bev)
+        if self.beams and other.beams:
+            self.beams.merge(other.beams)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything counted, by name."""
+        state = {"counts": torch.tensor([self.count, self.lit, self.measured])}
+        for kind, moments in self.moments.items():
+            state |= {f"{kind}.moments.{name}": value.cpu() for name, value in moments.state().items()}
+            state[f"{kind}.features"] = self.features(kind)
+        state |= {f"bev.{name}": value for name, value in (self.bev.state() if self.bev else {}).items()}
+        if self.beams:
+            state["beams.pixels"] = torch.from_numpy(self.beams.pixels)
+            state["beams.histogram"] = torch.from_numpy(self.beams.histogram)
+        if self.protocol.sets:
+            state["sets"] = torch.from_numpy(self.sets())
+        return {name: value.contiguous() for name, value in state.items()}
+
+    def restore(self, state: Mapping[str, Tensor], digest: str) -> None:
+        """Fill a new object with what `tensors` and `digest` of another gave."""
+        self.count, self.lit, self.measured = state["counts"].tolist()
+        self._digest = int(digest, 16)
+        for kind in [name.removesuffix(".features") for name in state if name.endswith(".features")]:
+            self.moments[kind] = Moments.from_state(_under(state, f"{kind}.moments."))
+            self._kept[kind] = [state[f"{kind}.features"]]
+        if self.bev:
+            self.bev.load_state(_under(state, "bev."))
+        if self.beams:
+            self.beams.pixels += state["beams.pixels"].numpy()
+            self.beams.histogram += state["beams.histogram"].numpy()
+        if self.protocol.sets:
+            self._sets = [state["sets"]]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: all but the networks."""
+        return {**vars(self), "networks": {}}
+
+
+def hash_of(image: RangeImage) -> int:
+    """128 bits of range, reflectance and mask; the sum of those of a set is the same in any order."""
+    content = b"".join(np.ascontiguousarray(v).tobytes() for v in (image.range, image.reflectance, image.mask))
+    return int(blake2b(content, digest_size=16).hexdigest(), 16)
+
+
+def _under(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str] | None = None) -> str:
+    """Write a `.safetensors` file, whole or not at all; returns the SHA-256 of its content, which it also holds.
+
+    extra  more to remember, such as where the images came from
+    """
+    tensors = statistics.tensors()
+    metadata = {
+        "format": FORMAT,
+        "protocol": statistics.protocol.name,
+        "definition": definition(statistics.protocol),
+        "role": statistics.role,
+        "sensor": json.dumps(statistics.sensor.to_dict()),
+        "weights": json.dumps(statistics.weights),
+        "digest": statistics.digest,
+        **(extra or {}),
+    }
+    metadata["sha256"] = _content(tensors, metadata)
+    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()
+        mode = unfinished.stat().st_mode & 0o777
+        save_file(tensors, unfinished, metadata)
+        unfinished.chmod(mode)  # safetensors lets nobody else read what it writes
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return metadata["sha256"]
+
+
+def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> tuple[Statistics, dict[str, str]]:
+    """Statistics that `save_statistics` wrote, verified, and the file's metadata.
+
+    protocol  what they must be of; by default the published one of the name in the file
+    Raises ValueError for another kind of file, another protocol or version, or a content that is not the one hashed.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"{path}: expected a file of statistics, found {error!s:.100}") from None
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected {FORMAT!r}, found {metadata.get('format')!r:.40}")
+    protocol = protocol or get_protocol(metadata.get("protocol", ""))
+    if metadata.get("definition") != definition(protocol):
+        raise ValueError(f"{path}: expected statistics of {protocol.title} as defined here, found those of "
+                         f"{metadata.get('protocol')}, {metadata.get('definition')}")  # fmt: skip
+    if _content(tensors, metadata) != metadata.get("sha256"):
+        raise ValueError(f"{path}: expected the content of SHA-256 {metadata.get('sha256')!s:.16}..., found another")
+    try:
+        role: Any = metadata["role"]
+        sensor = from_dict(json.loads(metadata["sensor"]), str(path))
+        statistics = Statistics(protocol, sensor, role, weights=json.loads(metadata["weights"]))
+        statistics.restore(tensors, metadata["digest"])
+    except (KeyError, TypeError, RuntimeError) as error:  # made by other hands
+        raise ValueError(f"{path}: expected the fields of {FORMAT!r}, found other ones: {error!s:.80}") from None
+    return statistics, metadata
+
+
+def definition(protocol: EvaluationProtocol) -> str:
+    """Version and hash of a protocol's record: two programs that agree in it compute the same statistics."""
+    fields = asdict(protocol)
+    for text in ("source", "notes", "absent", "rows"):  # what is said and shown, not what is gathered
+        del fields[text]
+    fields["measures"] = sorted({row.measure for row in protocol.rows})
+    return f"v{protocol.version} {sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:16]}"
+
+
+def _content(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    told = {name: value for name, value in metadata.items() if name != "sha256"}
+    digest = sha256(json.dumps(told, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.numpy().data)
+    return digest.hexdigest()

@@ -1,0 +1,45 @@
+"""What a model's folder on disk holds: `model.safetensors` and `experiment.json`."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import torch
+from safetensors.torch import save as serialized
+from torch import nn
+
+from lidarsynth.experiment.record import Experiment, from_dict
+
+WEIGHTS, RECORD = "model.safetensors", "experiment.json"
+
+
+def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
+    """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    dtype = torch.float16 if half else torch.float32
+    # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
+    exact = {name for name, _ in network.named_buffers()}
+    weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()}
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
+        (Path(scratch) / WEIGHTS).write_bytes(serialized(weights))  # save_file would hide it from other users
+        (Path(scratch) / RECORD).write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
+        for name in (WEIGHTS, RECORD):
+            os.replace(Path(scratch) / name, folder / name)
+    return folder
+
+
+def read_experiment(folder: str | Path) -> Experiment:
+    """The record of a saved model. Raises ValueError when the folder is not one."""
+    path = Path(folder) / RECORD
+    try:
+        return from_dict(json.loads(path.read_text()), str(path))
+    except FileNotFoundError:
+        raise ValueError(f"{folder}: expected a model folder with {WEIGHTS} and {RECORD}, found no {RECORD}") from None
+    except OSError as error:
+        raise ValueError(f"{path}: expected a readable record, found {error.strerror}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: expected JSON, found {error}") from None

@@ -1,0 +1,227 @@
+"""Bare arrays: KITTI `.bin`, nuScenes `.pcd.bin`, numpy `.npy` and `.npz`. Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import ast
+import json
+import lzma
+import struct
+import zipfile
+import zlib
+from io import BufferedIOBase, BytesIO
+from typing import IO
+
+import numpy as np
+
+from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, Fields, FileError, rings_of_grid
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import from_dict
+
+COLUMNS: tuple[str, ...] = ("x", "y", "z", "intensity", "ring")
+MAX_HEADER = 1 << 16
+ZIP_ERRORS = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, RuntimeError,
+    ValueError, OSError, KeyError, IndexError,
+)  # fmt: skip
+PRINTABLE = frozenset(b"\t\n\r" + bytes(range(32, 127)))
+
+
+def read_bin(data: bytes) -> Fields:
+    """KITTI: x y z reflectance, four float32 a point. Raises FileError for text or a size that is not whole points."""
+    hint = " (five floats a point, as nuScenes writes them, are read from .pcd.bin)" if len(data) % 20 == 0 else ""
+    return _floats(data, 4, hint)
+
+
+def read_pcd_bin(data: bytes) -> Fields:
+    """nuScenes: x y z intensity (0-255) ring, five float32 a point. Raises FileError as `read_bin`."""
+    fields = _floats(data, 5, "")
+    if np.nanmax(fields["intensity"], initial=0) <= 255:
+        fields["intensity"] = fields["intensity"] / np.float32(255)  # the format fixes the scale, however dark the scan
+    return fields
+
+
+def _floats(data: bytes, columns: int, hint: str) -> Fields:
+    if len(data) == 0 or len(data) % (4 * columns):
+        raise FileError(
+            f"expected whole points of {columns} float32 ({4 * columns} bytes), found {len(data)} bytes{hint}"
+        )
+    if PRINTABLE.issuperset(data[:4096]):
+        raise FileError(f"expected {columns} binary float32 a point, found text: {data[:24].decode('ascii')!r}")
+    table = np.frombuffer(data, "<f4").reshape(-1, columns)
+    extreme = np.nanmin(table[:, 3], initial=0), np.nanmax(table[:, 3], initial=0)
+    if hint and not 0 <= extreme[0] <= extreme[1] <= 65535:
+        raise FileError(
+            f"expected a reflectance in every fourth float32, found {extreme[0]:.4g} to {extreme[1]:.4g}{hint}"
+        )
+    return dict(zip(COLUMNS, table.T, strict=False))
+
+
+def read_npy(data: bytes) -> Fields:
+    """An (N, 3) to (N, 10) array of x y z intensity ..., or a structured array (N,) whose fields have names.
+
+    A fifth column of whole numbers 0-255 is the ring, as in nuScenes; any other further columns are left out.
+    """
+    return fields_of(read_array(BytesIO(data), len(data)))
+
+
+def fields_of(array: np.ndarray) -> Fields:
+    """Columns of an array of points, see `read_npy`. Raises FileError for any other shape or type."""
+    if array.dtype.names:
+        return {name: array[name].reshape(-1) for name in array.dtype.names if array[name].ndim == array.ndim}
+    if array.ndim != 2 or not 3 <= array.shape[1] <= 10 or array.dtype.kind not in "fiu":
+        raise FileError(f"expected an (N, 3) to (N, 10) array of points, found {array.shape} of {array.dtype}")
+    fields = dict(zip(COLUMNS, array.T, strict=False))
+    ring = fields.get("ring")
+    if ring is not None and not (
+        np.isfinite(ring).all() and np.all((ring >= 0) & (ring < 256) & (ring == np.floor(ring)))
+    ):
+        del fields["ring"]
+    return fields
+
+
+def read_array(file: IO[bytes], size: int) -> np.ndarray:
+    """The array of an npy stream of `size` bytes; no more is read than the header's shape asks for, and that must fit.
+
+    Raises FileError for objects (pickles), a broken header, or a shape that lies.
+    """
+    if (start := file.read(8))[:6] != b"\x93NUMPY" or len(start) < 8 or start[6] not in (1, 2, 3):
+        raise FileError(f"expected a numpy array (version 1-3), found {start!r}")
+    width = 2 if start[6] == 1 else 4
+    length = int.from_bytes(file.read(width), "little")
+    text = file.read(min(length, MAX_HEADER))
+    shape, dtype, columns_first = _npy_header(text)
+    if dtype.hasobject:
+        raise FileError("expected an array of numbers, found pickled Python objects, which are never loaded")
+    need = dtype.itemsize
+    for n in shape:
+        need *= n
+    found = size - 8 - width - length
+    if need > MAX_BYTES or need != found:
+        raise FileError(f"expected {need} bytes for an array {shape} of {dtype}, found {max(found, 0)}")
+    data = file.read(need)
+    if len(data) != need:
+        raise FileError(f"expected {need} bytes for an array {shape} of {dtype}, found {len(data)}")
+    if need == 0:
+        return np.zeros(shape, dtype)
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C")
+
+
+def _npy_header(text: bytes) -> tuple[tuple[int, ...], np.dtype, bool]:
+    try:
+        header = ast.literal_eval(text.decode("latin1").strip())
+        dtype = np.lib.format.descr_to_dtype(header["descr"])
+        shape, columns_first = header["shape"], header["fortran_order"]
+    except (ValueError, SyntaxError, TypeError, KeyError, IndexError, MemoryError, RecursionError):
+        raise FileError(f"expected a numpy header with descr, shape and fortran_order, found {text[:40]!r}") from None
+    if not isinstance(shape, tuple) or not all(isinstance(n, int) and 0 <= n < 2**40 for n in shape) or len(shape) > 8:
+        raise FileError(f"expected a shape of up to 8 whole numbers of at least 0, found {str(shape)[:60]!r}")
+    return shape, dtype, bool(columns_first)
+
+
+def read_npz(data: bytes) -> Fields:
+    """Our own scan (xyz, reflectance, ring, time, label), our own range image (`image_of`), columns under the usual
+    names, or a single array of points under any name (`read_npy`). Arrays (H, W, 3) and (H, W) are flattened."""
+    arrays = unzip(data)
+    if "sensor" in arrays and "mask" in arrays:
+        return scan_fields(image_of(arrays).to_scan())
+    if "xyz" not in arrays:
+        tables = [array for array in arrays.values() if array.ndim == 2 or array.dtype.names]
+        return fields_of(tables[0]) if len(tables) == 1 else dict(arrays)
+    xyz = arrays.pop("xyz")
+    if xyz.ndim < 2 or xyz.shape[-1] != 3:
+        raise FileError(f"expected xyz of (N, 3) or (H, W, 3), found {xyz.shape}")
+    points = dict(zip("xyz", xyz.reshape(-1, 3).T, strict=True))
+    points |= {name: array.reshape(-1) for name, array in arrays.items() if array.shape == xyz.shape[:-1]}
+    if xyz.ndim == 3 and (ring := rings_of_grid(points, xyz.shape[:2])) is not None:
+        points["ring"] = ring
+    return points
+
+
+def unzip(data: bytes) -> dict[str, np.ndarray]:
+    """Every array of an npz by its name, packed or not. Raises FileError; never unpacks more than a header asks for."""
+    try:
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+            if not 1 <= len(members) <= 64 or sum(m.file_size for m in members) > MAX_BYTES:
+                raise FileError(f"expected 1 to 64 arrays of at most {MAX_BYTES} bytes in all, found {len(members)} "
+                                f"of {sum(m.file_size for m in members)}")  # fmt: skip
+            return {m.filename[:-4]: _member(archive, m) for m in members}
+    except ZIP_ERRORS as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"expected an npz (a zip of numpy arrays), found {_first_line(error)}") from None
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(member) as file:
+        try:
+            return read_array(file, member.file_size)
+        except FileError as error:
+            raise FileError(f"{error} (in {member.filename[:40]})") from None
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least and greatest value
+    "range": ("f", 0, MAX_METRES),
+    "reflectance": ("f", 0, 1),
+    "mask": ("b", 0, 1),
+    "label": ("iu", 0, 19),
+    "xyz": ("f", -MAX_METRES, MAX_METRES),
+}
+
+
+def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
+    """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and label, xyz where present."""
+    if missing := {"range", "reflectance", "mask", "sensor"} - arrays.keys():
+        raise FileError(f"expected a saved range image, found no {', '.join(sorted(missing))} in {', '.join(arrays)}")
+    for name, (kinds, low, high) in IMAGE.items():
+        if name in arrays and arrays[name].dtype.kind not in kinds:
+            raise FileError(f"expected {name} of the kind {kinds}, found {arrays[name].dtype}")
+        if name in arrays and not np.all((arrays[name] >= low) & (arrays[name] <= high)):
+            raise FileError(f"expected finite {name} of {low:g} to {high:g}, found others")
+    try:
+        values = json.loads(str(arrays["sensor"]))
+        if not isinstance(values, dict) or "elevations" not in values:
+            raise FileError("expected a sensor with elevations in the range image, found another JSON text")
+        label = arrays["label"].astype(np.int32) if "label" in arrays else None
+        xyz = arrays["xyz"].astype(np.float32) if "xyz" in arrays else None
+        numbers = arrays["range"].astype(np.float32), arrays["reflectance"].astype(np.float32)
+        return RangeImage(*numbers, arrays["mask"], from_dict(values), label, xyz)
+    except FileError:
+        raise
+    except (ValueError, TypeError, RecursionError) as error:
+        raise FileError(f"expected a range image that fits its sensor, found: {_first_line(error)}") from None
+
+
+def scan_fields(scan: Scan) -> Fields:
+    """Our own npz keys, xyz split into x, y, z."""
+    fields = {axis: scan.xyz[:, i] for i, axis in enumerate("xyz")} | {"reflectance": scan.reflectance}
+    optional = {"ring": scan.ring, "time": scan.time, "label": scan.label}
+    return fields | {name: value for name, value in optional.items() if value is not None}
+
+
+def write_bin(file: BufferedIOBase, scan: Scan) -> None:
+    """x y z reflectance, four little-endian float32 a point; ring, time and label have no place in this format."""
+    file.write(_table(scan).tobytes())
+
+
+def write_npy(file: BufferedIOBase, scan: Scan) -> None:
+    """An (N, 4) float32 array x y z reflectance; ring, time and label have no place in this format."""
+    np.lib.format.write_array(file, _table(scan), allow_pickle=False)
+
+
+def _table(scan: Scan) -> np.ndarray:
+    return np.column_stack([scan.xyz, scan.reflectance]).astype("<f4")
+
+
+def write_npz(file: BufferedIOBase, scan: Scan | RangeImage) -> None:
+    """Every array of the scan or image under its own name, compressed; the sensor of an image as JSON text."""
+    if isinstance(scan, RangeImage):
+        arrays = {name: getattr(scan, name) for name in ("range", "reflectance", "mask", "label", "xyz")}
+        arrays["sensor"] = np.array(json.dumps(scan.sensor.to_dict()))
+    else:
+        arrays = {name: getattr(scan, name) for name in ("xyz", "reflectance", "ring", "time", "label")}
+    np.savez_compressed(file, **{name: array for name, array in arrays.items() if array is not None})

@@ -1,0 +1,137 @@
+"""Scans from and to files: `read`, `write`, chosen by the end of the name. Every failure is one line, a `FileError`."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any
+
+from lidarsynth.files import arrays, feather, las, pcd, ply
+from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
+from lidarsynth.files.labels import read_labels
+from lidarsynth.lidar.scan import RangeImage, Scan
+
+READERS: dict[str, Callable[[bytes], Fields]] = {
+    ".bin": arrays.read_bin,
+    ".pcd.bin": arrays.read_pcd_bin,
+    ".npy": arrays.read_npy,
+    ".npz": arrays.read_npz,
+    ".pcd": pcd.read_pcd,
+    ".ply": ply.read_ply,
+    ".las": las.read_las,
+    ".laz": las.read_las,
+    ".feather": feather.read_feather,
+}
+
+WRITERS: dict[str, Callable[[BufferedIOBase, Any], None]] = {  # a Scan; .npz also takes a RangeImage
+    ".bin": arrays.write_bin,
+    ".npy": arrays.write_npy,
+    ".npz": arrays.write_npz,
+    ".pcd": pcd.write_pcd,
+    ".ply": ply.write_ply,
+}
+
+
+def read(path: str | Path, intensity: str = "auto", labels: str | Path | None = None) -> Scan:
+    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`."""
+    return read_with_report(path, intensity, labels)[0]
+
+
+def read_with_report(path: str | Path, intensity: str = "auto", labels: str | Path | None = None) -> tuple[Scan, int]:
+    """The scan, and how many of the file's points were dropped: not finite, or (0, 0, 0) where nothing returned.
+
+    intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" by type and range
+               (`fields.reflectance_from`), "none" to read a file without intensity with reflectance 0
+    labels     a SemanticKITTI `.label` file with one word per point of the file
+    Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`).
+    Raises FileError, a ValueError of one line "path: expected ..., found ...".
+    """
+    if intensity not in INTENSITIES:
+        raise ValueError(f"expected an intensity of {', '.join(INTENSITIES)}, found {intensity!r}")
+    reader = READERS[_suffix(path, READERS, "read")]
+    data = _bytes(path)
+    with _naming(path):
+        fields = reader(data)
+    if labels is not None:
+        fields["label"] = read_labels(labels, len(next(iter(fields.values()), ())))
+    with _naming(path):
+        return scan_from_fields(fields, intensity)
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Puts the path before a FileError's message and keeps it on one line, whatever a file's own names hold."""
+    try:
+        yield
+    except FileError as error:
+        text = " ".join(str(error).split())
+        raise FileError(f"{path}: {''.join(c if c.isprintable() else '?' for c in text)}") from None
+    except MemoryError:
+        raise FileError(f"{path}: expected a scan that fits in memory, found one that does not") from None
+
+
+def read_image(path: str | Path) -> RangeImage:
+    """A range image that `write` saved as `.npz`: range, reflectance, mask, sensor, and label, xyz where it had them.
+
+    Raises FileError as `read`.
+    """
+    _suffix(path, {".npz": None}, "read a range image")
+    data = _bytes(path)
+    with _naming(path):
+        return arrays.image_of(arrays.unzip(data))
+
+
+def write(path: str | Path, scan: Scan | RangeImage) -> None:
+    """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given.
+
+    An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
+    points. `.bin` and `.npy` hold x y z reflectance only; the others ring, time and label too. The file appears whole
+    or not at all: it is written beside its place under another name, then renamed. Raises FileError.
+    """
+    path = Path(path)
+    if path.name.lower().endswith(".pcd.bin"):
+        raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found .pcd.bin")
+    suffix = _suffix(path, WRITERS, "write")
+    content = scan.to_scan() if isinstance(scan, RangeImage) and suffix != ".npz" else scan
+    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+    try:
+        if path.is_dir():
+            raise FileError(f"{path}: expected the name of a file to write, found a folder")
+        with open(unfinished, "xb") as file:
+            WRITERS[suffix](file, content)
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from None
+    finally:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def _suffix(path: str | Path, known: dict, verb: str) -> str:
+    """The longest key of `known` that ends the name."""
+    name = Path(path).name.lower()
+    if fits := [suffix for suffix in known if name.endswith(suffix)]:
+        return max(fits, key=len)
+    raise FileError(f"{path}: expected a name that ends in {', '.join(known)} to {verb}, found {name[-20:]!r}")
+
+
+def _bytes(path: str | Path) -> bytes:
+    """The content of a regular file of at most MAX_BYTES."""
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
+            what = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+            raise FileError(f"{path}: expected a file, found {what}")
+        if not 0 < status.st_size <= MAX_BYTES:
+            raise FileError(f"{path}: expected 1 to {MAX_BYTES} bytes of one scan, found {status.st_size}")
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileError):
+            raise
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise FileError(f"{path}: expected a readable file, found: {reason}") from None

@@ -1,0 +1,28 @@
+"""SemanticKITTI classes: raw `.label` words to the 20 training classes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lidarsynth.files.fields import FileError
+from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW
+
+
+def read_labels(path: str | Path, n: int) -> np.ndarray:
+    """(n,) int32 training classes 0-19 of a SemanticKITTI `.label` file, in the point order of its `.bin`.
+
+    Raises FileError when the file does not hold n words of 4 bytes or a raw id is not SemanticKITTI's.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise FileError(f"{path}: expected a readable .label file, found: {error.strerror}") from None
+    if len(data) != 4 * n:
+        raise FileError(f"{path}: expected {4 * n} bytes, one label of 4 for each of {n} points, found {len(data)}")
+    raw = np.frombuffer(data, "<u4") & 0xFFFF  # the high half is the instance
+    classes = CLASS_OF_RAW[raw]
+    if np.any(classes < 0):
+        raise FileError(f"{path}: expected SemanticKITTI's raw ids, found {int(raw[classes < 0][0])}")
+    return classes

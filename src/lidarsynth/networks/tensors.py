@@ -1,0 +1,98 @@
+"""Published weights of the feature networks: tensors by name from a file, and into a module, with clear errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import torch
+from torch import Tensor, nn
+
+
+def read_state(file: str | Path | BinaryIO, where: str) -> dict[str, Tensor]:
+    """Tensors by name of a state_dict that torch.save wrote, old formats too, read with `weights_only`, on the CPU.
+
+    where  names the file in errors. Raises ValueError for anything else, damaged files and pickled code included.
+    """
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ValueError(f"{where}: expected weights, found {error.strerror or error}") from None
+    except Exception as error:  # a damaged pickle raises whatever it likes
+        reason = str(error).rpartition("WeightsUnpickler error:")[2].strip().partition("\n")[0]
+        raise ValueError(f"{where}: expected weights, found a damaged or unsafe file ({reason:.120})") from None
+    if not isinstance(state, dict) or not all(isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()):
+        raise ValueError(f"{where}: expected tensors by name, found {type(state).__name__}")
+    return state
+
+
+def load_state(module: nn.Module, state: dict[str, Tensor], where: str) -> None:
+    """Put tensors into a module; counters of batch normalisation may be absent.
+
+    where  names the file in errors. Raises ValueError, naming the first, when names or shapes do not fit.
+    """
+    own = module.state_dict()
+    expected = {key: tuple(value.shape) for key, value in own.items()}
+    counters = {key for key in own if key.endswith("num_batches_tracked")}
+    found = {key: tuple(value.shape) for key, value in state.items()}
+    wrong = [key for key in {**expected, **found} if expected.get(key) != found.get(key)]
+    wrong = [key for key in wrong if key in found or key not in counters]
+    if wrong:
+        key = wrong[0]
+        raise ValueError(f"{where}: expected {key} {expected.get(key, 'not to be there')}, found "
+                         f"{found.get(key, 'none')}; {len(wrong)} tensors do not fit")  # fmt: skip
+    module.load_state_dict({**{key: own[key] for key in counters}, **state})
+
+
+def tensors_of(part: object, expected: str, prefix: str = "") -> dict[str, Tensor]:
+    """`part` as tensors by name, without the prefix; `expected` begins the error if it is anything else."""
+    if not isinstance(part, dict):
+        raise ValueError(f"{expected} with tensors by name, found a {type(part).__name__}")
+    for key, value in part.items():
+        if not isinstance(key, str) or not isinstance(value, Tensor):
+            raise ValueError(f"{expected} with tensors by name, found {key!r:.60} {type(value).__name__}")
+    return {key.removeprefix(prefix): value for key, value in part.items()}
+
+
+def iln_tensors(checkpoint: object, name: str) -> dict[str, Tensor]:
+    """Tensors of a checkpoint of ILN's repository, dict(epoch, model=dict(name, args, state_dict), ...).
+
+    name  of the model there: "iln", "liif_lidar" or "lsr". Raises ValueError for another one or another structure.
+    """
+    expected = f"expected a checkpoint of {name!r} in the format of ILN's repository"
+    model = checkpoint.get("model") if isinstance(checkpoint, dict) else None
+    if not isinstance(model, dict) or not {"name", "state_dict"} <= model.keys():
+        keys = f" with keys {list(checkpoint)[:4]}" if isinstance(checkpoint, dict) else ""
+        raise ValueError(f"{expected}, found a {type(checkpoint).__name__}{keys}")
+    if model["name"] != name:
+        raise ValueError(f"{expected}, found one of {model['name']!r:.60}")
+    return tensors_of(model["state_dict"], expected)
+
+
+def fill(network: nn.Module, weights: dict[str, Tensor]) -> None:
+    """Put tensors into a network. Raises ValueError, naming the first, when names or shapes do not fit."""
+    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in weights.items()}
+    wrong = [key for key in {**expected, **found} if expected.get(key) != found.get(key)]
+    if wrong:
+        key = wrong[0]
+        raise ValueError(
+            f"expected {key} {expected.get(key, 'not to be there')} for {type(network).__name__}, "
+            f"found {found.get(key, 'none')}; {len(wrong)} tensors do not fit"
+        )
+    network.load_state_dict(weights)
+
+
+def load_weights(network: nn.Module, weights: dict[str, Tensor], source: str) -> None:
+    """Copy weights into the network. Raises ValueError that names what is missing, unknown or of another shape."""
+    own = network.state_dict()
+    missing, unknown = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
+    if missing or unknown:
+        raise ValueError(
+            f"{source}: expected the {len(own)} tensors of the experiment's network, found {len(missing)} missing "
+            f"{missing[:2]} and {len(unknown)} unknown {unknown[:2]}"
+        )
+    for name, tensor in own.items():
+        if weights[name].shape != tensor.shape:
+            raise ValueError(f"{source}: expected {name} {tuple(tensor.shape)}, found {tuple(weights[name].shape)}")
+    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})

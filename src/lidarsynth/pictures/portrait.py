@@ -1,0 +1,56 @@
+"""The pictures that the verbs write: a portrait of one range image, and before / after / truth of a filled one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.pictures.figure import GAP, Picture, colour_bar, panel
+from lidarsynth.pictures.perspective import perspective
+from lidarsynth.pictures.render import bev, range_strip, reflectance_strip
+
+STRIP = 1024  # pixels, the width of a strip
+EXTENT = 32.0  # metres from the car to the left and right border of a view from above
+
+
+def portrait(image: RangeImage) -> np.ndarray:
+    """(H', W', 3) uint8: range and reflectance strips above a perspective view of the points."""
+    distance, reflectance = strips(image, image.sensor.max_range)
+    view = perspective(image, size=(STRIP, STRIP * 9 // 16))
+    return panel([[("range", distance)], [("reflectance", reflectance)], [("points", view)]])
+
+
+def strips(image: RangeImage, max_range: float) -> tuple[np.ndarray, np.ndarray]:
+    """Range and reflectance, (H', W', 3) uint8 of about 192 x 1024 for any size of image, colours to max_range m."""
+    rows, columns = max(round(192 / image.shape[0]), 1), max(round(STRIP / image.shape[1]), 1)
+    distance, reflectance = range_strip(image, max_range, rows), reflectance_strip(image, rows)
+    return np.repeat(distance, columns, axis=1), np.repeat(reflectance, columns, axis=1)
+
+
+def before_and_after(images: Mapping[str, RangeImage], points: Mapping[str, Scan]) -> np.ndarray:
+    """(H', W', 3) uint8: a row of range and reflectance strips per caption, then all points in 3-D and from above.
+
+    points  what to draw in 3-D instead of an image's own pixels, by caption
+    """
+    end = next(iter(images.values())).sensor.max_range
+    both = {name: strips(image, end) for name, image in images.items()}
+    rows: list[list[Picture]] = [[(f"{n}: range", d), (f"{n}: reflectance", r)] for n, (d, r) in both.items()]
+    rows.append([("", colour_bar("range", STRIP, end)), ("", colour_bar("reflectance", STRIP))])
+    width = (2 * STRIP + GAP - GAP * (len(images) - 1)) // len(images)
+    drawn = {name: points.get(name, image) for name, image in images.items()}
+    rows.append([(f"{n}: {_count(p)} points", perspective(p, size=(width, width * 9 // 16))) for n, p in drawn.items()])
+    rows.append([(f"{n}, from above", _ahead(p, width)) for n, p in drawn.items()])
+    return panel(rows, width=2 * STRIP + GAP)
+
+
+def _ahead(points: Scan | RangeImage, width: int) -> np.ndarray:
+    """(width * 9 // 16, width, 3) uint8: the bird's eye view turned so that the road runs to the right."""
+    square = np.rot90(bev(points, extent=EXTENT, size=width, background="white"), -1)
+    spare = (width - width * 9 // 16) // 2
+    return np.ascontiguousarray(square[spare : spare + width * 9 // 16])
+
+
+def _count(points: Scan | RangeImage) -> str:
+    return f"{len(points) if isinstance(points, Scan) else int(points.mask.sum()):,}"

@@ -1,0 +1,184 @@
+"""Roads and the ground beneath them: centre lines, heights, and what the surface is made of at any point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarsynth.streets.materials import LABEL, NUMBER
+
+KERB = 0.12  # metres from carriageway to sidewalk
+CROWN = 0.018  # fall of a carriageway from its middle to its edges
+BUMPS = (0.006, 0.014)  # metres, unevenness of paved and of other ground
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road along a gently waving centre line; s runs along it, d to its left, both in metres."""
+
+    x: float
+    y: float
+    yaw: float  # direction of s, radians
+    half: float  # half width of the carriageway, parking lanes included
+    walk: float  # width of each sidewalk, 0 for none
+    parking: tuple[float, float] = (0.0, 0.0)  # width of the parking lanes right and left
+    wave: tuple[float, float, float] = (0.0, 100.0, 0.0)  # amplitude (m), wave length (m), phase of the bend
+    start: float = -150.0  # range of s that exists
+    stop: float = 150.0
+    lanes: str = "none"  # centre marking: none, dashed or solid
+    rails: bool = False
+    paved: bool = True  # False: a gravel track
+
+    def bend(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sideways shift (m) and slope of the centre line at s."""
+        size, length, phase = self.wave
+        k = 2 * np.pi / length
+        return size * (np.sin(k * s + phase) - np.sin(phase)), size * k * np.cos(k * s + phase)
+
+    def at(self, s: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """World x, y and direction (radians) of the point at (s, d)."""
+        shift, slope = self.bend(s)
+        turn = np.arctan(slope)
+        u, v = s - d * np.sin(turn), shift + d * np.cos(turn)
+        c, sn = np.cos(self.yaw), np.sin(self.yaw)
+        return self.x + c * u - sn * v, self.y + sn * u + c * v, self.yaw + turn
+
+    def coordinates(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(s, d) of world points; d is infinite beyond the road's ends. One Newton step to the bend: 2 cm."""
+        c, sn = np.float32(np.cos(self.yaw)), np.float32(np.sin(self.yaw))
+        u = c * (x - np.float32(self.x)) + sn * (y - np.float32(self.y))
+        v = c * (y - np.float32(self.y)) - sn * (x - np.float32(self.x))
+        if self.wave[0] != 0:
+            shift, slope = self.bend(u)
+            foot = u + (v - shift) * slope / (1 + slope**2)
+            shift, slope = self.bend(foot)
+            v = ((v - shift) - (u - foot) * slope) / np.sqrt(1 + slope**2)
+            u = foot
+        return u, np.where((u >= self.start) & (u <= self.stop), v, np.inf)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Height and surface of the world. `verge` is the material word beside the roads: grass, gravel or sidewalk."""
+
+    roads: tuple[Road, ...]
+    slope: tuple[float, float] = (0.0, 0.0)  # along x and y
+    hills: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.float32))  # amplitude, kx, ky, phase
+    banks: tuple[float, float] = (0.0, 0.0)  # slope of the land right and left of the first road
+    verge: str = "grass"
+    patches: np.ndarray = field(default_factory=lambda: np.zeros((4, 3), np.float32))  # kx, ky, phase of wear
+    phase: float = 0.0  # where the dashes of markings start
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Metres above the origin of the bare ground, carriageway level."""
+        z = self.slope[0] * x + self.slope[1] * y
+        for amplitude, kx, ky, phase in self.hills:
+            z = z + amplitude * np.sin(kx * x + ky * y + phase)
+        if self.banks != (0.0, 0.0):
+            road = self.roads[0]
+            _, d = road.coordinates(x, y)
+            d = np.where(np.isfinite(d), d, 0)
+            far = np.clip(np.abs(d) - road.half - road.walk - 3.0, 0, 14)
+            z = z + far * np.where(d > 0, self.banks[1], self.banks[0])
+        return z
+
+    def carriageway(self, x: np.ndarray, y: np.ndarray, skip: int = -1) -> np.ndarray:
+        """Metres to the nearest carriageway's edge, negative on it; road number `skip` is not counted."""
+        gap = np.full(np.shape(x), np.inf)
+        for i, road in enumerate(self.roads):
+            if i != skip:
+                gap = np.minimum(gap, np.abs(road.coordinates(x, y)[1]) - road.half)
+        return gap
+
+    def surface(self, x: np.ndarray, y: np.ndarray, raised: np.ndarray) -> tuple[np.ndarray, ...]:
+        """What the ground is made of at world points x, y (N,).
+
+        raised (N,) bool: the beam met a sidewalk slab. Returns material (N,), label (N,) uint8, the change of signal by
+        wear (N,) float32, and how far the real surface lies below the smooth one (N,) float32 metres: crown and bumps.
+        """
+        material = np.full(x.shape, NUMBER[self.verge], np.uint8)
+        label = np.full(x.shape, LABEL["sidewalk" if self.verge == "sidewalk" else "terrain"], np.uint8)
+        sag = np.zeros(x.shape, np.float32)
+        tracks, roadway = np.zeros(x.shape, np.float32), np.zeros(x.shape, bool)
+        for road in self.roads:
+            s, d = road.coordinates(x, y)
+            inside = np.abs(d) < road.half
+            roadway |= inside
+            sag[inside] = CROWN * np.abs(d[inside])
+            tracks[inside] = 1.6 * np.cos(4 * np.pi * d[inside] / road.half + self.phase)  # two wheels a lane
+            material[inside] = NUMBER["road" if road.paved else "gravel"]
+            label[inside] = LABEL["road"]
+            park = inside & ((d < road.parking[0] - road.half) | (d > road.half - road.parking[1]))
+            material[park], label[park] = NUMBER["parking"], LABEL["parking"]
+            self._paint(road, s, d, material)
+        material[raised], label[raised] = NUMBER["sidewalk"], LABEL["sidewalk"]
+        wear = np.zeros(x.shape, np.float32)
+        wear[roadway] = tracks[roadway]
+        for kx, ky, phase in self.patches:
+            wear += np.sin(kx * x + ky * y + phase).astype(np.float32)
+        uneven = BUMPS[0] if self.verge == "sidewalk" else BUMPS[1]
+        sag[raised] = 0
+        bumps = np.where(roadway | raised, np.float32(BUMPS[0]), np.float32(uneven)) * (wear - tracks)
+        return material, label, np.float32(0.012) * wear, sag + bumps
+
+    def _paint(self, road: Road, s: np.ndarray, d: np.ndarray, material: np.ndarray) -> None:
+        """Lane markings, stop lines and rails, written into `material`."""
+        width = np.float32(0.075)
+        right, left = road.half - road.parking[0], road.half - road.parking[1]
+        middle = np.float32((left - right) / 2)
+        line = np.zeros(s.shape, bool)
+        if road.lanes != "none":
+            line |= np.abs(d - middle) < width
+            if road.lanes == "dashed":
+                line &= (s + self.phase) / 9 - np.floor((s + self.phase) / 9) < 0.44
+            line |= (np.abs(d - left + 0.25) < width) | (np.abs(d + right - 0.25) < width)
+        elif max(road.parking) > 0:
+            line |= (np.abs(d - left) < 0.05) | (np.abs(d + right) < 0.05)
+        painted = np.flatnonzero(line)
+        for other in self.roads:  # no lines across a crossing
+            if other is not road and len(painted):
+                x, y, _ = road.at(s[painted], d[painted])
+                painted = painted[np.abs(other.coordinates(x, y)[1]) >= other.half + 1.0]
+        material[painted] = NUMBER["marking"]
+        if road.rails:
+            for centre in (-1.6, 1.6):
+                rail = np.abs(np.abs(d - np.float32(centre)) - 0.72) < 0.06
+                material[rail] = NUMBER["rail"]
+
+
+def ground_mesh(ground: Ground, reach: tuple[float, float], cell: float) -> np.ndarray:
+    """(T, 3, 3) float32: the bare ground as a grid of `cell` metres over +-reach (x, y)."""
+    xs = np.arange(-reach[0], reach[0] + cell, cell, dtype=np.float32)
+    ys = np.arange(-reach[1], reach[1] + cell, cell, dtype=np.float32)
+    x, y = np.meshgrid(xs, ys, indexing="ij")
+    p = np.stack([x, y, ground.height(x, y)], axis=-1).astype(np.float32)
+    quad = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=-2).reshape(-1, 4, 3)
+    return quad[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+
+
+def slab_mesh(ground: Ground, step: float = 2.5) -> tuple[np.ndarray, np.ndarray]:
+    """Sidewalks of all roads as raised strips. Returns (T, 3, 3) float32 and (T,) bool, True for kerb faces."""
+    parts, kerbs = [], []
+    for i, road in enumerate(ground.roads):
+        if road.walk <= 0:
+            continue
+        s = np.arange(road.start, road.stop, step)
+        for side in (-1, 1):
+            edge = [_rail(ground, road, t, side * d, up) for t in (s, s + step)
+                    for d, up in ((road.half, 0.0), (road.half, KERB), (road.half + road.walk, KERB))]  # fmt: skip
+            low_a, a, b, low_b, c, e = edge
+            x, y, _ = road.at(s + step / 2, np.full(s.shape, side * (road.half + 0.2)))
+            open_ = ground.carriageway(x, y, skip=i) > 0.1
+            for quad, kerb in ((np.stack([a, b, e, c], 1), False), (np.stack([low_a, a, c, low_b], 1), True)):
+                triangles = quad[open_][:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+                parts.append(triangles)
+                kerbs.append(np.full(len(triangles), kerb))
+    if not parts:
+        return np.zeros((0, 3, 3), np.float32), np.zeros(0, bool)
+    return np.concatenate(parts).astype(np.float32), np.concatenate(kerbs)
+
+
+def _rail(ground: Ground, road: Road, s: np.ndarray, d: float, up: float) -> np.ndarray:
+    x, y, _ = road.at(s, np.full(s.shape, d))
+    return np.stack([x, y, ground.height(x, y) + up], axis=-1)

@@ -1,0 +1,196 @@
+"""From first hits to what the laser reports: passes through glass, signal, drop-outs, noise, quantisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsynth.streets import facades
+from lidarsynth.streets.hdl64e import Lasers
+from lidarsynth.streets.materials import NUMBER, TABLE
+from lidarsynth.streets.raycast import Caster
+from lidarsynth.streets.world import FRONT, GROUND, SLAB, World
+
+# Reflectance reported for a signal: nothing when dim, then steep, flat about 0.3, so that the shares of all reported
+# values become those of real scans.
+RESPONSE = (
+    (
+        0.026,
+        0.030,
+        0.044,
+        0.056,
+        0.071,
+        0.103,
+        0.128,
+        0.150,
+        0.186,
+        0.217,
+        0.262,
+        0.311,
+        0.366,
+        0.432,
+        0.513,
+        0.66,
+        0.8,
+    ),
+    (
+        0.000,
+        0.035,
+        0.060,
+        0.100,
+        0.150,
+        0.200,
+        0.250,
+        0.280,
+        0.310,
+        0.340,
+        0.380,
+        0.420,
+        0.470,
+        0.530,
+        0.600,
+        0.80,
+        0.99,
+    ),
+)
+REPORTED = np.round(np.interp(np.arange(801) / 1000, *RESPONSE), 2).astype(np.float32)  # by signal in thousandths
+GRAZING = (0.13, 0.17)  # signal lost per natural logarithm of cos(incidence) below the second number
+FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) where positive
+DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
+VANISH = -0.14  # signal at which half of the returns vanish
+VANISH_WIDTH = 0.014
+NOISE = (0.0012, 0.004, 0.014)  # metres: standard deviation per metre, least, most
+ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.08, "stone": 0.02, "bark": 0.02}  # metres along the beam
+
+
+@dataclass(frozen=True)
+class Optics:
+    """How well a sensor sees. The defaults are those of the sensor that the streets were fitted to.
+
+    loss, dip, shift  per beam, or () for none: signal lost; signal lost at 4 to 6 m; metres read too far
+    noise             factor of the range noise
+    strength          signal above that sensor's: more of it, fewer drop-outs
+    gamma, scale      reported reflectance = scale * reflectance ** gamma, at most 1
+    """
+
+    loss: tuple[float, ...] = ()
+    dip: tuple[float, ...] = ()
+    shift: tuple[float, ...] = ()
+    noise: float = 1.0
+    strength: float = 0.0
+    gamma: float = 1.0
+    scale: float = 1.0
+
+    def reported(self, reflectance: np.ndarray) -> np.ndarray:
+        """Reflectance (N,) in [0, 1] as this sensor reports it."""
+        if self.gamma == 1 and self.scale == 1:
+            return reflectance
+        return np.minimum(np.float32(self.scale) * reflectance ** np.float32(self.gamma), np.float32(1))
+
+
+OPTICS = Optics()
+
+
+@dataclass(frozen=True)
+class Returns:
+    """What N beams brought back: distance (N,) float32 m along the ray, 0 for none; reflectance and label (N,)."""
+
+    distance: np.ndarray
+    reflectance: np.ndarray
+    label: np.ndarray
+
+
+def sense(
+    world: World,
+    caster: Caster,
+    origins: np.ndarray,
+    rays: np.ndarray,
+    lasers: Lasers,
+    rng: np.random.Generator,
+    max_range: float,
+    eye: Optics = OPTICS,
+) -> Returns:
+    """Sends N rays and reports their returns.
+
+    origins, rays (N, 3) float32 world frame. The number of random draws depends on N only, so a ray that just misses
+    on another machine changes no other ray.
+    """
+    count = len(rays)
+    chance = rng.random((2, count), dtype=np.float32)
+    noise = rng.standard_normal((3, count), dtype=np.float32)
+    face, distance, cosine = caster.cast(origins, rays)
+    material, label, tint, depth = _surface(world, face, origins, rays, distance)
+    steady = _steady(face, lasers.number)
+    through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
+    if through.any():
+        far = _behind(world, caster, origins[through], rays[through], distance[through])
+        for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
+            mine[through] = theirs
+    optics = TABLE[material]
+    strength = _signal(optics, tint, cosine, distance, lasers)
+    near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
+    signal = strength - lasers.dip * np.clip(near, 0, 1)
+    doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
+    gone = (strength + doubt < VANISH - eye.strength) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
+    distance = (
+        distance
+        + depth / np.maximum(cosine, 0.12)
+        + noise[0] * np.float32(eye.noise) * _spread(material, distance)
+        + lasers.shift
+    )
+    gone |= ~(distance < max_range)
+    # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
+    grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
+    reflectance = REPORTED[np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.int32)]
+    reflectance = eye.reported(reflectance)
+    zero = np.float32(0)
+    return Returns(np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
+
+
+def _signal(optics: np.ndarray, tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers):
+    """(N,) signal before its noise: material, incidence, distance, and the laser's own loss."""
+    cosine = np.maximum(cosine, 0.01)
+    slant = np.log(cosine)
+    far = np.log(np.maximum(np.minimum(distance, 999) / FADE[2], 1))
+    signal = optics[:, 0] + tint * optics[:, 1] + optics[:, 3] * slant
+    signal = signal + GRAZING[0] * np.minimum(slant - np.float32(np.log(GRAZING[1])), 0)
+    return signal - far * (FADE[0] + FADE[1] * far) - lasers.loss
+
+
+def _steady(face: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """(N,) in [0, 1): a chance that one laser on one face keeps, so that panes drop out in stripes, not in grains."""
+    mixed = (face >> 1).astype(np.uint32) * np.uint32(2654435761) + (number >> 1) * np.uint32(1779033703)
+    return (mixed >> np.uint32(16)).astype(np.float32) * np.float32(2**-16)
+
+
+def _spread(material: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(N,) metres, standard deviation of the range: the sensor's noise and the surface's roughness."""
+    table = np.zeros(len(TABLE), np.float32)
+    for name, rough in ROUGH.items():
+        table[NUMBER[name]] = rough
+    return np.hypot(table[material], np.clip(distance * np.float32(NOISE[0]), *NOISE[1:]))
+
+
+def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
+    """Material, label, tint and depth behind the face of N hits; misses get the last triangle's."""
+    kind, material, label = world.kind[face], world.material[face], world.label[face]
+    tint, depth = world.tint[face], np.zeros(len(face), np.float32)
+    hit = face >= 0
+    low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
+    spot = origins[low] + rays[low] * distance[low, None]
+    material[low], label[low], wear, depth[low] = world.ground.surface(spot[:, 0], spot[:, 1], kind[low] == SLAB)
+    tint[low] = wear / TABLE[material[low], 1]
+    wall = np.flatnonzero(hit & (kind == FRONT))
+    spot = origins[wall] + rays[wall] * distance[wall, None]
+    material[wall], depth[wall] = facades.shade(spot, world.fronts[world.front[face[wall]]])
+    return material, label, tint, depth
+
+
+def _behind(world: World, caster: Caster, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
+    """The hits behind glass, as `_surface` and the caster give them; a second pane ends the beam."""
+    step = distance + np.float32(0.05)
+    start = origins + rays * step[:, None]
+    face, more, cosine = caster.cast(start, rays)
+    material, label, tint, depth = _surface(world, face, start, rays, more)
+    return face, step + more, cosine, material, label, tint, depth

@@ -1,0 +1,210 @@
+"""Where everything stands: one world of 300 m of street with its side roads, and the poses the scans are taken from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.areas import Area
+from lidarsynth.streets.ground import Ground, Road, ground_mesh, slab_mesh
+from lidarsynth.streets.materials import LABEL, NUMBER
+from lidarsynth.streets.objects import library
+
+GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
+REACH = (150.0, 90.0)  # half size of the world in metres, x and y
+POSES = 16  # scans taken in one world
+
+
+@dataclass(frozen=True)
+class World:
+    """T triangles and what they are.
+
+    corners (T, 3, 3) float32 m; kind (T,) uint8 of GROUND, SLAB, THING, FRONT; material, label (T,) uint8;
+    tint (T,) float32, the object's brightness in spreads of its material; front (T,) int16, row of `fronts` or -1;
+    fronts (F, 12) float32, see `facades.py`; ground; poses (16, 6) float64: x, y, z, yaw, pitch, roll of the vehicle.
+    """
+
+    corners: np.ndarray
+    kind: np.ndarray
+    material: np.ndarray
+    label: np.ndarray
+    tint: np.ndarray
+    front: np.ndarray
+    fronts: np.ndarray
+    ground: Ground
+    poses: np.ndarray
+
+
+@dataclass
+class Lot:
+    """Collects what is placed: rows of (x, y, z, yaw, length, width, height scales, tint) per kind and variant."""
+
+    rng: np.random.Generator
+    ground: Ground
+    area: Area
+    things: dict[tuple[str, int], list[np.ndarray]] = field(default_factory=dict)
+    walls: list[tuple[np.ndarray, np.ndarray, str, str]] = field(default_factory=list)  # corners, front rows, material
+
+    def put(
+        self,
+        kind: str,
+        x: np.ndarray,
+        y: np.ndarray,
+        yaw: np.ndarray,
+        up: float = 0.0,
+        clear: float | None = 0.3,
+        size: tuple[float, float] = (0.9, 1.1),
+    ) -> None:
+        """Things of one kind at (N,) places, variants drawn at random; dropped within `clear` m of a carriageway."""
+        count = len(x)
+        variants = library()[kind]
+        pick = self.rng.integers(0, len(variants), count)
+        scale = self.rng.uniform(*size, (count, 3))
+        tint = np.clip(self.rng.normal(size=count), -1.5, 2.2)
+        rows = np.column_stack([x, y, self.ground.height(x, y) + up, yaw, scale, tint])
+        if clear is not None:
+            keep = self.ground.carriageway(x, y) > clear
+            rows, pick = rows[keep], pick[keep]
+        for variant in np.unique(pick):
+            self.things.setdefault((kind, int(variant)), []).append(rows[pick == variant])
+
+    def put_row(
+        self, kind: str, x: np.ndarray, y: np.ndarray, yaw: np.ndarray, first: tuple[int, float, float]
+    ) -> None:
+        """Pieces of one hedge or fence: all of the same variant, height scale and tint, given by `first`."""
+        keep = self.ground.carriageway(x, y) > 0.4
+        variant = first[0] % len(library()[kind])
+        ones = np.ones(int(keep.sum()))
+        x, y, yaw = x[keep], y[keep], yaw[keep]
+        rows = np.column_stack([x, y, self.ground.height(x, y), yaw, ones, ones, ones * first[1], ones * first[2]])
+        self.things.setdefault((kind, variant), []).append(rows)
+
+
+def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
+    """Roads and terrain of one world."""
+    lane = rng.uniform(*area.half)
+    parking = (2.1 * (rng.random() < area.parking[0]), 2.1 * (rng.random() < area.parking[1]))
+    half = lane + max(parking)
+    parking = (parking[0], parking[1])
+    wave = (rng.uniform(*area.bend) * (rng.random() < 0.7), rng.uniform(130, 300), rng.uniform(0, 6.28))
+    draw = rng.random()
+    lanes = "dashed" if draw < area.lanes[0] else "solid" if draw < sum(area.lanes) else "none"
+    rails = bool(rng.random() < area.rails) and lane > 3.5
+    walk = rng.uniform(*area.walk)
+    roads = [Road(0, 0, 0, half, walk, parking, wave, -150, 150, lanes, rails)]
+    places = rng.permutation(np.arange(-100, 101, 40.0))
+    for k in range(rng.integers(area.crossings[0], area.crossings[1] + 1)):
+        place = places[k] + rng.uniform(-14, 14)
+        x, y, yaw = roads[0].at(np.asarray(place), np.asarray(0.0))
+        one_sided = rng.choice(np.array([(-90, 90), (-90, 0), (0, 90)]))
+        side = Road(float(x), float(y), float(yaw) + np.pi / 2 + rng.normal(0, 0.12), rng.uniform(2.2, max(3.0, lane)),
+                    walk * rng.uniform(0.5, 1), start=float(one_sided[0]), stop=float(one_sided[1]))  # fmt: skip
+        roads.append(side)
+    slope = rng.normal(0, area.slope, 2)
+    hills = np.column_stack([rng.uniform(0, 0.35, 3) * area.slope / 0.02, rng.uniform(-0.04, 0.04, (3, 2)),
+                             rng.uniform(0, 6.28, 3)])  # fmt: skip
+    banks = rng.normal(0, area.bank, 2) if area.bank else np.zeros(2)
+    patches = np.column_stack([rng.normal(0, 0.6, (4, 2)), rng.uniform(0, 6.28, 4)]).astype(np.float32)
+    return Ground(tuple(roads), (slope[0], slope[1]), hills, (banks[0], banks[1]), str(rng.choice(area.verge)), patches,
+                  float(rng.uniform(0, 9)))  # fmt: skip
+
+
+def draw_poses(rng: np.random.Generator, ground: Ground) -> tuple[np.ndarray, np.ndarray]:
+    """Vehicle poses (16, 6) and their places (16, 2), (s, d) along the main road, far away for those on side roads."""
+    road = ground.roads[0]
+    lanes = np.array([-(road.half - road.parking[0]) / 2, (road.half - road.parking[1]) / 2])
+    two_way = road.half - max(road.parking) > 2.6
+    back = (rng.random(POSES) < 0.4) & two_way
+    s = np.linspace(-66, 66, POSES) + rng.uniform(-3, 3, POSES)
+    d = np.where(back, lanes[1], lanes[0] if two_way else lanes.sum()) + rng.normal(0, 0.25, POSES)
+    x, y, yaw = road.at(s, d)
+    yaw = yaw + np.where(back, np.pi, 0) + rng.normal(0, 0.03, POSES)
+    for k in range(POSES):
+        draw, swing = rng.random(2), rng.normal(0, 1, 2)
+        near = [r for r in ground.roads[1:] if np.hypot(r.x - x[k], r.y - y[k]) < 10]
+        if near and draw[0] < 0.6:  # turning
+            x[k], y[k] = near[0].x + swing[0], near[0].y + swing[1]
+            yaw[k] += 2.4 * draw[1] - 1.2
+        elif len(ground.roads) > 1 and draw[0] > 0.85:  # on a side road
+            side = ground.roads[1 + k % (len(ground.roads) - 1)]
+            place = np.clip(side.start + (side.stop - side.start) * draw[1], -60, 60)
+            x[k], y[k], yaw[k] = side.at(np.asarray(place), np.asarray(-side.half / 2))
+            s[k] = 1e6
+    return _settled(rng, ground, x, y, yaw), np.column_stack([s, d])
+
+
+def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """(N, 6) poses of vehicles that stand on the ground: its slope under the wheels, and half a degree of sway."""
+    ahead, left = 1.3, 0.8
+    c, s = np.cos(yaw), np.sin(yaw)
+    rise = ground.height(x + ahead * c, y + ahead * s) - ground.height(x - ahead * c, y - ahead * s)
+    bank = ground.height(x - left * s, y + left * c) - ground.height(x + left * s, y - left * c)
+    sway = rng.normal(0, 0.008, (2, len(x)))
+    pitch, roll = np.arctan(rise / (2 * ahead)) + sway[0], np.arctan(bank / (2 * left)) + sway[1]
+    return np.column_stack([x, y, ground.height(x, y), yaw, pitch, roll])
+
+
+def assemble(lot: Lot, poses: np.ndarray) -> World:
+    """One soup of the ground, the sidewalks, the walls and the things."""
+    bare = ground_mesh(lot.ground, REACH, 4.0)
+    slab, kerb = slab_mesh(lot.ground)
+    columns = [_soup(bare, GROUND, "road", "road"), _soup(slab, SLAB, "sidewalk", "sidewalk")]
+    columns[1]["material"][kerb] = NUMBER["kerb"]
+    fronts = np.zeros((0, 12), np.float32)
+    for corners, rows, material, label in lot.walls:
+        soup = _soup(corners, FRONT, material, label)
+        soup["front"] = (np.repeat(np.arange(len(rows)), len(corners) // len(rows)) + len(fronts)).astype(np.int16)
+        soup["tint"] = np.repeat(rows[:, 11], len(corners) // len(rows)).astype(np.float32)
+        fronts = np.concatenate([fronts, rows])
+        columns.append(soup)
+    columns += [_instances(kind, variant, np.concatenate(rows)) for (kind, variant), rows in lot.things.items()]
+    joined = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
+    return World(**joined, fronts=fronts, ground=lot.ground, poses=poses)
+
+
+def visible(world: World, sensor: Sensor) -> World:
+    """The world without triangles that no pose can see: too far, or wholly above the highest beam. Faster to cast."""
+    poses = world.poses.astype(np.float32)
+    spot = world.corners[:, 0]
+    high = np.flatnonzero((world.kind == THING) & (spot[:, 2] > poses[:, 2].min() + sensor.mount + 0.8))
+    steep = np.float32(np.tan(np.radians(sensor.elevations[0]) + 0.06))  # 0.06 rad: pitch, roll and slope of the poses
+    shown = np.zeros(len(high), bool)
+    for x, y, z, *_ in poses:
+        away = np.hypot(spot[high, 0] - x, spot[high, 1] - y)
+        shown |= (away < sensor.max_range + 5) & (spot[high, 2] - z - sensor.mount - 0.8 < steep * away)
+    seen = np.ones(len(spot), bool)
+    seen[high] = shown
+    table = {key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front")}
+    return replace(world, **table)
+
+
+def _soup(corners: np.ndarray, kind: int, material: str, label: str) -> dict[str, np.ndarray]:
+    count = len(corners)
+    return {
+        "corners": np.asarray(corners, np.float32),
+        "kind": np.full(count, kind, np.uint8),
+        "material": np.full(count, NUMBER[material], np.uint8),
+        "label": np.full(count, LABEL[label], np.uint8),
+        "tint": np.zeros(count, np.float32),
+        "front": np.full(count, -1, np.int16),
+    }
+
+
+def _instances(kind: str, variant: int, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Copies of one library mesh, scaled, turned and shifted by rows (N, 8)."""
+    shape = library()[kind][variant]
+    rows = rows.astype(np.float32)
+    c, s, zero = np.cos(rows[:, 3]), np.sin(rows[:, 3]), np.zeros(len(rows), np.float32)
+    turn = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1], axis=-1).reshape(-1, 3, 3) * rows[:, 4:7, None]
+    corners = shape.corners.reshape(-1, 3) @ turn + rows[:, None, :3]
+    count = len(rows)
+    return {
+        "corners": corners.reshape(-1, 3, 3),
+        "kind": np.full(count * len(shape), THING, np.uint8),
+        "material": np.tile(shape.material, count),
+        "label": np.tile(shape.label, count),
+        "tint": np.repeat(rows[:, 7], len(shape)),
+        "front": np.full(count * len(shape), -1, np.int16),
+    }

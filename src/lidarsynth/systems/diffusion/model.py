@@ -1,0 +1,203 @@
+"""`LidarModel`, the model of a denoiser: generate, complete and upsample scans."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lidarsynth.diffusion import langevin, repaint
+from lidarsynth.diffusion.denoiser import Denoiser
+from lidarsynth.diffusion.samplers import STEPS, Rng, State, even_log_snr, generators, sample, starting_noise
+from lidarsynth.experiment.record import Experiment, Score
+from lidarsynth.lidar.depth import from_x_0, to_x_0
+from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.systems.scan_model import OnStep, ScanModel, known_pixels, with_known
+
+METHODS = ("auto", "conditional", "repaint", "posterior")
+SAMPLERS = (*STEPS, "langevin")
+
+
+@dataclass(frozen=True)
+class LidarModel(ScanModel):
+    """A trained denoiser with its sensor.
+
+    network   raw prediction (B, 2, H, W) from x_t (B, 2, H, W) and log_snr (B,)
+    denoiser  (x_t, t) -> x_0_hat
+    """
+
+    network: nn.Module
+    denoiser: Denoiser
+    sensor: Sensor
+    experiment: Experiment
+
+    @property
+    def conditional(self) -> bool:
+        """Whether the network can be told the known pixels."""
+        return self.experiment.model.network == "conditional-unet"
+
+    def stream(
+        self,
+        n: int,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
+
+        steps    network evaluations per scan (twice as many for `heun`; for `langevin` at most as many, in whole noise
+                 levels); default 32, or 1161 for `langevin`: 232 levels x 5 and a final denoising
+        sampler  ddpm | ddim | dpmpp-2m | heun | langevin; default ddpm, or langevin after score matching
+
+        Raises ValueError for an unknown sampler or counts below 1, or below 11 for `langevin`.
+        """
+        sampler, steps = self._sampler(sampler), self.generation_steps(steps, sampler)
+        if n < 1 or steps < 1 or batch_size < 1:
+            raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
+        for start in range(first, n, batch_size):
+            count = min(batch_size, n - start)
+            rng = generators(seed, count, offset=start)
+            x_1 = self._start(self._blank(count), rng, sampler == "langevin")
+            for x in _last(self._states(self.denoiser, x_1, rng, sampler, steps), on_step):
+                yield self._image(x)
+
+    def complete(
+        self,
+        scan: Scan | RangeImage,
+        known: np.ndarray | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int = 10,
+        sampler: str | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """Fill what was not measured; measured pixels come back exactly as they were, in metres.
+
+        scan    points, or an image of this model's sensor
+        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
+        method  `conditional`: the network is told the known pixels (one step, or few); `repaint`: R2DM's way, for any
+                network; `posterior`: LiDARGen's, for any network; `auto`: conditional where the network can, else
+                posterior after score matching, else repaint
+        steps   default 1, which errs least; or 32 for repaint, where `resamples` passes go over each step; or, for
+                posterior, at most so many network evaluations, default 1161
+
+        A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
+        """
+        image = self.image_of(scan)
+        known = known_pixels(image, known)
+        x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
+        mask = torch.from_numpy(known).to(self._device).expand(1, 2, *known.shape).clone()
+        mask[:, 1] &= bool(image.reflectance[known].any())
+        calls = self.evaluations(method, steps, resamples)
+        states = self._completion(x_0, mask, self._method(method), steps, resamples, sampler, generators(seed, 1))
+        filled = self._image(_last(states, on_step, calls)[0])
+        return with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """How many steps of the sampler `generate` takes per batch."""
+        if self._sampler(sampler) != "langevin":
+            return 32 if steps is None else steps
+        return self._langevin_calls(steps)
+
+    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
+        """How many network evaluations `complete` takes."""
+        method = self._method(method)
+        if method == "posterior":
+            return self._langevin_calls(steps)
+        if method == "conditional":
+            return 1 if steps is None else steps
+        return repaint.evaluations(32 if steps is None else steps, resamples)
+
+    def _method(self, method: str) -> str:
+        if method not in METHODS:
+            raise ValueError(f"expected a method of {', '.join(METHODS)}, found {method!r}")
+        if method == "conditional" and not self.conditional:
+            raise ValueError(f"{self.experiment.name}: expected method repaint or posterior, since this network cannot "
+                             f"be told the known pixels, found conditional")  # fmt: skip
+        if method != "auto":
+            return method
+        return "conditional" if self.conditional else "repaint" if self.experiment.score is None else "posterior"
+
+    def _sampler(self, sampler: str | None) -> str:
+        if sampler is None:
+            return "ddpm" if self.experiment.score is None else "langevin"
+        if sampler not in SAMPLERS:
+            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {sampler!r}")
+        return sampler
+
+    def _completion(
+        self,
+        x_0: Tensor,
+        mask: Tensor,
+        method: str,
+        steps: int | None,
+        resamples: int,
+        sampler: str | None,
+        rng: Rng,
+    ) -> Iterator[State]:
+        """The states of completing x_0 (1, 2, H, W) where `mask` is False; the last pull of `posterior` is one more."""
+        x_1 = self._start(x_0, rng, method == "posterior")
+        if method == "conditional":
+            told = self.denoiser.given(x_0, mask)
+            return self._states(told, x_1, rng, self._sampler(sampler or "ddim"), 1 if steps is None else steps)
+        if method == "repaint":
+            return repaint.repaint(
+                self.denoiser, x_1, x_0, mask, rng, steps=32 if steps is None else steps, resamples=resamples
+            )
+        levels, per_level, rate = self._annealing(steps)
+        return langevin.langevin_posterior(
+            self.denoiser, x_1, x_0, mask, rng, levels=levels, steps=per_level, rate=rate, grid=even_log_snr
+        )
+
+    def _states(self, denoiser: Denoiser, x_1: Tensor, rng: Rng, sampler: str, steps: int) -> Iterator[State]:
+        if sampler != "langevin":
+            return sample(denoiser, x_1, STEPS[sampler], steps, rng)
+        levels, per_level, rate = self._annealing(steps)
+        return langevin.langevin(denoiser, x_1, rng, levels, per_level, rate, even_log_snr)
+
+    def _start(self, x: Tensor, rng: Rng, annealed: bool) -> Tensor:
+        """x_1 like x: LiDARGen's chains, and only those, begin at uniform noise between the limits of the data."""
+        if annealed and self.experiment.score is not None:
+            return langevin.starting_uniform(x, rng, -1, 1)
+        return starting_noise(self.denoiser, x, rng)
+
+    def _annealing(self, calls: int | None) -> tuple[int, int, float]:
+        """Noise levels, Langevin steps at each and their rate, for at most `calls` network calls; None = all levels."""
+        score = self.experiment.score or Score()
+        levels = score.levels if calls is None else langevin.levels_within(calls, score.steps)
+        return levels, score.steps, score.rate
+
+    def _langevin_calls(self, calls: int | None) -> int:
+        levels, per_level, _ = self._annealing(calls)
+        return langevin.evaluations(levels, per_level)
+
+    def _image(self, x_0: Tensor) -> RangeImage:
+        """x_0 (2, H, W) as an image; mixed pixels are mended if `data.mend`, R2DM's stay as published."""
+        image = from_x_0(x_0, self.sensor, self.experiment.data.codec)
+        return without_mixed_pixels(image) if self.conditional and self.experiment.data.mend else image
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def _blank(self, count: int) -> Tensor:
+        return torch.zeros(count, 2, self.sensor.height, self.sensor.width, device=self._device)
+
+
+def _last(states: Iterator[State], on_step: OnStep, calls: int | None = None) -> Tensor:
+    """Run the sampler to its end; (B, 2, H, W). States behind the first `calls` took no network step."""
+    state = None
+    for index, state in enumerate(states):  # noqa: B007, the last one counts
+        if on_step is not None and (calls is None or index < calls):
+            on_step()
+    assert state is not None
+    return state.x_s

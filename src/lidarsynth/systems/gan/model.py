@@ -1,0 +1,181 @@
+"""`GanModel`, the model of a GAN: scans from one evaluation each, and completion by inversion of its generator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.diffusion.samplers import generators
+from lidarsynth.experiment.record import Adversarial, Experiment
+from lidarsynth.lidar.depth import from_x_0
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.networks.gan.inverse_depth import to_inverse_depth
+from lidarsynth.networks.gan.inversion import invert, unit_rms
+from lidarsynth.networks.gan.scan_generator import ScanGenerator
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, known_pixels, with_known
+
+METHODS = ("auto", "inversion")
+STEPS = 500  # of an inversion, as published
+
+
+@dataclass(frozen=True)
+class GanModel(ScanModel):
+    """A trained GAN with its sensor: Vanilla GAN, DUSty v1 or DUSty v2. It knows range only: reflectance is 0.
+
+    network  (latents (B, Z), uniform noise) -> images (B, 1, H, W) of inverse depth
+    """
+
+    network: ScanGenerator
+    sensor: Sensor
+    experiment: Experiment
+
+    def into(self, sensor: Sensor | str) -> GanModel:
+        """The same weights with images of another sensor, for DUSty v2, which renders any ray angles.
+
+        Raises ValueError for the other two, and for sizes that are no multiples of 16, at least 32.
+        """
+        sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
+        if self.network.angles is None:
+            raise ValueError(f"{self.experiment.name}: expected images of {self.sensor.name}, since only dusty-v2 "
+                             f"renders any rays, found {sensor.name}")  # fmt: skip
+        if sensor.height % 16 or sensor.width % 16 or min(sensor.height, sensor.width) < 32:
+            raise ValueError(f"{self.experiment.name}: expected beams and columns divisible by 16, at least 32, "
+                             f"found {sensor.height} x {sensor.width}")  # fmt: skip
+        angles = torch.from_numpy(sensor.ray_angles())[None].to(self._device)
+        network = ScanGenerator(self.network.generator, angles).eval()
+        return GanModel(network, sensor, imaged_by(self.experiment, sensor))
+
+    def stream(
+        self,
+        n: int,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Scans `first` .. n - 1 of `generate`, of one evaluation each, in the memory of one batch.
+
+        Whether a ray returns is decided by the same noise in all scans, as in DUSty's evaluation. Raises ValueError for
+        a sampler, for more than one step and for counts below 1.
+        """
+        self.generation_steps(steps, sampler)
+        if n < 1 or batch_size < 1:
+            raise ValueError(f"expected n and batch_size of at least 1, found {n} and {batch_size}")
+        fixed = torch.Generator().manual_seed(0)
+        uniform = torch.rand(1, 1, *self._size, generator=fixed).to(self._device)
+        for start in range(first, n, batch_size):
+            streams = generators(seed, min(batch_size, n - start), offset=start)
+            z = torch.stack([self._latent(rng) for rng in streams])
+            with torch.no_grad():
+                images = self.network(z.to(self._device), uniform).image
+            if on_step is not None:
+                on_step()
+            yield from map(self._image, images)
+
+    def complete(
+        self,
+        scan: Scan | RangeImage,
+        known: np.ndarray | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int = 10,
+        sampler: str | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """Fill what was not measured by the image that agrees best with it: inversion, i.e. auto-decoding.
+
+        scan    points, or an image of this model's sensor
+        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
+        steps   of the optimiser; default 500
+
+        Measured pixels come back exactly as they were, in metres; reflectance is 0 everywhere, since the network knows
+        none. Filled pixels are those that return more likely than not. Raises ValueError for other methods, for a
+        sampler, and when nothing is measured.
+        """
+        self._refuse(sampler)
+        steps = self.evaluations(method, steps)
+        image = self.image_of(scan)
+        known = known_pixels(image, known)
+        w = self._inverted(image, known & image.mask, steps, torch.Generator().manual_seed(seed), on_step)
+        with torch.no_grad():
+            images = self.network.synthesize(w, torch.full((1, 1, 1, 1), 0.5, device=self._device)).image
+        return with_known(self._image(images[0]), image, known, keep_reflectance=False)
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """1, how often `generate` evaluates the network per batch. Raises ValueError for other wishes."""
+        self._refuse(sampler)
+        if steps not in (None, 1):
+            raise ValueError(f"{self.experiment.name}: expected no steps, since a GAN takes one, found {steps}")
+        return 1
+
+    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
+        """How many steps the optimiser of `complete` takes. Raises ValueError for other methods."""
+        if method not in METHODS:
+            raise ValueError(f"{self.experiment.name}: expected a method of {', '.join(METHODS)}, found {method!r}")
+        if steps is not None and steps < 1:
+            raise ValueError(f"expected steps of at least 1, found {steps}")
+        return STEPS if steps is None else steps
+
+    def _refuse(self, sampler: str | None) -> None:
+        if sampler is not None:
+            raise ValueError(f"{self.experiment.name}: expected no sampler, since a GAN has none, found {sampler!r}")
+
+    def _inverted(
+        self, image: RangeImage, measured: np.ndarray, steps: int, rng: torch.Generator, on_step: OnStep
+    ) -> Tensor:
+        """Styles (1, D) whose image before ray-drop agrees with the `measured` (H, W) pixels.
+
+        Of DUSty v2 from the mean style on, as published; the styles of the others are latents, kept where N(0, I) is.
+        """
+        if not measured.any():
+            raise ValueError("expected at least one known pixel with a return, found none")
+        mapped, limits = self.network.angles is not None, (self.sensor.min_range, self.sensor.max_range)
+        with torch.no_grad():
+            w = self.network.mean_style(rng) if mapped else unit_rms(self._latent(rng)[None]).to(self._device)
+        depth = torch.from_numpy(np.where(measured, image.range, np.float32(0)))[None, None].to(self._device)
+        reference = to_inverse_depth(depth, *limits)
+        mask, project = reference.gt(0).float(), None if mapped else unit_rms
+        with torch.inference_mode(False), torch.enable_grad():  # also where the caller wants none
+            for fit in invert(self._renderer(), w, reference, mask, limits, steps, project=project):
+                w = fit.latents
+                if fit.step and on_step is not None:
+                    on_step()
+        return w
+
+    def _renderer(self) -> Callable[[Tensor], Tensor]:
+        """Styles (1, D) -> min_range / depth before ray-drop, as 2x - 1, (1, 1, H, W)."""
+        noise = torch.full((1, 1, 1, 1), 0.5, device=self._device)  # not looked at before ray-drop
+        farthest = 0.0  # min_range / depth where the code is 0
+        if self.experiment.data.codec == "inverse-minmax":
+            farthest = self.sensor.min_range / self.sensor.max_range
+
+        def render(w: Tensor) -> Tensor:
+            return 1 - (1 - self.network.synthesize(w, noise).image_orig) * (1 - farthest)
+
+        return render
+
+    def _image(self, x: Tensor) -> RangeImage:
+        """Code (1, H, W) in [-1, 1] as an image without reflectance."""
+        empty = (self.experiment.adversarial or Adversarial()).empty_below
+        code = torch.where((x + 1) / 2 > empty, x, -1.0)
+        return from_x_0(torch.cat([code, torch.full_like(x, -1)]), self.sensor, self.experiment.data.codec)
+
+    def _latent(self, rng: torch.Generator) -> Tensor:
+        """(Z,) ~ N(0, I), on the CPU."""
+        return torch.randn(self.network.latent_channels, generator=rng)
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.sensor.height, self.sensor.width
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.network.parameters()).device

@@ -1,0 +1,202 @@
+"""What every model of scans can do, whatever its network, and how scans come into its images and back."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import torch
+from torch import nn
+
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.systems.hub import push
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+OnStep = Callable[[], object] | None  # called after every network step, for progress bars
+
+
+class ScanModel(ABC):
+    """A trained model with its sensor, as `load` returns it.
+
+    network     the bare torch module
+    sensor      the beams and columns of its images
+    experiment  what it is and how it was trained
+
+    Each kind is a frozen record of these and of what else it needs. One that cannot do what is asked, such as a GAN
+    that is asked for a number of steps, raises ValueError. `steps`, `sampler` and `method` of None or `auto` are the
+    model's own.
+    """
+
+    network: nn.Module
+    sensor: Sensor
+    experiment: Experiment
+    kind: ClassVar[str] = "one that completes scans"  # said of those that generate nothing
+
+    def to(self, device: str | torch.device) -> Self:
+        """The same model with its network on another device."""
+        self.network.to(device)
+        return self
+
+    def generate(
+        self,
+        n: int = 1,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        on_step: OnStep = None,
+    ) -> list[RangeImage]:
+        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
+
+        Raises ValueError as `stream` does.
+        """
+        return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
+
+    def stream(
+        self,
+        n: int,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
+
+        Raises ValueError where the model only completes scans.
+        """
+        raise self._generates_nothing()
+
+    @abstractmethod
+    def complete(
+        self,
+        scan: Scan | RangeImage,
+        known: np.ndarray | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int = 10,
+        sampler: str | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """Fill what was not measured; pixels of `known` (H, W) bool come back exactly as they were."""
+
+    def upsample(
+        self,
+        scan: Scan,
+        sensor_in: Sensor | str | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor.
+
+        sensor_in  the sensor that made the scan; None = recognised from the points. Its beams tell which rows of the
+                   image were looked at; points outside this model's view are left out.
+
+        Raises ValueError when the sensor is not recognised or sees nothing that the model does.
+        """
+        image, known = sparse_image(scan, sensor_that_made(scan, sensor_in), self.sensor)
+        return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
+
+    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
+        """The scan in this model's image. Raises ValueError for an image of another size."""
+        if isinstance(scan, Scan):
+            return project(scan, self.sensor, self.experiment.data.projection)
+        if scan.shape != (self.sensor.height, self.sensor.width):
+            raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
+        return scan
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """How often `generate` calls `on_step` per batch. Raises ValueError as `stream` does."""
+        raise self._generates_nothing()
+
+    @abstractmethod
+    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
+        """How often `complete` calls `on_step`."""
+
+    def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
+        """Upload the model, with a card filled in from its experiment, to `owner/name` of the Hugging Face hub.
+
+        half  weights in float16, at half the size
+
+        Returns the address; `load("owner/name")` then gives the model anywhere. Needs the extra `hub` and a token.
+        Raises ValueError in one line when the hub refuses or cannot be reached.
+        """
+        return push(self.experiment, self.network, repo_id, private, half)
+
+    def _generates_nothing(self) -> ValueError:
+        return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found "
+                          f"{self.kind}; use complete or upsample")  # fmt: skip
+
+
+def imaged_by(experiment: Experiment, sensor: Sensor) -> Experiment:
+    """The experiment with images of another sensor."""
+    return with_fields(
+        experiment,
+        {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width},
+    )
+
+
+def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
+    """(H, W) bool: the given pixels, or the measured ones. Raises ValueError for another shape or type."""
+    known = image.mask if known is None else known
+    if known.shape != image.shape or known.dtype != np.bool_:
+        raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
+    return known
+
+
+def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
+    """The given sensor, or as recognised from the points. Raises ValueError when it is not."""
+    if sensor_in is None:
+        sensor_in, reason = recognise(scan)
+        if sensor_in is None:
+            raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
+    return get_sensor(sensor_in) if isinstance(sensor_in, str) else sensor_in
+
+
+def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeImage, np.ndarray]:
+    """A scan of `sensor_in` in the image of `sensor`, and which pixels it looked at: (H, W) bool.
+
+    A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
+    in that direction. Raises ValueError when no point falls into the image.
+    """
+    image = project(replace(scan, ring=None), sensor, "spherical")
+    if not image.mask.any():
+        raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
+    own = project(scan, sensor_in, "auto", width=sensor.width)
+    gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
+    # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.
+    beams = np.flatnonzero((gap.min(axis=1) < 0.5) & (own.mask.mean(axis=1) > 0.02))
+    known = image.mask.copy()
+    # A beam of fewer returns a turn than columns leaves gaps: empty is what has no return within two columns.
+    answered = np.any([np.roll(own.mask, shift, axis=1) for shift in range(-2, 3)], axis=0)
+    for beam in beams:
+        known[gap[beam].argmin()] |= ~answered[beam]
+    return image, known
+
+
+def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
+    """The filled image with every known pixel replaced by its measurement, bit by bit."""
+    measured = known & image.mask
+    mask = np.where(known, image.mask, filled.mask)
+    reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
+    points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
+    return RangeImage(
+        range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
+        reflectance=np.where(mask, reflectance, 0).astype(np.float32),
+        mask=mask,
+        sensor=filled.sensor,
+        xyz=points,
+    )

@@ -1,0 +1,48 @@
+"""Looks at a run from time to time: judges the averaged weights on fixed images and draws pictures of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import nn
+
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.training.examples import SYNTHETIC, Streets, open_images
+from lidarsynth.training.journal import Journal
+from lidarsynth.training.task import Task
+
+VALIDATION_SEED = 1_000_003  # of streets that are never trained on
+IMAGES = 16
+
+
+class Monitor:
+    """Looks at images that are not trained on where there are such.
+
+    data        what is trained on: a cache, or `synthetic`, for which streets of another seed are held out
+    validation  cache of images that are not trained on; without one, a cache's curves are called `training_images`
+    """
+
+    def __init__(self, experiment: Experiment, task: Task, data: str | Path, validation: str | Path | None = None):
+        self._experiment = experiment
+        self._task = task
+        self._source = validation or data
+        held_out = validation is not None or str(data) == SYNTHETIC
+        self._name = "validation" if held_out else "training_images"
+        self._images: list[RangeImage] = []
+
+    def look(self, network: nn.Module, step: int, journal: Journal) -> None:
+        """The task's numbers and pictures of the averaged weights, into the journal."""
+        self._images = self._images or _spread(self._experiment, self._source)
+        values = self._task.judge(self._experiment, network, self._images)
+        journal.curves(step, {f"{self._name}/{name}": value for name, value in values.items()})
+        journal.pictures(step, "sample", self._task.pictures(self._experiment, network, self._images))
+
+
+def _spread(experiment: Experiment, source: str | Path) -> list[RangeImage]:
+    """At most IMAGES images from everywhere in a cache, or as many streets."""
+    images = open_images(source, experiment, VALIDATION_SEED)
+    if isinstance(images, Streets):
+        return images.take(images.indices(0, IMAGES))
+    count = min(IMAGES, len(images))
+    return images.take([i * len(images) // count for i in range(count)])

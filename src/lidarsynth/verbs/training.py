@@ -1,0 +1,204 @@
+"""One training run in a folder: fresh, from other weights, or continued; what `lidarsynth train` does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from lidarsynth.data.index import PLACE
+from lidarsynth.experiment.folder import read_experiment
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Card, Experiment, with_fields
+from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.build import build_network
+from lidarsynth.systems.finetune import transfer
+from lidarsynth.systems.tasks import task_of
+from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
+from lidarsynth.training.examples import Learned, Streets, open_images
+from lidarsynth.training.journal import Journal
+from lidarsynth.training.loop import Progress, Run, start, train
+from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
+from lidarsynth.training.monitor import Monitor
+from lidarsynth.training.options import Options
+from lidarsynth.weights.load import load_parts
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+
+def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str | Path | None = None) -> Experiment:
+    """A preset with `group.field=value` changes, values in JSON or bare words, for the images of cache `data`.
+
+    Sensor, resolution and projection are the cache's, unless `changes` name them. Raises ValueError by name.
+    """
+    chosen: dict[str, Any] = {"training.seed": seed}
+    for change in changes:
+        path, equals, text = change.partition("=")
+        if not equals:
+            raise ValueError(f"expected group.field=value, such as training.steps=1000, found {change!r}")
+        try:
+            chosen[path] = json.loads(text)
+        except json.JSONDecodeError:
+            chosen[path] = text
+    experiment = with_fields(preset(name), chosen)
+    return experiment if data is None else _for_images(experiment, data, set(chosen))
+
+
+def _for_images(experiment: Experiment, data: str | Path, chosen: set[str]) -> Experiment:
+    """The experiment with the projection and the sensor of the images, unless the user chose those fields."""
+    images = open_images(data, experiment)
+    projection, drawn = experiment.data.projection, images.source.get("projection", experiment.data.projection)
+    if "data.projection" not in chosen and (projection, drawn) != ("auto", "unfolding"):  # auto unfolds what it can
+        experiment = with_fields(experiment, {"data.projection": drawn})
+    found, expected = images.sensor, build_sensor(experiment)
+    shape, (height, width) = (found.height, found.width), (expected.height, expected.width)
+    own = bool(chosen & {"data.sensor", "data.height", "data.width"})
+    if own and shape != (height, width):
+        raise ValueError(f"{data}: expected images of {height} x {width}, found {shape[0]} x {shape[1]}")
+    if own or found == expected:
+        return experiment
+    words = [w for w, s in SENSORS.items() if s.height % found.height == 0 and s.resized(*shape) == found]
+    sensor = words[0] if words else found.to_dict()
+    return with_fields(experiment, {"data.sensor": sensor, "data.height": shape[0], "data.width": shape[1]})
+
+
+def run(
+    experiment: Experiment,
+    data: str | Path,
+    out: str | Path,
+    weights: str | None = None,
+    validation: str | Path | None = None,
+    options: Options | None = None,
+    resume: bool = False,
+) -> Iterator[Progress]:
+    """Train on a cache, or on `synthetic` streets, into folder `out`; in the main process, yield after every step.
+
+    The first yield says where the run stands: at 0, or at the step of the newest checkpoint; that is continued exactly.
+    weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet
+    validation  cache of images that are not trained on
+    resume      insist that there is a checkpoint
+
+    SIGTERM or Ctrl-C saves after the present step and ends the iteration. Raises ValueError when experiment, images,
+    weights or folder do not fit; FloatingPointError, naming step, scans and last checkpoint, when it is not finite.
+    """
+    options = options or Options()
+    out, accelerator = Path(out), accelerator_of(options)
+    images = open_images(data, experiment)
+    experiment, state = _begin(experiment, images, out, weights, resume, accelerator)
+    if accelerator.is_main_process:
+        yield Progress(state.step, {}, 0.0, 0.0)
+    monitor = Monitor(experiment, state.task, data, validation)
+    with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
+        for progress in _named(train(experiment, state, images, options, accelerator), out):
+            stop = any_process(accelerator, bool(received))
+            if journal:
+                journal.step(progress)
+                if stop or _due(progress.step, options.save_every, experiment):
+                    save_checkpoint(out, _with_history(experiment, state.step, accelerator), state, options.keep)
+                if not stop and options.sample_every and _due(progress.step, options.sample_every, experiment):
+                    monitor.look(state.ema, state.step, journal)
+                yield progress
+            if stop:
+                break
+    accelerator.end_training()
+
+
+def _begin(
+    experiment: Experiment,
+    images: Learned,
+    out: Path,
+    weights: str | None,
+    resume: bool,
+    accelerator: Accelerator,
+) -> tuple[Experiment, Run]:
+    """The experiment with its card, and the run: fresh, from weights, or as the newest checkpoint has it."""
+    found, expected = images.sensor, build_sensor(experiment)
+    if (found.height, found.width) != (expected.height, expected.width):
+        raise ValueError(f"{images.source}: expected images of {expected.height} x {expected.width}, "
+                         f"found {found.height} x {found.width}")  # fmt: skip
+    with fixed_randomness(experiment.training.seed):
+        network = build_network(experiment)
+    card = replace(experiment.card, data=_learned_from(images))
+    saved = checkpoints(out)
+    if resume and not saved:
+        raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
+    if weights and not saved:
+        source, trained = load_parts(weights)
+        transfer(network, experiment, trained, source, weights)
+        learned = "; ".join(filter(None, (source.card.data, card.data)))
+        licence = card.licence or source.card.licence
+        card = Card(licence, learned, (*source.card.history, f"from {source.name}"))
+    state = start(experiment, network, task_of(experiment), accelerator.scaler)
+    if saved:
+        card = _same_experiment(saved[-1], experiment).card
+        # The history's last line is this run's, written anew at each checkpoint.
+        card = replace(card, history=card.history[:-1], licence=experiment.card.licence or card.licence)
+        load_run(saved[-1] / STATE, state)
+    elif accelerator.is_main_process:
+        out.mkdir(parents=True, exist_ok=True)
+        sweep(out)
+    accelerator.wait_for_everyone()
+    return replace(experiment, card=card), state
+
+
+def _learned_from(images: Learned) -> str:
+    """What a card says of the images: how many of what, and not where they lie on this disk."""
+    count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
+    details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
+    return ", ".join([f"{count} images of {images.source['name']}", *details])
+
+
+def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
+    """The checkpoint's record. Raises ValueError that names the first field that differs."""
+    found = read_experiment(checkpoint)
+    if replace(found, card=experiment.card) != experiment:
+        theirs, ours = (_flat(e.to_dict()) for e in (found, experiment))
+        key = next(key for key in ours if key.partition(".")[0] != "card" and ours[key] != theirs.get(key))
+        raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {theirs.get(key)!r:.60}, "
+                         f"found {ours[key]!r:.60}; another folder begins a new run")  # fmt: skip
+    return found
+
+
+def _flat(record: dict) -> dict:
+    groups = {key: value if isinstance(value, dict) else {"": value} for key, value in record.items()}
+    return {f"{group}.{key}".rstrip("."): value for group, part in groups.items() for key, value in part.items()}
+
+
+def _with_history(experiment: Experiment, step: int, accelerator: Accelerator) -> Experiment:
+    device = torch.cuda.get_device_name() if accelerator.device.type == "cuda" else accelerator.device.type
+    line = f"{step:,} steps of {experiment.training.batch_size} on {accelerator.num_processes} x {device}"
+    return replace(experiment, card=replace(experiment.card, history=(*experiment.card.history, line)))
+
+
+def _due(step: int, every: int, experiment: Experiment) -> bool:
+    return step % every == 0 or step == experiment.training.steps
+
+
+def _named(steps: Iterator[Progress], out: Path) -> Iterator[Progress]:
+    """The same steps; a loss that is not finite also names the last good checkpoint."""
+    try:
+        yield from steps
+    except FloatingPointError as error:
+        raise FloatingPointError(f"{error}; last good checkpoint: {(checkpoints(out) or ['none'])[-1]}") from None
+
+
+@contextmanager
+def _journal(
+    experiment: Experiment, out: Path, step: int, options: Options, accelerator: Accelerator
+) -> Iterator[Journal | None]:
+    """The main process's journal; None in the others."""
+    if not accelerator.is_main_process:
+        yield None
+        return
+    parts = task_of(experiment).parts
+    with closing(
+        Journal(out, step, experiment.training.batch_size, options.log_every, options.wandb, parts)
+    ) as journal:
+        yield journal

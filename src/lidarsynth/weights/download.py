@@ -1,0 +1,91 @@
+"""Releases are downloaded once into the user's cache and continue where they were interrupted."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
+from pathlib import Path
+from typing import BinaryIO
+
+OnBytes = Callable[[int, "int | None"], object]  # called with (bytes so far, bytes in all or None if not known)
+
+
+def cache_folder() -> Path:
+    """Where releases are kept: LIDARSYNTH_CACHE, or ~/.cache/lidarsynth."""
+    return Path(os.environ.get("LIDARSYNTH_CACHE") or Path.home() / ".cache" / "lidarsynth")
+
+
+def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
+    """Fetch `url` into `path`, yielding (bytes so far, bytes in all or None if not told); nothing if it is there.
+
+    The bytes gather in `<path>.part`, which moves into place when it is complete; after an interruption, the next call
+    continues there. Raises ValueError that says where to put the file by hand.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    if path.is_file():
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()
+        # Written in place, not appended: two processes that fetch the same file write the same bytes.
+        with part.open("r+b") as file:
+            yield from _receive(url, file)
+        os.replace(part, path)
+    except (OSError, http.client.HTTPException) as error:
+        if path.is_file():  # another process was faster
+            return
+        place = f"without a network, put the file at {path}"
+        raise ValueError(f"{url}: expected a download, found {_reason(error)}; {place}") from None
+
+
+def _receive(url: str, file: BinaryIO) -> Iterator[tuple[int, int | None]]:
+    """Continue `file` to the end of `url`; from the start where the server cannot continue."""
+    # The last byte is asked for again, so that a complete file is answered like any other.
+    start = max(file.seek(0, os.SEEK_END) - 1, 0)
+    with _reply(url, start) as reply:
+        done, total = _extent(reply)
+        file.seek(done)
+        yield done, total
+        while chunk := reply.read(1 << 20):
+            file.write(chunk)
+            done += len(chunk)
+            yield done, total
+    if total is not None and done != total:
+        raise ConnectionError(f"only {done} of {total} bytes")
+    file.truncate(done)  # the rest, if any, is of an older and longer file
+
+
+def _reply(url: str, start: int) -> http.client.HTTPResponse:
+    try:
+        return urllib.request.urlopen(urllib.request.Request(url, headers={"Range": f"bytes={start}-"}), timeout=30)
+    except urllib.error.HTTPError as error:
+        if error.code != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+            raise
+        error.close()
+        return urllib.request.urlopen(url, timeout=30)
+
+
+def _extent(reply: http.client.HTTPResponse) -> tuple[int, int | None]:
+    """First byte of a reply, and bytes of the whole file or None if not told."""
+    length = reply.headers["Content-Length"]
+    if reply.status != HTTPStatus.PARTIAL_CONTENT:
+        return 0, None if length is None else int(length)
+    told = reply.headers["Content-Range"] or ""  # bytes FIRST-LAST/TOTAL
+    match = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", told)
+    if match is None:
+        raise ConnectionError(f"an answer with Content-Range {told!r}")
+    return int(match[1]), None if match[2] == "*" else int(match[2])
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, urllib.error.HTTPError):
+        error.close()
+    elif isinstance(error, urllib.error.URLError):
+        return str(error.reason)
+    return str(error)
