@@ -40,7 +40,7 @@ ROOMS = (
 )
 CORE = {"torch", "numpy", "einops", "safetensors", "tyro", "tqdm", "PIL", "tomli"}  # pyproject's dependencies
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
-PURE = {
+PURE = {"experiment/record", "experiment/presets", "experiment/upsampling_presets"}  # no torch, no numpy, no lidar
     "experiment/record",
     "experiment/presets",
     "experiment/upsampling_presets",
