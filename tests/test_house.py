@@ -41,10 +41,6 @@ ROOMS = (
 CORE = {"torch", "numpy", "einops", "safetensors", "tyro", "tqdm", "PIL", "tomli"}  # pyproject's dependencies
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
 PURE = {"experiment/record", "experiment/presets", "experiment/upsampling_presets"}  # no torch, no numpy, no lidar
-    "experiment/record",
-    "experiment/presets",
-    "experiment/upsampling_presets",
-}  # no torch, no numpy, no lidar: they read in milliseconds
 SPEAKERS = {"cli/terminal.py", "__main__.py"}  # the only ones that print and set the exit code
 
 
