@@ -1,0 +1,116 @@
+"""The coarse stage of generation: a few beams and columns of any sensor, where a street's layout is decided."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.efficient_unet import EfficientUNet
+from lidarsynth.networks.rays import decode_range, encode_range, ground_range, level_sines
+
+ROWS, COLUMNS = 16, 128
+RAY_CHANNELS = 8
+LOWEST, BINS = -32, 61  # degrees of the standard's first bin, and how many of one degree there are
+STANDARD_MOUNT = 1.73  # metres
+
+
+def grid_rows(height: int, first: float = 0.5) -> np.ndarray:
+    """Which of `height` >= 16 beams the coarse stage sees: 16, evenly, from the share `first` of a step on."""
+    return np.floor((np.arange(ROWS) + first) * height / ROWS).astype(int)
+
+
+def grid_columns(width: int, first: float = 0.5) -> np.ndarray:
+    """Which of `width` columns it sees: 128, evenly."""
+    return np.floor((np.arange(COLUMNS) + first) * width / COLUMNS).astype(int)
+
+
+def grid_rays(sensor: Sensor, blocked: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[Tensor, Tensor]:
+    """What the network is told of the rays, (8, 16, 128), and their standing elevations (16, 128) in radians.
+
+    Elevation, ground, steps to the beams above and below, azimuth, blocked, and the sensor's limit. The standing
+    elevation is that at which a sensor 1.73 m up sees the same spot of flat ground.
+    """
+    elevation = np.radians(np.asarray(sensor.elevations))[rows]
+    azimuth = sensor.ray_angles()[1, 0, columns].astype(np.float64)
+    mount = (sensor.mount + np.asarray(sensor.offsets or np.zeros(sensor.height))[rows])[:, None]
+    sine = np.clip(level_sines(sensor, elevation, azimuth), -1, 1)
+    step = np.degrees(np.abs(np.diff(elevation)))
+    up, down = (np.log2(s / 1.6 + 0.1)[:, None] / 2 for s in (np.append(0, step), np.append(step, 0)))
+    ground = torch.from_numpy(ground_range(sine, mount))
+    limit = math.log2(min(sensor.max_range, 250) + 1) / 4 - 1
+    parts = (3 * elevation[:, None], 2 * encode_range(ground).numpy(), up, down, np.sin(azimuth)[None],
+             np.cos(azimuth)[None], blocked[np.ix_(rows, columns)], limit)  # fmt: skip
+    told = np.stack([np.broadcast_to(part, (ROWS, COLUMNS)) for part in parts]).astype(np.float32)
+    standing = np.arcsin(np.clip(sine * STANDARD_MOUNT / mount, -1, 1)).astype(np.float32)
+    return torch.from_numpy(told), torch.from_numpy(standing)
+
+
+class CoarseUNet(nn.Module):
+    """`forward(x_t (B, 3, 16, 128), log_snr (B,), rays (B, 8, 16, 128)) -> velocity (B, 3, 16, 128)`.
+
+    Channels of x_0: range code and reflectance, each standardised by its mean and spread at the ray's standing
+    elevation (buffer `standard`), and +1 where the ray returned, -1 where not; empty pixels hold their left
+    neighbour's values. Else unit noise would drown the ground, whose code spreads by 0.03 near the car and by 0.27 at
+    the horizon.
+    """
+
+    standard: Tensor
+
+    def __init__(self, base_channels: int = 64, multipliers: tuple[int, ...] = (1, 2, 4, 4), blocks: int = 2):
+        super().__init__()
+        self.unet = EfficientUNet(
+            3 + RAY_CHANNELS,
+            3,
+            (ROWS, COLUMNS),
+            base_channels,
+            channel_multipliers=multipliers,
+            num_residual_blocks=(blocks,) * 4,
+            coords_encoding=None,
+            stem=(2, 2),
+        )
+        self.register_buffer("standard", torch.stack([torch.zeros(2, BINS), torch.ones(2, BINS)]))
+
+    def forward(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
+        x = torch.cat([x_t, rays], 1).contiguous(memory_format=torch.channels_last)
+        return self.unet(x, log_snr)
+
+    def standards(self, standing: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and spread (B, 2, H, W) of range code and of 2 reflectance - 1, at standing elevations (B, H, W)."""
+        place = (torch.rad2deg(standing) - LOWEST).clamp(0, BINS - 1.001)
+        low = place.long()
+        share = (place - low)[:, None]
+        mean, spread = (
+            table[:, low].transpose(0, 1) * (1 - share) + table[:, low + 1].transpose(0, 1) * share
+            for table in self.standard
+        )
+        return mean, spread
+
+    def encode(self, metres: Tensor, reflectance: Tensor, standing: Tensor) -> Tensor:
+        """x_0 (B, 3, H, W) of metres (B, H, W), 0 where nothing returned, and reflectance (B, H, W) in [0, 1]."""
+        mean, spread = self.standards(standing)
+        returned = metres > 0
+        values = (torch.stack([encode_range(metres), 2 * reflectance - 1], 1) - mean) / spread
+        return torch.cat([left_filled(values, returned), 2 * returned[:, None].float() - 1], 1)
+
+    def decode(self, x_0: Tensor, standing: Tensor) -> tuple[Tensor, Tensor]:
+        """Metres, 0 where nothing returned, and reflectance, each (B, H, W), of x_0 (B, 3, H, W)."""
+        mean, spread = self.standards(standing)
+        code, reflectance = (x_0[:, :2] * spread + mean).unbind(1)
+        returned = x_0[:, 2] > 0
+        return decode_range(code) * returned, ((reflectance + 1) / 2).clamp(0, 1) * returned
+
+
+def left_filled(values: Tensor, returned: Tensor) -> Tensor:
+    """(B, C, H, W) with the values of the nearest return to the left, around the turn, where not `returned` (B, H, W).
+
+    0 in rows without a return.
+    """
+    width = returned.shape[-1]
+    place = torch.where(returned, torch.arange(width, device=returned.device), -1).cummax(-1).values
+    place = torch.where(place < 0, place[..., -1:], place)
+    source = place.clamp(min=0)[:, None].expand_as(values)
+    return values.gather(3, source) * (place >= 0)[:, None]

@@ -1,0 +1,198 @@
+"""One network for any sensor: told known pixels and the geometry of the rays, it fills in the others in one step."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarsynth.networks.candidates import RANGE_CANDIDATES, REFLECTANCE_CANDIDATES, Candidates, candidates
+from lidarsynth.networks.rays import Rays, encode_range
+
+STEM = (4, 2)  # rows, columns of the patches that become channels
+NOISES = 3  # per pixel, along a ring, in patches
+INPUTS = 29
+OUTPUTS = (RANGE_CANDIDATES + 2) + (REFLECTANCE_CANDIDATES + 1 + NOISES) + (1 + NOISES)
+PRIOR = 2.0  # score of the first guess before any training
+
+
+class Known(NamedTuple):
+    """What is known of B images, (B, 1, H, W) each: metres, reflectance in [0, 1], and three masks.
+
+    told: the pixel is known; returned: it is known and a return; lit: its reflectance is known too.
+    """
+
+    metres: Tensor
+    reflectance: Tensor
+    told: Tensor
+    returned: Tensor
+    lit: Tensor
+
+
+class Filled(NamedTuple):
+    """code: range if the ray returns, in [-1, 1]; reflectance; logit: of returning. (B, 1, H, W) each."""
+
+    code: Tensor
+    reflectance: Tensor
+    logit: Tensor
+
+
+class Block(nn.Module):
+    """Normalise, silu, convolve twice, add: (B, C, H, W) -> (B, D, H, W); the width is a ring, the height has ends."""
+
+    def __init__(self, channels: int, out: int, groups: int = 8):
+        super().__init__()
+        self.norm = nn.GroupNorm(groups, channels)
+        self.first = nn.Conv2d(channels, out, 3, padding=(1, 0))
+        self.second = nn.Conv2d(out, out, 3, padding=(1, 0))
+        self.skip = Pointwise(channels, out) if channels != out else nn.Identity()
+        nn.init.normal_(self.second.weight, std=0.1 / math.sqrt(9 * out))
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = ring(F.silu(self.norm(x)), 2)
+        return self.skip(x) + self.second(F.silu(self.first(h)))
+
+
+class Pointwise(nn.Linear):
+    """A 1 x 1 convolution of (B, C, H, W) in channels-last memory, as one matrix product."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class Halve(nn.Module):
+    """(B, C, H, W) -> (B, D, H/2, W/2): patches of 2 x 2 through one matrix."""
+
+    def __init__(self, channels: int, out: int):
+        super().__init__()
+        self.mix = nn.Linear(4 * channels, out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        b, c, h, w = x.shape
+        x = x.permute(0, 2, 3, 1).reshape(b, h // 2, 2, w // 2, 2 * c).transpose(2, 3).reshape(b, h // 2, w // 2, 4 * c)
+        return self.mix(x).permute(0, 3, 1, 2)
+
+
+def ring(x: Tensor, columns: int) -> Tensor:
+    """(B, C, H, W) with `columns` of the other end on either side."""
+    return torch.cat([x[..., -columns:], x, x[..., :columns]], -1)
+
+
+class FillUNet(nn.Module):
+    """`forward(known, rays, noise) -> Filled`, for any number of beams in multiples of 32 and columns of 16.
+
+    noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
+    the grain of a recorded scan. For each pixel the network chooses among `candidates` by a softmax, corrects the
+    choice, and says whether the ray returns at all.
+    """
+
+    def __init__(self, widths: tuple[int, ...] = (64, 96, 128, 160), blocks: tuple[int, ...] = (1, 1, 2, 2)):
+        super().__init__()
+        patch = STEM[0] * STEM[1]
+        self.stem = Pointwise(INPUTS * patch, widths[0])
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        for i, (width, count) in enumerate(zip(widths, blocks, strict=True)):
+            self.down.append(nn.ModuleList(Block(width, width) for _ in range(count)))
+            if i + 1 < len(widths):
+                self.down.append(Halve(width, widths[i + 1]))
+        for i in range(len(widths) - 2, -1, -1):
+            self.up.append(Pointwise(widths[i + 1], widths[i]))
+            joined = [2 * widths[i]] + [widths[i]] * (blocks[i] - 1)
+            self.up.append(nn.ModuleList(Block(width, widths[i]) for width in joined))
+        self.head = Pointwise(2 * widths[0], 2 * widths[0])
+        self.out = Pointwise(2 * widths[0], OUTPUTS * patch)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, known: Known, rays: Rays, noise: Tensor) -> Filled:
+        with torch.no_grad():
+            guesses = candidates(known.metres, known.reflectance, known.returned, known.lit, rays)
+            x = _to_patches(inputs(known, rays, guesses, noise))
+        top = h = self.stem(x)
+        kept = []
+        for stage in self.down:
+            if isinstance(stage, Halve):
+                kept.append(h)
+                h = stage(h)
+            else:
+                h = _through(stage, h)
+        for join, stage in zip(self.up[::2], self.up[1::2], strict=True):
+            h = F.interpolate(join(h), scale_factor=2, mode="nearest")
+            h = _through(stage, torch.cat([h, kept.pop()], 1))
+        h = F.silu(self.head(torch.cat([h, top], 1)))
+        return _assemble(_to_pixels(self.out(h)), guesses, noise)
+
+
+def _through(blocks: nn.Module, h: Tensor) -> Tensor:
+    assert isinstance(blocks, nn.ModuleList)
+    for block in blocks:
+        h = block(h)
+    return h
+
+
+def _assemble(out: Tensor, guesses: Candidates, noise: Tensor) -> Filled:
+    scores, shift, grain, f_scores, f_shift, f_gain, logit, gain = out.split(
+        [RANGE_CANDIDATES, 1, 1, REFLECTANCE_CANDIDATES, 1, NOISES, 1, NOISES], 1
+    )
+    prior = out.new_zeros(RANGE_CANDIDATES, 1, 1)
+    prior[1:3] = PRIOR
+    code = ((scores + prior).softmax(1) * guesses.code).sum(1, keepdim=True) + 0.1 * shift
+    code = code + 0.02 * grain * noise[:, :1]
+    reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
+    reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True)
+    return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0)
+
+
+def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tensor:
+    """(B, INPUTS, H, W): what the network sees, each of about unit size."""
+    told, returned, lit = (mask.float() for mask in (known.told, known.returned, known.lit))
+    base = guesses.code[:, 2:3]
+    ground = encode_range(rays.ground)
+    others = 8 * (guesses.code[:, [0, 3, 4, 5, 6, 7, 8, 9]] - base)
+    full = torch.ones_like(told)
+    steps = [full * torch.log2(step * (180 / math.pi) / 0.4 + 0.1) / 2 for step in (rays.up, rays.down, rays.across)]
+    return torch.cat(
+        [
+            noise,
+            told,
+            returned,
+            lit,
+            2 * base,
+            (8 * (base - ground)).clamp(-3, 3),
+            others.clamp(-4, 4),
+            2 * guesses.reflectance[:, :1] - 0.5,
+            guesses.reflectance[:, 5:6] * 2 - 0.5,
+            guesses.near,
+            3 * rays.elevation.expand_as(told),
+            ground.expand_as(told) * 2,
+            *steps,
+            rays.blocked.expand_as(told),
+            rays.inside.expand_as(told),
+        ],
+        1,
+    )
+
+
+def draw_noise(shape: tuple[int, int, int], rng: torch.Generator | None = None) -> Tensor:
+    """(B, NOISES, H, W) unit Gaussians: independent, constant over 6 columns of a ring, over patches of 4 x 8."""
+    batch, height, width = shape
+    pixel = torch.randn(batch, 1, height, width, generator=rng)
+    along = torch.randn(batch, 1, height, -(-width // 6), generator=rng).repeat_interleave(6, 3)[..., :width]
+    patch = torch.randn(batch, 1, -(-height // 4), -(-width // 8), generator=rng)
+    patch = patch.repeat_interleave(4, 2).repeat_interleave(8, 3)[:, :, :height, :width]
+    return torch.cat([pixel, along, patch], 1)
+
+
+def _to_patches(x: Tensor) -> Tensor:
+    b, c, h, w = x.shape
+    x = x.reshape(b, c, h // STEM[0], STEM[0], w // STEM[1], STEM[1]).permute(0, 3, 5, 1, 2, 4)
+    return x.reshape(b, -1, h // STEM[0], w // STEM[1]).contiguous(memory_format=torch.channels_last)
+
+
+def _to_pixels(x: Tensor) -> Tensor:
+    b, c, h, w = x.shape
+    x = x.reshape(b, STEM[0], STEM[1], c // (STEM[0] * STEM[1]), h, w).permute(0, 3, 4, 1, 5, 2)
+    return x.reshape(b, -1, h * STEM[0], w * STEM[1])
