@@ -131,6 +131,26 @@ class Sensor:
         )
         return replace(self, name=name, elevations=pick, width=width, offsets=offsets, blocked=blocked)
 
+    def denser(self, times: int) -> Sensor:
+        """The sensor with `times` - 1 beams more between each two, evenly; row i becomes row `times` * i.
+
+        Raises ValueError for `times` below 2.
+        """
+        if times < 2:
+            raise ValueError(f"expected at least 2 times as many beams, found {times}")
+        own, place = np.arange(self.height), np.arange((self.height - 1) * times + 1) / times
+        elevations = tuple(np.interp(place, own, self.elevations).tolist())
+        offsets = tuple(np.interp(place, own, self.offsets).tolist()) if self.offsets else ()
+        blocked = tuple(
+            (row, first, last)
+            for beam, first, last in self.blocked
+            for row in range(
+                max(0, (beam - 1) * times + 1 + times // 2), min(len(place), beam * times + times // 2 + 1)
+            )
+        )
+        name = f"{self.name}x{times}"
+        return replace(self, name=name, elevations=elevations, offsets=offsets, blocked=blocked)
+
     def to_dict(self) -> dict:
         """Plain lists and numbers, the inverse of `from_dict`."""
         return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}

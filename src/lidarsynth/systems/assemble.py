@@ -8,11 +8,13 @@ from torch import nn
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
 from lidarsynth.networks.iln import ILN, LIIF
 from lidarsynth.networks.interpolation import METHODS, Interpolation
 from lidarsynth.networks.lidar_sr import LidarSR
 from lidarsynth.systems.build import GANS, build_denoiser
+from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.gan.model import GanModel
 from lidarsynth.systems.interpolation.model import InterpolationModel
@@ -39,7 +41,13 @@ def _gan(experiment: Experiment, network: nn.Module) -> GanModel:
     return GanModel(network, build_sensor(experiment), experiment)
 
 
+def _cascade(experiment: Experiment, network: nn.Module) -> CascadeModel:
+    assert isinstance(network, Cascade)
+    return CascadeModel(network, build_sensor(experiment), experiment)
+
+
 MODELS: dict[str, Callable[[Experiment, nn.Module], ScanModel]] = {  # word of a network -> its model
+    "cascade": _cascade,
     "efficient-unet": _diffusion,
     "conditional-unet": _diffusion,
     "refinenet": _diffusion,

@@ -16,8 +16,11 @@ from lidarsynth.experiment.folder import RECORD, WEIGHTS, read_experiment
 from lidarsynth.experiment.record import Adversarial, Experiment, Score, Segmentation, Upsampling
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.conditional import CANDIDATES, ConditionalUNet
 from lidarsynth.networks.efficient_unet import EfficientUNet
+from lidarsynth.networks.fill_unet import FillUNet
 from lidarsynth.networks.gan import dcgan as gan
 from lidarsynth.networks.gan import dusty2
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
@@ -128,7 +131,12 @@ def build_discriminator(experiment: Experiment) -> nn.Module:
     return gan.Discriminator(size, *widths, vertical="reflect" if group.iros21 else "replicate")
 
 
+def _cascade(experiment: Experiment, sensor: Sensor) -> Cascade:
+    return Cascade(CoarseUNet(), FillUNet())
+
+
 NETWORKS: dict[str, Callable[[Experiment, Sensor], nn.Module]] = {
+    "cascade": _cascade,
     "efficient-unet": _unet,
     "conditional-unet": _conditional,
     "rangenet": _rangenet,

@@ -1,0 +1,319 @@
+"""`CascadeModel`, one model for any sensor: a coarse layout from noise, and one step that fills in the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.diffusion import repaint
+from lidarsynth.diffusion.denoiser import Denoiser
+from lidarsynth.diffusion.samplers import STEPS, even_log_snr, generators, noise_like, sample
+from lidarsynth.diffusion.schedule import flow
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.fill_unet import NOISES, Known, draw_noise
+from lidarsynth.networks.rays import decode_range, padded, rays_of
+from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, known_pixels, sensor_that_made, with_known
+
+METHODS = ("auto", "conditional", "sample", "repaint")
+SAMPLERS = tuple(STEPS)
+BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
+STEPS_DEFAULT = 16
+
+
+@dataclass(frozen=True)
+class CascadeModel(ScanModel):
+    """A trained cascade with the sensor of its images, which `into` changes at no cost.
+
+    network.coarse   velocity of flow matching on a grid of 16 beams x 128 columns of the sensor
+    network.fill     known pixels and rays -> all pixels, in one step
+    """
+
+    network: Cascade
+    sensor: Sensor
+    experiment: Experiment
+    kind: ClassVar[str] = "a cascade"
+
+    def into(self, sensor: Sensor | str) -> CascadeModel:
+        """The same model with images of another sensor."""
+        sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
+        return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor))
+
+    def suited_to(self, scan: Scan) -> CascadeModel:
+        """The same model with images of the sensor that made the scan, as recognised from its points.
+
+        Raises ValueError when it is not recognised.
+        """
+        name, reason = recognise(scan)
+        if name is None:
+            raise ValueError(f"{reason}, or give its sensor file")
+        return self if name == self.sensor.name else self.into(name)
+
+    def stream(
+        self,
+        n: int,
+        steps: int | None = None,
+        seed: int = 0,
+        sampler: str | None = None,
+        batch_size: int = 4,
+        first: int = 0,
+        on_step: OnStep = None,
+    ) -> Iterator[RangeImage]:
+        """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
+
+        steps    of the coarse network, default 16; the fill takes one more
+        sampler  ddpm | ddim | dpmpp-2m | heun; default dpmpp-2m
+
+        Raises ValueError for an unknown sampler, counts below 1, or a sensor of fewer than 16 beams or 128 columns.
+        """
+        sampler, steps = self._sampler(sampler), STEPS_DEFAULT if steps is None else steps
+        if n < 1 or steps < 1 or batch_size < 1:
+            raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
+        rows, columns = self._grid()
+        for start in range(first, n, batch_size):
+            rng = generators(seed, min(batch_size, n - start), offset=start)
+            told, standing = self._grid_rays(rows, columns, len(rng))
+            x_1 = noise_like(torch.zeros(len(rng), 3, ROWS, COLUMNS, device=self._device), rng)
+            x_0 = x_1
+            for state in sample(self._coarse(told), x_1, STEPS[sampler], steps, rng, even_log_snr):
+                x_0 = state.x_s
+                if on_step is not None:
+                    on_step()
+            metres, reflectance = self.network.coarse.decode(x_0, standing)
+            yield from self._filled_grids(metres, reflectance, rows, columns, rng)
+            if on_step is not None:
+                on_step()
+
+    def complete(
+        self,
+        scan: Scan | RangeImage,
+        known: np.ndarray | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int = 10,
+        sampler: str | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """Fill what was not measured; measured pixels come back exactly as they were, in metres.
+
+        scan    points, or an image of this model's sensor
+        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
+        method  `conditional` (`auto`): the most likely image, of least error; `sample`: one of many possible images,
+                with the grain of a recorded scan; `repaint`: large holes first by the coarse network, then a sample
+        steps   1; of `repaint`, those of the coarse network, default 16, with `resamples` passes over each
+
+        A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
+        """
+        image = self.image_of(scan)
+        known = known_pixels(image, known)
+        self.evaluations(method, steps, resamples)
+        rng = generators(seed, 1)
+        lit = bool(image.reflectance[known].any())
+        metres, reflectance, told = image.range, image.reflectance, known | (self._blocked & ~image.mask)
+        if method == "repaint":
+            metres, reflectance, told = self._holes(metres, reflectance, told, rng, steps, resamples, on_step)
+        noise = None if method in ("auto", "conditional") else rng
+        filled = self._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
+        if on_step is not None:
+            on_step()
+        return with_known(filled, image, known | (self._blocked & ~image.mask), keep_reflectance=lit)
+
+    def upsample(
+        self,
+        scan: Scan,
+        sensor_in: Sensor | str | None = None,
+        method: str = "auto",
+        steps: int | None = None,
+        seed: int = 0,
+        on_step: OnStep = None,
+        times: int = 4,
+    ) -> RangeImage:
+        """A scan with `times` - 1 new beams between each two of its own sensor's, whose rays stay where they are.
+
+        sensor_in  the sensor that made the scan; None = recognised from the points
+        """
+        own = sensor_that_made(scan, sensor_in)
+        sparse = self.into(own).image_of(scan)
+        model = self.into(own.denser(times))
+        image, known = spread(sparse, model.sensor, times)
+        return model.complete(image, known, method, steps, seed=seed, on_step=on_step)
+
+    def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
+        """How often `generate` calls `on_step` per batch: the coarse steps and the fill."""
+        self._sampler(sampler)
+        return 1 + (STEPS_DEFAULT if steps is None else steps)
+
+    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
+        """How often `complete` calls `on_step`. Raises ValueError for another method or more steps."""
+        if method not in METHODS:
+            raise ValueError(f"{self.experiment.name}: expected a method of {', '.join(METHODS)}, found {method!r}")
+        if method == "repaint":
+            return 1 + repaint.evaluations(STEPS_DEFAULT if steps is None else steps, resamples)
+        if steps not in (None, 1):
+            raise ValueError(f"{self.experiment.name}: expected 1 step, for the fill is one, found {steps}")
+        return 1
+
+    def _sampler(self, sampler: str | None) -> str:
+        if sampler is not None and sampler not in SAMPLERS:
+            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {sampler!r}")
+        return sampler or "dpmpp-2m"
+
+    def _coarse(self, told: Tensor) -> Denoiser:
+        return Denoiser(self.network.coarse, flow(BOUND), "velocity", clip=False, condition=(told,))
+
+    def _grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (16,) and columns (128,) of the coarse grid."""
+        if self.sensor.height < ROWS or self.sensor.width < COLUMNS:
+            raise ValueError(f"expected a sensor of at least {ROWS} beams and {COLUMNS} columns to generate, found "
+                             f"{self.sensor.name} with {self.sensor.height} and {self.sensor.width}")  # fmt: skip
+        return grid_rows(self.sensor.height), grid_columns(self.sensor.width)
+
+    def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
+        told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
+        return (part.to(self._device).expand(count, *part.shape) for part in (told, standing))  # type: ignore[return-value]
+
+    def _filled_grids(
+        self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
+    ) -> list[RangeImage]:
+        """Coarse grids (B, 16, 128) as samples of whole images."""
+        shape, grid = (len(metres), self.sensor.height, self.sensor.width), np.ix_(range(len(metres)), rows, columns)
+        ranges, shades, told = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
+        ranges[grid], shades[grid], told[grid] = metres.cpu().numpy(), reflectance.cpu().numpy(), True
+        ranges[(ranges < self.sensor.min_range) | (ranges > self.sensor.max_range)] = 0
+        ranges[:, self._blocked] = 0
+        told |= self._blocked
+        return self._fill(ranges, shades * (ranges > 0), told, True, rng)
+
+    def _holes(
+        self,
+        metres: np.ndarray,
+        reflectance: np.ndarray,
+        told: np.ndarray,
+        rng: list[torch.Generator],
+        steps: int | None,
+        resamples: int,
+        on_step: OnStep,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Metres, reflectance and known pixels with a grid of new ones where nothing is known around."""
+        self._grid()
+        rows, columns, cell = _best_known(told)
+        rays, standing = self._grid_rays(rows, columns, 1)
+        grid = np.ix_(rows, columns)
+        here = torch.from_numpy(told[grid])[None].to(self._device)
+        coarse = self.network.coarse
+        values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
+        known = coarse.encode(*values, standing)  # type: ignore[call-arg]
+        x_1 = noise_like(known, rng)
+        count = STEPS_DEFAULT if steps is None else steps
+        x_0 = x_1
+        for state in repaint.repaint(
+            self._coarse(rays), x_1, known, here[:, None], rng, steps=count, resamples=resamples, grid=even_log_snr
+        ):
+            x_0 = state.x_s
+            if on_step is not None:
+                on_step()
+        new_metres, new_reflectance = (part[0].cpu().numpy() for part in coarse.decode(x_0, standing))
+        hole = ~_widened(cell)
+        metres, reflectance, told = metres.copy(), reflectance.copy(), told.copy()
+        new_metres = np.where(new_metres > self.sensor.max_range, 0, new_metres)
+        metres[grid] = np.where(hole, new_metres, metres[grid])
+        reflectance[grid] = np.where(hole, new_reflectance, reflectance[grid])
+        told[grid] |= hole
+        return metres, reflectance, told
+
+    @torch.no_grad()
+    def _fill(
+        self,
+        metres: np.ndarray,
+        reflectance: np.ndarray,
+        told: np.ndarray,
+        lit: bool,
+        rng: list[torch.Generator] | None,
+    ) -> list[RangeImage]:
+        """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples."""
+        count, (height, width) = len(metres), padded(self.sensor)
+        known = _known(metres, reflectance, told, lit, (height, width))
+        rays = rays_of(self.sensor, self._blocked)
+        noise = torch.zeros(count, NOISES, height, width)
+        if rng is not None:
+            noise = torch.cat([draw_noise((1, height, width), generator) for generator in rng])
+        device = self._device
+        known = Known(*(part.to(device) for part in known))
+        rays = type(rays)(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
+        return [self._image(*parts) for parts in zip(*self.network.fill(known, rays, noise.to(device)), strict=True)]
+
+    def _image(self, code: Tensor, reflectance: Tensor, logit: Tensor) -> RangeImage:
+        """The image of (1, H', W') outputs, without their padding."""
+        height, width, sensor = self.sensor.height, self.sensor.width, self.sensor
+        distance = decode_range(code)[0, :height, :width].cpu().numpy()
+        mask = (logit[0, :height, :width] > 0).cpu().numpy() & (distance <= sensor.max_range) & ~self._blocked
+        mask &= distance >= sensor.min_range
+        shade = reflectance[0, :height, :width].clamp(0, 1).cpu().numpy()
+        return RangeImage(distance * mask, shade * mask, mask, sensor)
+
+    @property
+    def _blocked(self) -> np.ndarray:
+        return hidden(self.sensor)
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+
+def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, np.ndarray]:
+    """A scan's own image as every `times`-th row of a denser sensor's, and which pixels were looked at: those rows."""
+    shape = (sensor.height, sensor.width)
+    parts = [np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)]
+    for part, values in zip(parts, (sparse.range, sparse.reflectance, sparse.mask), strict=True):
+        part[::times] = values
+    known = np.zeros(shape, bool)
+    known[::times] = True
+    xyz = None
+    if sparse.xyz is not None:
+        xyz = np.zeros((*shape, 3), np.float32)
+        xyz[::times] = sparse.xyz
+    return RangeImage(*parts, sensor, xyz=xyz), known
+
+
+def _known(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
+    """(B, H, W) arrays as padded tensors (B, 1, H', W'): rows below are known to be empty, columns go around."""
+    extra, columns = size[0] - told.shape[1], np.arange(size[1]) % told.shape[2]
+
+    def part(values: np.ndarray, below: float) -> Tensor:
+        values = np.pad(values[:, :, columns], ((0, 0), (0, extra), (0, 0)), constant_values=below)
+        return torch.from_numpy(np.ascontiguousarray(values))[:, None]
+
+    returned = told & (metres > 0)
+    ranges = part(np.where(returned, metres, 0).astype(np.float32), 0)
+    shades = part(np.where(returned & lit, reflectance, 0).astype(np.float32), 0)
+    return Known(ranges, shades, part(told, True), part(returned, False), part(returned & lit, False))
+
+
+def _best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each of 16 x 128 bands the row and the column with most known pixels, and which cells hold any: (16, 128)."""
+    rows, columns = (
+        np.linspace(0, size, count + 1).astype(int) for size, count in zip(told.shape, (ROWS, COLUMNS), strict=True)
+    )
+    row = np.array([a + told[a:b].sum(1).argmax() for a, b in pairwise(rows)])
+    column = np.array([a + told[:, a:b].sum(0).argmax() for a, b in pairwise(columns)])
+    cell = np.add.reduceat(np.add.reduceat(told.astype(int), rows[:-1], 0), columns[:-1], 1) > 0
+    return row, column, cell
+
+
+def _widened(cell: np.ndarray) -> np.ndarray:
+    """(16, 128) bool: cells and their eight neighbours, around the turn."""
+    tall = np.pad(cell, ((1, 1), (0, 0)))
+    tall = tall[:-2] | tall[1:-1] | tall[2:]
+    return tall | np.roll(tall, 1, 1) | np.roll(tall, -1, 1)
