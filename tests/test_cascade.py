@@ -1,0 +1,220 @@
+"""The cascade: rays and candidates by closed forms, what is known stays, any sensor goes in and out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lidarsynth.experiment.record import Data, Experiment, Model
+from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.networks import fill_unet
+from lidarsynth.networks.candidates import candidates
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import CoarseUNet, grid_columns, grid_rays, grid_rows, left_filled
+from lidarsynth.networks.fill_unet import NOISES, FillUNet, Known, draw_noise
+from lidarsynth.networks.rays import decode_range, encode_range, level_sines, padded, rays_of
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.model import CascadeModel, spread
+
+SMALL = Sensor("small", tuple(np.linspace(5, -25, 24).tolist()), 256, 0.5, 120.0, mount=1.8)
+
+
+@pytest.fixture(scope="module")
+def model() -> CascadeModel:
+    """An untrained cascade whose last layers are not zero."""
+    torch.manual_seed(0)
+    network = Cascade(CoarseUNet(32, (1, 2, 2, 2), 1), FillUNet((16, 16, 16, 16))).eval()
+    for layer in (network.fill.out.weight, network.coarse.unet.out_conv.weight):
+        torch.nn.init.normal_(layer, std=0.02)
+    return CascadeModel(network, SMALL, Experiment("test", Data(sensor=SMALL.to_dict()), Model(network="cascade")))
+
+
+def plane(sensor: Sensor, normal: tuple[float, float, float], level: float) -> torch.Tensor:
+    """Metres (1, 1, H, W) to the plane normal . p = level along every ray."""
+    return torch.from_numpy(level / (sensor.directions() @ np.array(normal)))[None, None].float()
+
+
+def test_range_code_is_inverse_and_has_one_limit():
+    metres = torch.linspace(0, 255, 500)
+    assert_close(decode_range(encode_range(metres)), metres, rtol=1e-4, atol=1e-4)
+    assert encode_range(torch.tensor(255.0)).item() == pytest.approx(1)
+
+
+def test_flat_ground_is_where_trigonometry_puts_it():
+    rays = rays_of(SMALL, SMALL.blocked_rays())
+    low = np.radians(SMALL.elevations[-1])
+    assert rays.ground[0, 0, 23, 0].item() == pytest.approx(1.8 / np.sin(-low), rel=1e-5)
+    assert rays.ground[0, 0, 0, 0].item() == pytest.approx(120)
+    assert rays.inside[0, 0, :, 0].tolist() == [1.0] * 24 + [0.0] * 8
+
+
+def test_a_tilted_sensor_sees_the_road_as_its_pose_says():
+    tilted = replace(SMALL, tilt=(4.0, -3.0))
+    angles = tilted.ray_angles().astype(float)
+    sines = level_sines(tilted, angles[0, :, 0], angles[1, 0])
+    pitch, roll = np.radians(tilted.tilt)
+    about_y = np.array([[np.cos(pitch), 0, -np.sin(pitch)], [0, 1, 0], [np.sin(pitch), 0, np.cos(pitch)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+    np.testing.assert_allclose(sines, (tilted.directions() @ (about_y @ about_x).T)[..., 2], atol=1e-6)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.02, -0.03, 1.0), (0.03, 0.05, 1.0)])
+def test_the_plane_candidate_is_exact_on_planes_but_for_the_curve_of_the_sine(normal: tuple[float, float, float]):
+    sensor = replace(SMALL, elevations=tuple(np.linspace(-5, -25, 24).tolist()))
+    metres = plane(sensor, normal, -1.8)
+    told = torch.zeros(metres.shape, dtype=torch.bool)
+    told[:, :, ::4] = True
+    rays = rays_of(sensor, sensor.blocked_rays())
+    rays = type(rays)(*(part[:, :, :24] if part.shape[2] == 32 else part for part in rays))
+    guesses = candidates(metres, torch.zeros_like(metres), told, told, rays)
+    error = (decode_range(guesses.code[:, 2:3]) - metres).abs()[:, :, :21] / metres[:, :, :21]
+    bilinear = (decode_range(guesses.code[:, 1:2]) - metres).abs()[:, :, :21] / metres[:, :, :21]
+    assert error.max() < 2e-3
+    assert error.max() < bilinear.max() / 5
+    if normal[:2] == (0.0, 0.0):
+        assert_close(decode_range(guesses.code[:, 7:8])[:, :, :21], metres[:, :, :21], rtol=1e-4, atol=1e-4)
+
+
+def test_known_pixels_are_their_own_candidates_and_lonely_ones_the_ground():
+    metres = torch.full((1, 1, 32, 256), 7.0)
+    told = torch.zeros(metres.shape, dtype=torch.bool)
+    rays = rays_of(SMALL, SMALL.blocked_rays())
+    nothing = candidates(metres, metres / 10, told, told, rays)
+    assert_close(decode_range(nothing.code[:, :1]), rays.ground, rtol=1e-4, atol=1e-3)
+    told[0, 0, 3, 5] = True
+    one = candidates(metres, metres / 10, told, told, rays)
+    assert_close(decode_range(one.code[0, :, 3, 5]), torch.full((10,), 7.0))
+    assert_close(one.reflectance[0, :, 3, 5], torch.full((6,), 0.7))
+
+
+def test_what_is_not_known_is_never_looked_at(model: CascadeModel):
+    rays = rays_of(SMALL, SMALL.blocked_rays())
+    told = torch.rand(1, 1, *padded(SMALL), generator=torch.Generator().manual_seed(1)) < 0.3
+    metres = torch.rand(told.shape, generator=torch.Generator().manual_seed(2)) * 40 + 1
+    noise = torch.zeros(1, NOISES, *padded(SMALL))
+    outputs = [
+        model.network.fill(Known(m, m / 50, told, told, told), rays, noise)
+        for m in (metres, torch.where(told, metres, 99.0))
+    ]
+    for a, b in zip(*outputs, strict=True):
+        assert_close(a, b)
+
+
+def test_the_width_is_a_ring(model: CascadeModel):
+    rays = rays_of(SMALL, SMALL.blocked_rays())
+    rng = torch.Generator().manual_seed(3)
+    told = torch.rand(1, 1, *padded(SMALL), generator=rng) < 0.2
+    metres, noise = torch.rand(told.shape, generator=rng) * 40 + 1, draw_noise((1, *padded(SMALL)), rng)
+    known = Known(metres, metres / 50, told, told, told)
+    whole = model.network.fill(known, rays, noise)
+    turned = model.network.fill(Known(*(part.roll(32, 3) for part in known)), rays, noise.roll(32, 3))
+    for a, b in zip(whole, turned, strict=True):
+        assert_close(a.roll(32, 3), b, atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "pandar64", "os1-128"])
+def test_measured_pixels_come_back_bit_by_bit_in_any_sensor(model: CascadeModel, sensor: str):
+    image = SyntheticStreets(4, 16, SENSORS[sensor]).image(3)
+    known = corrupt(image, "beams:2")
+    filled = model.into(sensor).complete(image.keep(known), known)
+    assert filled.shape == image.shape
+    np.testing.assert_array_equal(filled.range[known], image.range[known])
+    np.testing.assert_array_equal(filled.reflectance[known & image.mask], image.reflectance[known & image.mask])
+    assert filled.mask[~known].any()
+
+
+def test_blocked_rays_stay_empty_and_no_other_sensor_gets_kittis_car(model: CascadeModel):
+    blocked = replace(SMALL, blocked=((22, 10, 60), (23, 250, 80)))
+    image = RangeImage(*(np.zeros((24, 256), t) for t in (np.float32, np.float32, bool)), blocked)
+    filled = model.into(blocked).complete(image)
+    assert not filled.mask[blocked.blocked_rays()].any()
+    assert filled.mask[23, 81:249].any() == model.complete(image).mask[23, 81:249].any()
+    assert not rays_of(SENSORS["hdl-64e-kitti"], np.zeros((64, 1024), bool)).blocked.any()
+
+
+def test_coarse_code_is_inverse():
+    network = CoarseUNet(32, (1, 2, 2, 2), 1)
+    network.standard[1] = 0.1
+    _, standing = grid_rays(SMALL, SMALL.blocked_rays(), grid_rows(24), grid_columns(256))
+    rng = torch.Generator().manual_seed(0)
+    metres = torch.rand(1, 16, 128, generator=rng) * 80 * (torch.rand(1, 16, 128, generator=rng) < 0.8)
+    reflectance = torch.rand(1, 16, 128, generator=rng) * (metres > 0)
+    back = network.decode(network.encode(metres, reflectance, standing[None]), standing[None])
+    for found, expected in zip(back, (metres, reflectance), strict=True):
+        assert_close(found, expected, atol=1e-3, rtol=1e-4)
+
+
+def test_empty_pixels_hold_their_left_neighbour_around_the_turn():
+    values, returned = torch.tensor([[[[5.0, 1.0, 2.0, 3.0]]]]), torch.tensor([[[False, True, False, False]]])
+    assert left_filled(values, returned).flatten().tolist() == [1, 1, 1, 1]
+    assert left_filled(values, torch.zeros_like(returned)).flatten().tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(("height", "width"), [(16, 128), (20, 1800), (64, 1024), (128, 2048)])
+def test_the_grid_is_sixteen_beams_and_128_columns_of_any_sensor(height: int, width: int):
+    for grid, size, count in ((grid_rows(height), height, 16), (grid_columns(width), width, 128)):
+        assert len(np.unique(grid)) == count
+        assert grid.min() >= 0
+        assert grid.max() < size
+
+
+def test_generated_scans_depend_on_their_seed_alone(model: CascadeModel):
+    three = model.generate(3, steps=2, seed=5, batch_size=1)
+    (last,) = model.stream(3, steps=2, seed=5, batch_size=1, first=2)
+    np.testing.assert_array_equal(three[2].range, last.range)
+    assert (three[0].range != three[1].range).any()
+    assert three[0].range.max() <= SMALL.max_range
+
+
+def test_upsampling_keeps_the_beams_where_they_are(model: CascadeModel):
+    sensor = SENSORS["vlp-16"]
+    scan = SyntheticStreets(4, 16, sensor)[2]
+    dense = model.upsample(scan, "vlp-16", times=4)
+    assert dense.shape == (61, 1024)
+    assert dense.sensor.elevations[::4] == pytest.approx(sensor.elevations)
+    own = model.into(sensor).image_of(scan)
+    np.testing.assert_array_equal(dense.range[::4], own.range)
+    assert dense.mask[1::4].any()
+
+
+def test_repaint_fills_a_lost_sector_and_leaves_the_rest(model: CascadeModel):
+    image = SyntheticStreets(4, 16, SMALL).image(3)
+    known = corrupt(image, "sector:90")
+    filled = model.complete(image.keep(known), known, method="repaint", steps=2, resamples=1, seed=1)
+    np.testing.assert_array_equal(filled.range[known], image.range[known])
+    assert filled.mask[~known].any()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m: m.generate(0), "at least 1"),
+        (lambda m: m.generate(1, sampler="nonsense"), "a sampler of ddpm"),
+        (lambda m: m.into(replace(SMALL, elevations=(1.0, 0.0))).generate(1), "at least 16 beams"),
+        (lambda m: m.evaluations("posterior"), "a method of auto, conditional, sample, repaint"),
+        (lambda m: m.evaluations(steps=4), "expected 1 step"),
+    ],
+)
+def test_what_it_cannot_do_is_refused(model: CascadeModel, call, message: str):
+    with pytest.raises(ValueError, match=message):
+        call(model)
+
+
+def test_spread_rows_are_known_and_no_others():
+    image = SyntheticStreets(4, 16, SMALL).image(1)
+    sparse, known = spread(image, SMALL.denser(3), 3)
+    assert known.sum() == 24 * 256
+    np.testing.assert_array_equal(sparse.range[::3], image.range)
+    assert not sparse.mask[1::3].any()
+
+
+def test_noise_has_three_grains():
+    noise = draw_noise((2, 64, 1024), torch.Generator().manual_seed(0))
+    assert noise.shape == (2, fill_unet.NOISES, 64, 1024)
+    assert_close(noise.std((0, 2, 3)), torch.ones(3), atol=0.03, rtol=0)
+    assert torch.equal(noise[:, 1, :, 0], noise[:, 1, :, 5])
+    assert torch.equal(noise[:, 2, 0, 0], noise[:, 2, 3, 7])
