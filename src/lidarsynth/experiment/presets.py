@@ -183,6 +183,32 @@ def default() -> Experiment:
     )
 
 
+def cascade() -> Experiment:
+    """A coarse layout, then one step that fills it in: one model for any sensor, from `--data virtual`."""
+    return Experiment(
+        "cascade",
+        data=Data(sensor="hdl-64e-kitti", projection="auto"),
+        model=Model(
+            network="cascade",
+            base_channels=64,  # of both stages
+            channel_multipliers=(1, 2, 4, 4),
+            num_residual_blocks=(2, 2, 2, 2),  # of the coarse stage
+            coords_encoding=None,  # both are told each pixel's rays
+        ),
+        diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
+        training=Training(
+            steps=20_000,
+            batch_size=8,
+            learning_rate=2e-3,  # half of it for the coarse stage
+            warmup=200,
+            ema_decay=0.999,
+            ema_start=200,
+            ema_every=1,
+            generation_share=0.5,  # of crops that learn to be drawn; the others learn the most likely image
+        ),
+    )
+
+
 def kitti() -> Experiment:
     """`default` fine-tuned on real scans (`--from default`), for completion first of all."""
     start = default()
@@ -252,6 +278,7 @@ def tiny() -> Experiment:
 
 
 PRESETS: dict[str, Callable[[], Experiment]] = {
+    "cascade": cascade,
     "default": default,
     "dusty-v1": dusty_v1,
     "dusty-v2": dusty_v2,

@@ -132,7 +132,12 @@ def build_discriminator(experiment: Experiment) -> nn.Module:
 
 
 def _cascade(experiment: Experiment, sensor: Sensor) -> Cascade:
-    return Cascade(CoarseUNet(), FillUNet())
+    model, width = experiment.model, experiment.model.base_channels
+    if len(set(model.num_residual_blocks)) > 1:
+        raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
+                         f"{model.num_residual_blocks}")  # fmt: skip
+    coarse = CoarseUNet(width, model.channel_multipliers, model.num_residual_blocks[0])
+    return Cascade(coarse, FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2)))
 
 
 NETWORKS: dict[str, Callable[[Experiment, Sensor], nn.Module]] = {

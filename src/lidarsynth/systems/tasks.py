@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.systems.build import GANS
+from lidarsynth.systems.cascade.training import CASCADE
 from lidarsynth.systems.diffusion.score_matching import SCORE
 from lidarsynth.systems.diffusion.training import DIFFUSION
 from lidarsynth.systems.gan.training import ADVERSARIAL
@@ -12,6 +13,7 @@ from lidarsynth.systems.upsampling.training import LIDAR_SR, QUERIES
 from lidarsynth.training.task import Task
 
 TASKS: dict[str, Task] = {
+    "cascade": CASCADE,
     "efficient-unet": DIFFUSION,
     "conditional-unet": DIFFUSION,
     "rangenet": SEGMENTATION,

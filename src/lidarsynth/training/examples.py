@@ -23,18 +23,22 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Draw
 
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
+VIRTUAL = "virtual"  # the same, by virtual sensors that are drawn too
 
 
 class Streets:
     """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
 
+    virtual  each seen by a sensor that is drawn from the seed (`VirtualStreets`), and not by `sensor`
+
     Raises ImportError naming the extra when the ray caster is missing.
     """
 
-    def __init__(self, seed: int, sensor: Sensor):
+    def __init__(self, seed: int, sensor: Sensor, virtual: bool = False):
         self.seed = seed
         self.sensor = sensor
-        self.source = {"name": SYNTHETIC, "seed": seed}
+        self.virtual = virtual
+        self.source = {"name": VIRTUAL if virtual else SYNTHETIC, "seed": seed}
         self._readers: dict[int, Any] = {}
 
     def indices(self, step: int, batch_size: int) -> list[int]:
@@ -45,16 +49,19 @@ class Streets:
 
     def name(self, i: int) -> Name:
         """What scan i is called."""
-        return Name(SYNTHETIC, f"seed {self.seed}", str(i))
+        return Name(self.source["name"], f"seed {self.seed}", str(i))
 
     def take(self, indices: list[int]) -> list[RangeImage]:
         """Scans as images, with labels."""
         from lidarsynth.streets.reader import SyntheticStreets
+        from lidarsynth.streets.virtual import VirtualStreets
 
         images = []
         for slot, index in enumerate(indices):  # a reader per slot, because a reader remembers only two worlds
-            reader = self._readers.setdefault(slot, SyntheticStreets(self.seed, 1 << 62, self.sensor))
-            images.append(reader.image(index))
+            if slot not in self._readers:
+                streets = SyntheticStreets(self.seed, 1 << 62, self.sensor)
+                self._readers[slot] = VirtualStreets(self.seed, 1 << 62) if self.virtual else streets
+            images.append(self._readers[slot].image(index))
         return images
 
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
@@ -66,12 +73,13 @@ Learned = CachedImages | SeveralCaches | Streets  # what a network can learn fro
 
 
 def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> Learned:
-    """The images of a cache folder, or streets of `seed` (default the experiment's) for the word `synthetic`.
+    """The images of a cache folder, or streets of `seed` (default the experiment's) for `synthetic` and `virtual`.
 
     Several folders, with commas between them, are seen equally often. Raises ValueError when one is no cache.
     """
-    if str(data) == SYNTHETIC:
-        return Streets(experiment.training.seed if seed is None else seed, build_sensor(experiment))
+    if str(data) in (SYNTHETIC, VIRTUAL):
+        seed = experiment.training.seed if seed is None else seed
+        return Streets(seed, build_sensor(experiment), str(data) == VIRTUAL)
     if "," in str(data) and not Path(data).exists():
         return SeveralCaches(str(data).split(","))
     return CachedImages(data)

@@ -1,0 +1,171 @@
+"""What the cascade learns from: crops of streets seen by any sensor with pixels hidden, and grids of whole turns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.fill_unet import Known
+from lidarsynth.networks.rays import Rays, rays_of, stacked
+from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.systems.diffusion.training import generation_count
+from lidarsynth.training.randomness import sample_seed
+from lidarsynth.training.task import Images
+
+HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
+SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
+
+
+class Crops(NamedTuple):
+    """b crops of which pixels are hidden; the first `samples` learn to be drawn, the others the most likely image."""
+
+    known: Known
+    rays: Rays
+    metres: Tensor  # (b, 1, H, W), 0 where nothing returned
+    reflectance: Tensor  # (b, 1, H, W)
+    seeds: tuple[int, ...]
+    samples: int
+
+
+class Grids(NamedTuple):
+    """Whole turns at the coarse stage."""
+
+    metres: Tensor  # (b, 16, 128)
+    reflectance: Tensor
+    rays: Tensor  # (b, 8, 16, 128)
+    standing: Tensor  # (b, 16, 128) radians
+
+
+class Batch(NamedTuple):
+    """One process's share of one pass."""
+
+    crops: Crops
+    grids: Grids
+
+
+def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
+    """The samples at `positions` of step `step`'s global batch: functions of (seed, step, position)."""
+    taken, seed = images.take(indices), experiment.training.seed
+    samples = generation_count(experiment.training, step)
+    seeds = tuple(sample_seed(seed, step, position) for position in positions)
+    rngs = [np.random.default_rng(number) for number in seeds]
+    pairs = zip(taken, rngs, positions, strict=True)
+    crops = [crop(image, rng, position < samples) for image, rng, position in pairs]
+    grids = [grid(image, rng) for image, rng in zip(taken, rngs, strict=True)]
+    known, truth = ([torch.cat(part) for part in zip(*(c[i] for c in crops), strict=True)] for i in (0, 2))
+    rays = stacked([c[1] for c in crops])
+    count = sum(position < samples for position in positions)
+    return Batch(
+        Crops(Known(*known), rays, *truth, seeds, count),
+        Grids(*(torch.stack(part) for part in zip(*grids, strict=True))),
+    )
+
+
+def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Known, Rays, tuple[Tensor, Tensor]]:
+    """Known pixels, rays, and the truth (metres, reflectance), each (1, 1, 64, 256), of a part of an image.
+
+    A world somewhat larger or smaller, seen in a mirror half of the time, with reflectances of another response; the
+    carrier is unknown at times, and the tilt, since users do not know theirs either.
+    """
+    sensor, rows = _window(image.sensor, rng)
+    columns = (int(rng.integers(sensor.width)) + np.arange(WIDTH)) % sensor.width
+    scale = math.exp(rng.uniform(-SCALE, SCALE)) if rng.random() < 0.7 else 1.0
+    blocked = hidden(image.sensor)[rows]
+    told_sensor = sensor if rng.random() < 0.7 else replace(sensor, tilt=(0.0, 0.0))
+    told_sensor = replace(told_sensor, mount=told_sensor.mount * scale)
+    unaware = rng.random() < 0.3
+    rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns)
+    metres = image.range[rows][:, columns] * np.float32(scale)
+    reflectance, hole = image.reflectance[rows][:, columns], blocked[:, columns]
+    metres = np.where(metres < 250, metres, np.float32(0))
+    told = pattern(metres.shape, sensor.width, rng, sampled)
+    if rng.random() < 0.4:
+        told &= metres > 0
+    told = told & ~hole if unaware else told | hole
+    lit = told & (metres > 0) & (rng.random() >= 0.1)
+    if rng.random() < 0.3:
+        reflectance = np.minimum(reflectance ** math.exp(rng.normal(0, 0.25)) * rng.uniform(0.6, 1.2), 1)
+    arrays = [metres, reflectance * (metres > 0), told, told & (metres > 0), lit]
+    below = HEIGHT - len(metres)
+    full = [np.pad(a, ((0, below), (0, 0)), constant_values=a is told) for a in arrays]
+    if rng.random() < 0.5:
+        full = [a[:, ::-1] for a in full]
+        rays = Rays(*(part.flip(3) for part in rays))
+    r, f, told, returned, lit = (
+        torch.from_numpy(np.ascontiguousarray(a, a.dtype if a.dtype == bool else np.float32))[None, None] for a in full
+    )
+    rays = Rays(*(_to_height(part, below) for part in rays))
+    return Known(r * returned, f * lit, told, returned, lit), rays, (r, f)
+
+
+def _to_height(part: Tensor, below: int) -> Tensor:
+    """Rays of 32 rows with 32 more of padding below, copies of the last; those of 64 as they are."""
+    if part.shape[2] == 1 or part.shape[2] == HEIGHT:
+        return part
+    return torch.cat([part, part[:, :, -1:].expand(-1, -1, HEIGHT - part.shape[2], -1)], 2)
+
+
+def _window(sensor: Sensor, rng: np.random.Generator) -> tuple[Sensor, np.ndarray]:
+    """At most 64 beams: all, every second, or a run of 64; and their rows."""
+    if sensor.height <= HEIGHT:
+        return sensor, np.arange(sensor.height)
+    if sensor.height >= 2 * HEIGHT and rng.random() < 0.3:
+        rows = np.arange(int(rng.integers(2)), sensor.height, 2)[:HEIGHT]
+    else:
+        rows = int(rng.integers(sensor.height - HEIGHT + 1)) + np.arange(HEIGHT)
+    return sensor.rows(rows.tolist()), rows
+
+
+def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled: bool) -> np.ndarray:
+    """(H, W) bool, True = known, of a crop of a turn of `turn` columns.
+
+    The coarse stage's grids (most of what is `sampled`), every k-th beam, any beams, points, a lost sector, regions.
+    """
+    (height, width), kind = shape, rng.random()
+    known = np.zeros(shape, bool)
+    if kind < (0.6 if sampled else 0.12):
+        count, step = (16 if rng.random() < 0.75 else 8), max(1, round(turn / (128 if rng.random() < 0.8 else 256)))
+        rows = ((np.arange(count) + rng.random()) * height / count).astype(int)
+        known[np.ix_(np.unique(rows), np.arange(rng.integers(step), width, step))] = True
+    elif kind < 0.72:
+        step = int(rng.choice((2, 2, 3, 4, 4, 4, 6, 8)))
+        known[rng.integers(step) :: step] = True
+    elif kind < 0.79:
+        known[rng.random(height) < rng.uniform(1 / 8, 1 / 2)] = True
+    elif kind < 0.9:
+        known[:] = rng.random(shape) < 0.02 * 30 ** rng.random()
+    elif kind < 0.95:
+        known[:, int(rng.integers(8, width // 2)) :] = True
+        known = np.roll(known, int(rng.integers(width)), 1)
+    else:
+        known[:] = True
+        for _ in range(int(rng.integers(1, 4))):
+            tall, wide = int(rng.integers(2, height)), int(rng.integers(4, width // 3))
+            top, left = int(rng.integers(height - tall + 1)), int(rng.integers(width - wide))
+            known[top : top + tall, left : left + wide] = False
+    if rng.random() < 0.08:
+        known &= rng.random(shape) < rng.uniform(0.3, 1)
+    return known
+
+
+def grid(image: RangeImage, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Metres, reflectance, rays and standing elevations of an image at the coarse stage, any phase, maybe mirrored."""
+    rows, columns = grid_rows(image.shape[0], rng.random()), grid_columns(image.shape[1], rng.random())
+    rays, standing = grid_rays(image.sensor, hidden(image.sensor), rows, columns)
+    at = np.ix_(rows, columns)
+    metres = torch.from_numpy(np.where(image.range[at] < 250, image.range[at], 0).astype(np.float32))
+    reflectance = torch.from_numpy(image.reflectance[at].astype(np.float32))
+    if rng.random() < 0.5:
+        metres, reflectance, rays, standing = (part.flip(-1) for part in (metres, reflectance, rays, standing))
+        rays[4] *= -1  # the sine of the azimuth
+    assert metres.shape == (ROWS, COLUMNS)
+    return metres, reflectance, rays, standing

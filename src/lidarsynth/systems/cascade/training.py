@@ -1,0 +1,228 @@
+"""How the cascade learns: the fill by absolute errors and by energy scores, the coarse stage by flow matching."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarsynth.diffusion.denoiser import Denoiser
+from lidarsynth.diffusion.schedule import flow
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import BINS, LOWEST, CoarseUNet
+from lidarsynth.networks.fill_unet import Filled, FillUNet, Known, draw_noise
+from lidarsynth.networks.rays import Rays, decode_range, encode_range
+from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.systems.cascade.examples import Batch, Crops, draw, grid
+from lidarsynth.systems.cascade.model import BOUND, CascadeModel
+from lidarsynth.systems.diffusion.validation import strips
+from lidarsynth.training.randomness import sample_rng
+from lidarsynth.training.task import Phase, Task
+
+SEAM = 16  # columns at the ends of a crop that are not judged: beyond them its turn would go on
+FITTED = 256  # streets that the standards of the coarse stage are measured on
+
+
+class FillObjective(nn.Module):
+    """`objective(batch)` -> losses (n,) of the crops: `sample`, energy scores of two draws, and `median`, errors."""
+
+    def __init__(self, network: FillUNet):
+        super().__init__()
+        self.network = network
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        n, crops = batch.crops.samples, batch.crops
+        return {"sample": self._sample(crops, n), "median": self._median(crops, n)}
+
+    def _sample(self, crops: Crops, n: int) -> Tensor:
+        if n == 0:
+            return crops.metres[:0, 0, 0, 0]
+        known, rays, metres, reflectance = _part(crops, slice(None, n))
+        shape = (1, *metres.shape[2:])
+        draws = [draw_noise(shape, sample_rng(s, 0, k)) for k in (0, 1) for s in crops.seeds[:n]]
+        twice = (type(part)(*(torch.cat([t, t]) for t in part)) for part in (known, rays))
+        filled = self.network(*twice, torch.cat(draws).to(metres))
+        first, second = (joined(Filled(*(p[h] for p in filled)), known, rays) for h in (slice(None, n), slice(n, None)))
+        return energy_score(first, second, truth(metres, reflectance, rays))
+
+    def _median(self, crops: Crops, n: int) -> Tensor:
+        known, rays, metres, reflectance = _part(crops, slice(n, None))
+        noise = metres.new_zeros(len(metres), 3, *metres.shape[2:])
+        if not len(metres):
+            return metres[:, 0, 0, 0]
+        return absolute_errors(self.network(known, rays, noise), known, rays, metres, reflectance)
+
+
+class CoarseObjective(nn.Module):
+    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N)."""
+
+    def __init__(self, network: CoarseUNet):
+        super().__init__()
+        self.network = network
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        metres, reflectance, rays, standing = batch.grids
+        x_0 = self.network.encode(metres, reflectance, standing)
+        rngs = [sample_rng(seed, 1, 0) for seed in batch.crops.seeds]
+        t = torch.sigmoid(1.1 * torch.cat([torch.randn(1, generator=rng) for rng in rngs])).to(x_0)
+        eps = torch.stack([torch.randn(x_0.shape[1:], generator=rng) for rng in rngs]).to(x_0)
+        denoiser = Denoiser(self.network, flow(BOUND), "velocity", clip=False, condition=(rays,))
+        return {"layout": denoiser.loss(x_0, t, eps, gamma=None)}
+
+
+def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor]:
+    known, rays = (type(part)(*(t[chosen] for t in part)) for part in (crops.known, crops.rays))
+    return known, rays, crops.metres[chosen], crops.reflectance[chosen]  # type: ignore[return-value]
+
+
+def absolute_errors(filled: Filled, known: Known, rays: Rays, metres: Tensor, reflectance: Tensor) -> Tensor:
+    """(b,): of hidden returns, in code and metres, and of their reflectance; and the cross-entropy of returning.
+
+    The absolute error has the median as its optimum, in metres and in any code alike.
+    """
+    inside, returned = rays.inside > 0, metres > 0
+    hidden = ~known.told & inside
+    code = _mean((filled.code - encode_range(metres)).abs(), hidden & returned)
+    far = _mean((decode_range(filled.code) - metres).abs(), hidden & returned)
+    shade = _mean((filled.reflectance - reflectance).abs(), ~known.lit & inside & returned)
+    drop = _mean(F.binary_cross_entropy_with_logits(filled.logit, returned.float(), reduction="none"), hidden)
+    return 2 * code + 0.1 * far + 2 * shade + 0.5 * drop
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    """(b,) means over `mask`, but for the crop's ends."""
+    values, mask = values[..., SEAM:-SEAM], mask[..., SEAM:-SEAM]
+    return (values * mask).sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp_min(1)
+
+
+def joined(filled: Filled, known: Known, rays: Rays) -> Tensor:
+    """What energy scores compare, (b, 3, H, W): returns, range and reflectance, with known pixels as they are."""
+    share = torch.where(known.told, known.returned.float(), filled.logit.sigmoid())
+    code = torch.where(known.returned, encode_range(known.metres), filled.code)
+    shade = torch.where(known.lit, known.reflectance, filled.reflectance)
+    return _comparable(share, code, shade, rays)
+
+
+def truth(metres: Tensor, reflectance: Tensor, rays: Rays) -> Tensor:
+    """`joined` of what was measured."""
+    return _comparable((metres > 0).float(), encode_range(metres), reflectance, rays)
+
+
+def _comparable(share: Tensor, code: Tensor, shade: Tensor, rays: Rays) -> Tensor:
+    x = torch.cat([2 * share - 1, 3 * share * (code - encode_range(rays.ground)), 3 * share * shade], 1)
+    return (x * (rays.inside > 0))[..., SEAM:-SEAM]
+
+
+def energy_score(first: Tensor, second: Tensor, truth: Tensor) -> Tensor:
+    """(b,): E|X - y| - E|X - X'| / 2 of two draws, lowest when draws are distributed as the truth (Gneiting & Raftery
+    2007), summed over pixels and patches of values, and of differences to the next pixel along a ring and below, for
+    texture."""
+    total = truth.new_zeros(len(truth))
+    for size, weight in (((1, 1), 1.0), ((2, 4), 1.0), ((8, 16), 0.5)):
+        total = total + weight * _score(first, second, truth, size)
+    for textures in zip(*map(_differences, (first, second, truth)), strict=True):
+        for size in ((1, 1), (2, 8)):
+            total = total + 0.5 * _score(*textures, size)
+    return total
+
+
+def _score(first: Tensor, second: Tensor, truth: Tensor, size: tuple[int, int]) -> Tensor:
+    to_truth = (_distance(first, truth, size) + _distance(second, truth, size)) / 2
+    return to_truth - _distance(first, second, size) / 2
+
+
+def _distance(a: Tensor, b: Tensor, size: tuple[int, int]) -> Tensor:
+    """(b,): Euclidean distances of patches, on average."""
+    squares = (a - b).square().sum(1, keepdim=True)
+    if size != (1, 1):
+        squares = F.avg_pool2d(squares, size)
+    return (squares + 1e-6).sqrt().mean((1, 2, 3))
+
+
+def _differences(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps along a ring and to the beam below, of range (small ones stretched) and reflectance."""
+    steps = x[:, 1:, :, 1:] - x[:, 1:, :, :-1], x[:, 1:, 1:] - x[:, 1:, :-1]
+    along, down = (torch.cat([torch.asinh(12 * d[:, :1]) / 2, d[:, 1:]], 1) for d in steps)
+    return along, down
+
+
+def fit_standard(network: CoarseUNet, images: Sequence[RangeImage]) -> None:
+    """Measure mean and spread of range code and reflectance by standing elevation, smoothed over five degrees."""
+    sums, rng = np.zeros((2, 3, BINS)), np.random.default_rng(0)
+    for image in images:
+        metres, reflectance, _, standing = grid(image, rng)
+        returned = (metres > 0).numpy()
+        place = np.clip(np.round(np.degrees(standing.numpy())[returned]) - LOWEST, 0, BINS - 1).astype(int)
+        for channel, values in enumerate((encode_range(metres), 2 * reflectance - 1)):
+            chosen = values.numpy()[returned]
+            for power in range(3):
+                sums[channel, power] += np.bincount(place, chosen**power, BINS)
+    kernel = np.array([1, 2, 3, 2, 1]) / 9
+    count, total, square = np.apply_along_axis(
+        lambda s: np.convolve(np.pad(s, 2, mode="edge"), kernel, "valid"), 2, sums
+    ).transpose(1, 0, 2)
+    mean = total / np.maximum(count, 1e-9)
+    spread = np.sqrt(np.maximum(square / np.maximum(count, 1e-9) - mean**2, 1e-4))
+    seen, degrees = count[0] > 20, np.arange(BINS)
+    tables = [[np.interp(degrees, degrees[seen], row[seen]) for row in table] for table in (mean, spread)]
+    network.standard.copy_(torch.tensor(np.array(tables)))
+
+
+def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
+    """The fill's part and the coarse stage's; the standards of a fresh coarse stage are measured on virtual streets."""
+    assert isinstance(network, Cascade)
+    if bool((network.coarse.standard[1] == 1).all()):
+        streets = VirtualStreets(experiment.training.seed + 1, FITTED)
+        fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
+    return Phase(FillObjective(network.fill), "fill"), Phase(CoarseObjective(network.coarse), "coarse")
+
+
+def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.optim.Optimizer]:
+    """AdamW for each stage; the coarse one at half the rate."""
+    assert isinstance(network, Cascade)
+    training = experiment.training
+    coarse = {"params": list(network.coarse.parameters()), "factor": 0.5}
+    options = {"lr": training.learning_rate, "betas": training.betas, "weight_decay": 0.01}
+    return {"fill": torch.optim.AdamW(network.fill.parameters(), **options),
+            "coarse": torch.optim.AdamW([coarse], **options)}  # fmt: skip
+
+
+@torch.no_grad()
+def judge(experiment: Experiment, network: nn.Module, images: Sequence[RangeImage]) -> dict[str, float]:
+    """Mean absolute errors of hidden pixels, in metres, with every second and every fourth beam known."""
+    assert isinstance(network, Cascade)
+    errors: dict[str, float] = {}
+    for every in (2, 4):
+        for image in images:
+            model = CascadeModel(network, image.sensor, experiment)
+            known = np.zeros(image.shape, bool)
+            known[::every] = True
+            filled = model.complete(image.keep(known), known)
+            error = float(np.abs(filled.range - image.range)[~known].mean())
+            errors[f"beams_{every}"] = errors.get(f"beams_{every}", 0.0) + error / len(images)
+    return errors
+
+
+def pictures(
+    experiment: Experiment, network: nn.Module, images: Sequence[RangeImage], count: int = 2
+) -> list[np.ndarray]:
+    """Pictures (H', W', 3) uint8 of scans generated in the sensors of the images."""
+    assert isinstance(network, Cascade)
+    models = [CascadeModel(network, image.sensor, experiment) for image in images[:count]]
+    return [strips(model.generate(1, seed=i)[0]) for i, model in enumerate(models)]
+
+
+CASCADE = Task(
+    parts=("sample", "median", "layout"),
+    draw=draw,
+    phases=phases,
+    judge=judge,
+    pictures=pictures,
+    optimizers=optimizers,
+    buffers=False,
+)

@@ -1,0 +1,111 @@
+"""The cascade's training: proper scores, patterns, standards, and a run of the command line's own loop."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import with_fields
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.networks.coarse_unet import BINS, CoarseUNet, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.fill_unet import Filled, Known
+from lidarsynth.networks.rays import encode_range, rays_of
+from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.systems.cascade.examples import crop, pattern
+from lidarsynth.systems.cascade.training import absolute_errors, energy_score, fit_standard
+from lidarsynth.training.options import Options
+from lidarsynth.verbs.training import run
+
+TINY = with_fields(
+    preset("cascade"),
+    {"model.base_channels": 16, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1),
+     "training.batch_size": 2, "training.steps": 2, "training.warmup": 0, "model.gn_num_groups": 8},
+)  # fmt: skip
+
+
+def test_the_energy_score_is_lowest_for_the_true_distribution():
+    rng = torch.Generator().manual_seed(0)
+
+    def score(mean: float, spread: float) -> float:
+        first, second = (mean + spread * torch.randn(64, 3, 16, 32, generator=rng) for _ in range(2))
+        return energy_score(first, second, torch.randn(64, 3, 16, 32, generator=rng)).mean().item()
+
+    true = score(0, 1)
+    assert true < min(score(0, 0.3), score(0, 2), score(0.5, 1))
+
+
+def test_a_copy_of_the_truth_scores_nothing():
+    truth = torch.randn(2, 3, 16, 32, generator=torch.Generator().manual_seed(1))
+    assert_close(energy_score(truth, truth, truth), torch.zeros(2), atol=3e-3, rtol=0)
+
+
+def test_absolute_errors_count_hidden_returns_of_the_sensor_alone():
+    sensor = SENSORS["vlp-16"]
+    rays = rays_of(sensor, sensor.blocked_rays(), np.arange(64))
+    shape = rays.elevation.shape
+    metres = torch.full(shape, 10.0)
+    told = torch.zeros(shape, dtype=torch.bool)
+    told[:, :, :4] = True
+    known = Known(metres, metres / 50, told, told, told)
+    code = encode_range(metres).clone()
+    code[:, :, :4] += 1  # known
+    code[:, :, 16:] += 1  # padding
+    code[..., :16] += 1  # beyond the seam
+    filled = Filled(code, metres / 50, torch.full(shape, 50.0))
+    assert_close(absolute_errors(filled, known, rays, metres, metres / 50), torch.zeros(1), atol=1e-5, rtol=0)
+    code[:, :, 8, 30] += 0.1
+    assert absolute_errors(Filled(code, *filled[1:]), known, rays, metres, metres / 50).item() > 0
+
+
+@pytest.mark.parametrize("index", range(0, 32, 4))
+def test_crops_tell_the_truth_and_nothing_else(index: int):
+    image = VirtualStreets(6, 32).image(index)
+    known, rays, (metres, reflectance) = crop(image, np.random.default_rng(index), index % 8 == 0)
+    assert metres.shape == reflectance.shape == rays.ground.shape == (1, 1, 64, 256)
+    assert torch.equal(known.metres, metres * known.returned)
+    assert not bool((known.returned & ~known.told).any())
+    assert not bool((known.lit & ~known.returned).any())
+    assert bool(known.told[rays.inside == 0].all())
+    assert not bool(((metres > 0) & (rays.inside == 0)).any())
+    assert not bool((rays.blocked.bool() & (metres > 0)).any())
+
+
+def test_patterns_leave_something_known_and_something_to_learn():
+    shares = [pattern((64, 256), 1024, np.random.default_rng(i), i % 2 == 0).mean() for i in range(200)]
+    assert 0 < min(shares) < 0.02
+    assert max(shares) < 1
+    assert 0.1 < np.mean(shares) < 0.5
+
+
+def test_standards_make_the_ground_as_wide_as_the_horizon():
+    network = CoarseUNet(16, (1, 1, 1, 1), 1)
+    streets = VirtualStreets(6, 64)
+    images = [streets.image(i) for i in range(0, 64, 2)]
+    fit_standard(network, images)
+    assert network.standard.shape == (2, 2, BINS)
+    values = []
+    for image in images:
+        rows, columns = grid_rows(image.shape[0]), grid_columns(image.shape[1])
+        _, standing = grid_rays(image.sensor, image.sensor.blocked_rays(), rows, columns)
+        at = np.ix_(rows, columns)
+        metres, reflectance = (
+            torch.from_numpy(v[at].astype(np.float32))[None] for v in (image.range, image.reflectance)
+        )
+        x_0, low = network.encode(metres, reflectance, standing[None]), (standing < np.radians(-10))[None]
+        values.append(x_0[:, 0][low & (metres > 0)])
+    assert 0.6 < torch.cat(values).std().item() < 1.6
+
+
+@pytest.mark.slow
+def test_a_run_trains_both_stages_and_goes_on(tmp_path):
+    before = None
+    for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
+        before = before or progress
+    losses = progress.losses
+    assert {"sample", "median", "layout"} <= losses.keys()
+    assert all(np.isfinite(value) for value in losses.values())
+    from lidarsynth import load
+
+    model = load(tmp_path / "run")
+    assert model.generate(1, steps=1)[0].shape == (64, 1024)
