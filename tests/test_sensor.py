@@ -115,7 +115,7 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
     [
         ("", r"expected elevations, or beams with top and bottom, found \[\]"),
         ("width = 100", r"expected elevations, or beams with top and bottom, found \['width'\]"),
-        ("elevation = [1, 2]", r"expected the fields \['blocked', 'edges', .*\] or .*, found \['elevation'\]"),
+        ("elevation = [1, 2]", r"expected the fields \['blocked', .*\] or .*, found \['elevation'\]"),
         ("beams = 4\ntop = 1", r"expected the fields .* found \['beams', 'top'\]"),
         ("beams = 0\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found 0"),
         ("beams = 2.5\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found 2.5"),

@@ -33,6 +33,7 @@ class Sensor:
     tilt        pitch (nose up) and roll (left side up) of the sensor against the road, in degrees
     blocked     rays that end on the carrier and never return, as (row, first column, last column), columns included;
                 a run whose first column is behind its last goes around the seam
+    dimness     how much less signal each beam reports than others, or () where it is not known
 
     Raises ValueError when a value makes no sense.
     """
@@ -47,6 +48,7 @@ class Sensor:
     mount: float = 1.73
     tilt: tuple[float, float] = (0.0, 0.0)
     blocked: tuple[tuple[int, int, int], ...] = ()
+    dimness: tuple[float, ...] = ()
 
     def __post_init__(self):
         steps = np.diff(self.elevations)
@@ -63,6 +65,9 @@ class Sensor:
                              f"got {len(self.offsets)}")  # fmt: skip
         if len(self.tilt) != 2 or not all(abs(angle) < 90 for angle in self.tilt):
             raise ValueError(f"sensor {self.name}: expected a tilt of two angles within 90 degrees, got {self.tilt}")
+        if self.dimness and len(self.dimness) != len(self.elevations):
+            raise ValueError(f"sensor {self.name}: dimness must have one number per beam ({len(self.elevations)}), "
+                             f"got {len(self.dimness)}")  # fmt: skip
         for run in self.blocked:
             inside = len(run) == 3 and 0 <= run[0] < self.height and all(0 <= c < self.width for c in run[1:])
             if not inside:
@@ -129,7 +134,9 @@ class Sensor:
             for row, first, last in self.blocked
             if row in place and (first > last or int(first * scale) < int((last + 1) * scale))
         )
-        return replace(self, name=name, elevations=pick, width=width, offsets=offsets, blocked=blocked)
+        dimness = tuple(self.dimness[i] for i in rows) if self.dimness else ()
+        parts = {"elevations": pick, "offsets": offsets, "blocked": blocked, "dimness": dimness}
+        return replace(self, name=name, width=width, **parts)
 
     def denser(self, times: int) -> Sensor:
         """The sensor with `times` - 1 beams more between each two, evenly; row i becomes row `times` * i.
@@ -141,6 +148,7 @@ class Sensor:
         own, place = np.arange(self.height), np.arange((self.height - 1) * times + 1) / times
         elevations = tuple(np.interp(place, own, self.elevations).tolist())
         offsets = tuple(np.interp(place, own, self.offsets).tolist()) if self.offsets else ()
+        dimness = tuple(np.interp(place, own, self.dimness).tolist()) if self.dimness else ()
         blocked = tuple(
             (row, first, last)
             for beam, first, last in self.blocked
@@ -149,7 +157,7 @@ class Sensor:
             )
         )
         name = f"{self.name}x{times}"
-        return replace(self, name=name, elevations=elevations, offsets=offsets, blocked=blocked)
+        return replace(self, name=name, elevations=elevations, offsets=offsets, blocked=blocked, dimness=dimness)
 
     def to_dict(self) -> dict:
         """Plain lists and numbers, the inverse of `from_dict`."""
@@ -177,10 +185,10 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
     if not isinstance(values.get("width", 4), int):
         raise ValueError(f"{source}: expected a whole number of columns as width, found {values['width']!r:.60}")
-    elevations, offsets = _numbers(values["elevations"], source), _numbers(values.get("offsets", ()), source)
-    if offsets and len(offsets) == len(elevations):  # each height goes with its beam
-        elevations, offsets = zip(*sorted(zip(elevations, offsets, strict=True), reverse=True), strict=True)
-    values |= {"elevations": tuple(sorted(elevations, reverse=True)), "offsets": tuple(offsets)}
+    beams = {key: _numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
+    order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
+    for key, numbers in beams.items():  # each number goes with its beam
+        values[key] = tuple(numbers[i] for i in order) if len(numbers) == len(order) else tuple(numbers)
     values |= {"tilt": tuple(_numbers(values.get("tilt", (0.0, 0.0)), source)), "blocked": _runs(values, source)}
     try:
         return Sensor(**{"name": source, **values})

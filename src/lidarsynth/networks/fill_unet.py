@@ -14,7 +14,7 @@ from lidarsynth.networks.rays import Rays, encode_range
 
 STEM = (4, 2)  # rows, columns of the patches that become channels
 NOISES = 3  # per pixel, along a ring, in patches
-INPUTS = 29
+INPUTS = 30
 OUTPUTS = (RANGE_CANDIDATES + 2) + (REFLECTANCE_CANDIDATES + 1 + NOISES) + (1 + NOISES)
 PRIOR = 2.0  # score of the first guess before any training
 
@@ -171,6 +171,7 @@ def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tens
             *steps,
             rays.blocked.expand_as(told),
             rays.inside.expand_as(told),
+            10 * rays.dimness * full,
         ],
         1,
     )

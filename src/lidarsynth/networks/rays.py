@@ -22,7 +22,8 @@ class Rays(NamedTuple):
 
     elevation, azimuth; up, down: elevation steps (B, 1, H, 1) to the next beam above and below, 0 at the ends;
     across: azimuth step (B, 1, 1, 1); ground: metres to flat ground; blocked: 1 where a ray never returns; inside: 1
-    for a beam of the sensor, 0 for a row of padding.
+    for a beam of the sensor, 0 for a row of padding; dimness (B, 1, H, 1): how much less signal a beam reports than the
+    mean beam, so that a network knows the stripes of its reflectance; 0 where nobody has measured it.
     """
 
     elevation: Tensor
@@ -33,6 +34,7 @@ class Rays(NamedTuple):
     ground: Tensor
     blocked: Tensor
     inside: Tensor
+    dimness: Tensor
 
 
 def encode_range(metres: Tensor) -> Tensor:
@@ -63,10 +65,16 @@ def padded(sensor: Sensor) -> tuple[int, int]:
     return ROWS * math.ceil(sensor.height / ROWS), COLUMNS * math.ceil(sensor.width / COLUMNS)
 
 
-def rays_of(sensor: Sensor, blocked: np.ndarray, columns: Sequence[int] | np.ndarray | None = None) -> Rays:
+def rays_of(
+    sensor: Sensor,
+    blocked: np.ndarray,
+    columns: Sequence[int] | np.ndarray | None = None,
+    dimness: Sequence[float] = (),
+) -> Rays:
     """The sensor's rays as one padded image.
 
     blocked  (H, W) bool: rays that never return
+    dimness  per beam, or () where it is not known
     columns  which columns of the turn, in multiples of 16; None = all, and the first ones again up to a multiple
     """
     height, width = padded(sensor)
@@ -79,6 +87,7 @@ def rays_of(sensor: Sensor, blocked: np.ndarray, columns: Sequence[int] | np.nda
     mount = sensor.mount + np.concatenate([offsets, np.zeros(extra)])
     step = np.abs(np.diff(own))
     ends = np.zeros(extra + 1)
+    dim = np.asarray(dimness or np.zeros(sensor.height))
     parts = (
         np.broadcast_to(elevation[:, None], (height, len(chosen))),
         np.broadcast_to(azimuth[None], (height, len(chosen))),
@@ -88,6 +97,7 @@ def rays_of(sensor: Sensor, blocked: np.ndarray, columns: Sequence[int] | np.nda
         ground_range(level_sines(sensor, elevation, azimuth), mount[:, None]),
         np.concatenate([blocked[:, chosen], np.zeros((extra, len(chosen)), bool)]),
         np.broadcast_to((np.arange(height) < sensor.height)[:, None], (height, len(chosen))),
+        np.concatenate([dim - dim.mean(), np.zeros(extra)])[:, None],
     )
     return Rays(*(torch.from_numpy(np.ascontiguousarray(part, np.float32))[None, None] for part in parts))
 

@@ -105,3 +105,8 @@ def lasers(sensor: Sensor, loss: Table = (), dip: Table = (), shift: Table = ())
 def hidden(sensor: Sensor) -> np.ndarray:
     """(H, W) bool: rays that end on the carrier: those blocked by name, and those of KITTI's own car."""
     return own_car(sensor) | sensor.blocked_rays()
+
+
+def dimness(sensor: Sensor) -> Table:
+    """How much less signal each beam reports, () where nobody has measured it."""
+    return RING_LOSS if sensor.name == NAME else sensor.dimness

@@ -77,7 +77,8 @@ def draw_sensor(rng: np.random.Generator, known_share: float = 0.5) -> VirtualSe
         sensor = Sensor("virtual", _elevations(rng), width, nearest, limit, mount=mount, tilt=tilt)
     if rng.random() < 0.5:
         sensor = replace(sensor, blocked=_carrier(rng, sensor))
-    return VirtualSensor(sensor, _optics(rng, sensor))
+    optics = _optics(rng, sensor)
+    return VirtualSensor(replace(sensor, dimness=optics.loss), optics)
 
 
 def _elevations(rng: np.random.Generator) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
-from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
@@ -74,7 +74,7 @@ def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Kn
     """Known pixels, rays, and the truth (metres, reflectance), each (1, 1, 64, 256), of a part of an image.
 
     A world somewhat larger or smaller, seen in a mirror half of the time, with reflectances of another response; the
-    carrier is unknown at times, and the tilt, since users do not know theirs either.
+    carrier is unknown at times, and the tilt and the beams' dimness, since users do not know theirs either.
     """
     sensor, rows = _window(image.sensor, rng)
     columns = (int(rng.integers(sensor.width)) + np.arange(WIDTH)) % sensor.width
@@ -83,7 +83,8 @@ def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Kn
     told_sensor = sensor if rng.random() < 0.7 else replace(sensor, tilt=(0.0, 0.0))
     told_sensor = replace(told_sensor, mount=told_sensor.mount * scale)
     unaware = rng.random() < 0.3
-    rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns)
+    dim = tuple(np.asarray(dimness(image.sensor))[rows]) if dimness(image.sensor) and rng.random() < 0.6 else ()
+    rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns, dim)
     metres = image.range[rows][:, columns] * np.float32(scale)
     reflectance, hole = image.reflectance[rows][:, columns], blocked[:, columns]
     metres = np.where(metres < 250, metres, np.float32(0))

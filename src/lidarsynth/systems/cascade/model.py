@@ -23,7 +23,7 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import NOISES, Known, draw_noise
 from lidarsynth.networks.rays import decode_range, padded, rays_of
-from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, known_pixels, sensor_that_made, with_known
 
 METHODS = ("auto", "conditional", "sample", "repaint")
@@ -245,7 +245,7 @@ class CascadeModel(ScanModel):
         """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples."""
         count, (height, width) = len(metres), padded(self.sensor)
         known = _known(metres, reflectance, told, lit, (height, width))
-        rays = rays_of(self.sensor, self._blocked)
+        rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
             noise = torch.cat([draw_noise((1, height, width), generator) for generator in rng])
