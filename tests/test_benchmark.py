@@ -120,12 +120,12 @@ class Counted:
         self._count(seed)
         return self.model.generate(n, steps, seed, sampler, batch_size)
 
-    def complete(self, scan, known, method="auto", steps=None, resamples=10, sampler=None, seed=0):
+    def complete(self, scan, known, method="auto", steps=None, resamples=None, sampler=None, seed=0):
         self._count(seed)
         return self.model.complete(scan, known, method, steps, resamples, sampler, seed)
 
-    def evaluations(self, method="auto", steps=None, resamples=10):
-        return self.model.evaluations(method, steps, resamples)
+    def evaluations(self, method="auto", steps=None, resamples=None, sampler=None):
+        return self.model.evaluations(method, steps, resamples, sampler)
 
     def generation_steps(self, steps=None, sampler=None):
         return self.model.generation_steps(steps, sampler)

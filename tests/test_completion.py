@@ -9,13 +9,17 @@ import pytest
 from networks import trained
 
 from lidarsynth.experiment.presets import preset
+from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.lidar.measured import rays_with_points, with_measured
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.systems.assemble import assemble
 from lidarsynth.systems.diffusion.model import LidarModel
-from lidarsynth.verbs.completion import complete_scan, interpolated, judged, named_sensor, upsample_scan, with_measured
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.interpolation.model import interpolated
+from lidarsynth.verbs.completion import complete_scan, judged, named_sensor, upsample_scan
 
 FLAT = Sensor("flat", (2.0, 0.0, -2.0, -4.0), width=8, min_range=1.0, max_range=50.0)
 
@@ -119,6 +123,73 @@ def test_a_ray_that_went_beyond_the_limits_stays_empty(model: LidarModel):
     assert np.isin(rows_of(far), rows_of(filled.points)).all()
 
 
+# one door
+
+
+@pytest.mark.parametrize("word", ["tiny", "bilinear", "iln-tiny", "tiny-gan"])
+def test_the_library_completes_as_the_command_line_does(word: str):
+    """Rays with any point are known, and every measured point stays, whichever of the two is asked."""
+    model = assemble(preset(word), trained(preset(word)))
+    recipe, steps = ("beams:2" if word == "iln-tiny" else "points:0.5"), (1 if word != "tiny-gan" else 2)
+    sensor = model.sensor
+    seen = room(sensor, holes=0)
+    ahead = np.abs(np.arctan2(seen.xyz[:, 1], seen.xyz[:, 0])) < 0.5
+    seen = replace(seen, xyz=np.where(ahead[:, None], seen.xyz * np.float32(40), seen.xyz))
+    drawn = model.image_of(room(sensor, holes=0)).keep(corrupt(model.image_of(room(sensor, holes=0)), recipe))
+    assert seen.ring is not None
+    sparse = seen[drawn.mask[seen.ring, np.tile(np.arange(sensor.width), sensor.height)]]
+    sparse = replace(sparse, ring=None)
+    asked, told = model.complete(sparse, steps=steps), complete_scan(model, sparse, how=Filling(steps=steps))
+    np.testing.assert_array_equal(asked.range, told.image.range)
+    np.testing.assert_array_equal(asked.mask, told.image.mask)
+    np.testing.assert_array_equal(rows_of(asked.to_scan()), rows_of(told.points))
+    if word != "tiny-gan":  # which knows no reflectance, and what was measured has one
+        assert np.isin(rows_of(sparse), rows_of(asked.to_scan())).all(), "bit by bit"
+    there = rays_with_points(sparse, sensor, model.experiment.data.projection) & ~model.image_of(sparse).mask
+    assert there.any()
+    assert not asked.mask[there].any(), "nothing stands before a point beyond the limits"
+
+
+@pytest.mark.parametrize("word", ["tiny", "bilinear", "iln-tiny"])
+def test_the_library_upsamples_as_the_command_line_does(word: str):
+    model, scan = assemble(preset(word), trained(preset(word))), room(SENSORS["vlp-16"].resized(width=64))
+    far = replace(scan, xyz=np.where(scan.xyz[:, :1] > 8, scan.xyz * np.float32(40), scan.xyz))
+    asked = model.upsample(far, "vlp-16", steps=1)
+    told = upsample_scan(model, far, SENSORS["vlp-16"], Filling(steps=1))
+    np.testing.assert_array_equal(asked.range, told.image.range)
+    np.testing.assert_array_equal(rows_of(asked.to_scan()), rows_of(told.points))
+    assert np.isin(rows_of(far), rows_of(asked.to_scan())).all()
+
+
+def test_pixels_that_are_not_wanted_are_not_among_the_points(model: LidarModel):
+    """Whoever says what is known gets the image's points, not the ones that were hidden."""
+    scan = room(model.sensor.resized(width=256))
+    half = np.zeros((16, 64), bool)
+    half[:, :32] = True
+    asked = model.complete(scan, half)
+    assert asked.completed is None and len(asked.to_scan()) == asked.mask.sum()
+    assert model.complete(scan).keep(half).completed is None
+
+
+def test_what_would_be_ignored_is_refused(model: LidarModel):
+    scan = room(model.sensor)
+    for how, said in (
+        (Filling("repaint", sampler="nonsense"), "expected a sampler of .*, found 'nonsense'"),
+        (Filling("repaint", sampler="langevin"), "for repaint, found 'langevin'"),
+        (Filling("posterior", sampler="heun"), "expected no sampler, .* found 'heun'"),
+        (Filling("conditional", resamples=3), "expected no resamples, .* found 3"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            model.filled(scan, how)
+
+
+def test_repaint_takes_the_steps_of_the_sampler_that_is_named(model: LidarModel):
+    scan = room(model.sensor)
+    ddpm, again, ddim = (model.complete(scan, None, "repaint", 3, 2, s).range for s in (None, "ddpm", "ddim"))
+    np.testing.assert_array_equal(ddpm, again)
+    assert (ddpm != ddim).any()
+
+
 # the table
 
 
@@ -170,8 +241,9 @@ def test_progress_is_told_at_every_step(model: LidarModel):
     scan = room(SENSORS["hdl-64e-kitti"].resized(width=256))
     for method in ("conditional", "repaint"):
         calls.clear()
-        complete_scan(model, scan, None, method, 3, 2, on_step=lambda: calls.append(1))
-        assert len(calls) == model.evaluations(method, 3, 2)
+        how = Filling(method, 3, 2 if method == "repaint" else None)
+        complete_scan(model, scan, None, how, on_step=lambda: calls.append(1))
+        assert len(calls) == model.calls(model.resolved(how))
 
 
 def test_figures_have_a_row_per_image_and_views(model: LidarModel):

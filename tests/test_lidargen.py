@@ -470,7 +470,8 @@ def test_known_pixels_come_back_bit_by_bit(model, r2dm, recipe):
     truth = wall(1)
     known = corrupt(truth, recipe)
     for made, method in ((model, "auto"), (r2dm, "posterior"), (model, "repaint")):
-        result = made.complete(truth.keep(known), known, method, steps=2 if method == "repaint" else 16, resamples=2)
+        counts = {"steps": 2, "resamples": 2} if method == "repaint" else {"steps": 16}
+        result = made.complete(truth.keep(known), known, method, **counts)
         for field in ("range", "reflectance", "mask"):
             np.testing.assert_array_equal(getattr(result, field)[known], getattr(truth, field)[known])
         assert np.isfinite(result.range).all() and result.mask[~known].any()

@@ -137,7 +137,7 @@ def assert_known_is_kept(result: RangeImage, truth: RangeImage, known: np.ndarra
 def test_known_pixels_come_back_bit_by_bit(model, image, recipe, method):
     known = corrupt(image, recipe)
     steps = {"conditional": 2, "repaint": 2}[method]
-    result = model.complete(image.keep(known), known, method, steps=steps, resamples=2)
+    result = model.complete(image.keep(known), known, method, steps=steps, resamples=2 if method == "repaint" else None)
     assert_known_is_kept(result, image, known)
     hidden = ~known
     assert result.mask[hidden].any() and len(np.unique(result.range[hidden])) > 1
@@ -190,7 +190,7 @@ def test_completion_hears_the_known_pixels(model, image):
 def test_completion_does_not_see_the_hidden_pixels(model, image):
     known = corrupt(image, "beams:4")
     for method in ("conditional", "repaint"):
-        seen, hidden = (model.complete(i, known, method, steps=2, resamples=1) for i in (image, image.keep(known)))
+        seen, hidden = (model.complete(i, known, method, steps=2) for i in (image, image.keep(known)))
         np.testing.assert_array_equal(seen.range, hidden.range)
 
 
@@ -209,7 +209,7 @@ def test_the_same_seed_completes_the_same(model, image):
     assert (one != other).any()
 
 
-@pytest.mark.parametrize(("method", "steps", "resamples"), [("conditional", 3, 10), ("repaint", 3, 4)])
+@pytest.mark.parametrize(("method", "steps", "resamples"), [("conditional", 3, None), ("repaint", 3, 4)])
 def test_evaluations_are_foretold(model, image, method, steps, resamples):
     calls = []
     model.complete(image, None, method, steps, resamples, on_step=lambda: calls.append(1))

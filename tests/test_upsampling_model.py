@@ -21,10 +21,11 @@ from lidarsynth.networks.iln import ILN, LIIF, angle_queries
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
 from lidarsynth.systems.assemble import assemble
 from lidarsynth.systems.build import build_network
+from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated
 from lidarsynth.systems.tasks import TASKS
 from lidarsynth.systems.upsampling.model import UpsamplingModel, places, queries_at, scaled
-from lidarsynth.verbs.completion import complete_scan, into_sensor, upsample_scan
+from lidarsynth.verbs.completion import complete_scan, upsample_scan
 from lidarsynth.verbs.description import describe
 
 WORDS = ("lidar-sr", "iln", "liif")
@@ -247,7 +248,7 @@ def test_lidar_sr_makes_four_beams_of_each_of_another_sensor():
 
 def test_measured_points_stay_whatever_the_sensor(model):
     scan = sphere(SENSORS["vlp-16"], 20.0)
-    filled = upsample_scan(model, scan, SENSORS["vlp-16"], steps=1)
+    filled = upsample_scan(model, scan, SENSORS["vlp-16"], Filling(steps=1))
     measured = {tuple(p) for p in scan.xyz.tolist()}
     assert measured <= {tuple(p) for p in filled.points.xyz.tolist()} and len(filled.points) > len(scan)
     with pytest.raises(ValueError, match="at least 2 beams, found one"):
@@ -255,15 +256,15 @@ def test_measured_points_stay_whatever_the_sensor(model):
 
 
 def test_another_sensor_is_for_models_of_any_sensor():
-    assert into_sensor(model_of("liif"), "vlp-32c").sensor == SENSORS["vlp-32c"]
+    assert model_of("liif").into("vlp-32c").sensor == SENSORS["vlp-32c"]
     with pytest.raises(ValueError, match=r"divisible by 16, found 64 x 1800"):
-        into_sensor(model_of("lidar-sr"), "pandar64")
+        model_of("lidar-sr").into("pandar64")
     with pytest.raises(ValueError, match=r"tiny: expected a model of any sensor, .* for --to os1-64, found one of hdl"):
-        into_sensor(assemble(preset("tiny"), build_network(preset("tiny"))), "os1-64")
+        assemble(preset("tiny"), build_network(preset("tiny"))).into("os1-64")
 
 
 def test_completion_of_a_scan_is_judged_against_interpolation(model, image):
-    filled = complete_scan(model, image.to_scan(), "beams:4", steps=1)
+    filled = complete_scan(model, image.to_scan(), "beams:4", Filling(steps=1))
     assert set(filled.errors) == {"lidarsynth", "nearest", "bilinear", "bicubic", "left empty"}
     assert math.isfinite(filled.errors["lidarsynth"].range_mae)
 

@@ -13,7 +13,7 @@ def has_reflectance(model: ScanModel) -> bool:
 
 def completion_evaluations(model: ScanModel, method: UpsamplingMethod) -> int:
     """Network evaluations per scan. Raises ValueError for what the model cannot do."""
-    return model.evaluations(method.method or "auto", method.steps_asked, method.resamples or 10)
+    return model.evaluations(method.method or "auto", method.steps_asked, method.resamples, method.sampler)
 
 
 def generation_evaluations(model: ScanModel, method: GenerationMethod) -> int:

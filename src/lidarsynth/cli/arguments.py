@@ -37,7 +37,7 @@ Steps = Annotated[
         help="network steps; default 1 where conditional, 32 where repaint, 1161 where posterior, 500 where inversion.",
     ),
 ]
-Resamples = Annotated[int, arg(help="passes over each step of repaint.")]
+Resamples = Annotated[int | None, arg(metavar="INT", help="passes over each step of repaint; default 10.")]
 Intensity = Annotated[
     Literal["auto", "unit", "byte", "uint16", "none"],
     arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),

@@ -29,7 +29,7 @@ def complete(
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
-    resamples: Resamples = 10,
+    resamples: Resamples = None,
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
@@ -40,18 +40,19 @@ def complete(
     With --corrupt a part of the scan is hidden first. The file then holds what the rest was filled to, and the errors
     of the hidden pixels are printed beside those of interpolation.
     """
+    from lidarsynth.systems.filling import Filling
     from lidarsynth.verbs.completion import complete_scan
     from lidarsynth.verbs.description import errors_table, mean_table
     from lidarsynth.verbs.output_files import targets
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
-    loaded, tables = None, []
+    how, loaded, tables = Filling(method, steps, resamples, seed=seed), None, []
     for path, target in targets(scans, out):
         scan = read_scan(path, intensity)
         loaded = loaded or load_with_bar(model, device)
-        with step_bar(path.name, loaded.evaluations(method, steps, resamples)) as on_step:
-            filled = complete_scan(loaded, scan, corrupt, method, steps, resamples, seed, on_step)
+        with step_bar(path.name, loaded.calls(loaded.resolved(how))) as on_step:
+            filled = complete_scan(loaded, scan, corrupt, how, on_step)
         write_filled(target, filled, picture)
         if filled.errors:
             say(errors_table(path.name, filled.errors))

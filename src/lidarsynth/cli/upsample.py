@@ -32,14 +32,15 @@ def upsample(
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
-    resamples: Resamples = 10,
+    resamples: Resamples = None,
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
     picture: Picture = True,
 ) -> None:
     """Make a scan of a sensor with few beams dense: every measured point stays, bit by bit, and new ones are added."""
-    from lidarsynth.verbs.completion import into_sensor, named_sensor, upsample_scan
+    from lidarsynth.systems.filling import Filling
+    from lidarsynth.verbs.completion import named_sensor, upsample_scan
     from lidarsynth.verbs.output_files import target
 
     at_least(1, {"steps": steps, "resamples": resamples})
@@ -48,8 +49,9 @@ def upsample(
     sparse = read_scan(scan, intensity)
     sensor = named_sensor(sparse, scan, "--from", sensor_in)
     loaded = load_with_bar(model, device)
-    loaded = into_sensor(loaded, sensor_out) if sensor_out else loaded
-    with step_bar(scan.name, loaded.evaluations(method, steps, resamples)) as on_step:
-        filled = upsample_scan(loaded, sparse, sensor, method, steps, resamples, seed, on_step)
+    loaded = loaded.into(sensor_out) if sensor_out else loaded
+    how = Filling(method, steps, resamples, seed=seed)
+    with step_bar(scan.name, loaded.calls(loaded.resolved(how))) as on_step:
+        filled = upsample_scan(loaded, sparse, sensor, how, on_step)
     say(f"{scan}: {len(sparse)} points of {sensor.name} became {len(filled.points)}")
     write_filled(out, filled, picture)

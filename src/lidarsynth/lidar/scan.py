@@ -54,6 +54,7 @@ class RangeImage:
     sensor       gives every pixel's ray angles
     label        (H, W) int, SemanticKITTI training class, 0 where nothing returned, or None
     xyz          (H, W, 3) float32, metres: the measured points themselves where the image came from a scan, or None
+    completed    every point of the scan that was completed to this image, bit by bit, with the new ones, or None
 
     Raises ValueError when a shape does not fit.
     """
@@ -64,6 +65,7 @@ class RangeImage:
     sensor: Sensor
     label: np.ndarray | None = None
     xyz: np.ndarray | None = None
+    completed: Scan | None = None
 
     def __post_init__(self):
         shape = (self.sensor.height, self.sensor.width)
@@ -86,7 +88,9 @@ class RangeImage:
         return np.where(np.any(self.xyz != 0, axis=-1, keepdims=True), self.xyz, rays)
 
     def to_scan(self) -> Scan:
-        """The measured pixels as points, row by row from the top; `ring` is the row."""
+        """The measured pixels as points, row by row from the top, `ring` the row; of a completed scan, `completed`."""
+        if self.completed is not None:
+            return self.completed
         rows = np.broadcast_to(np.arange(self.shape[0])[:, None], self.shape)
         label = None if self.label is None else self.label[self.mask]
         return Scan(self.points()[self.mask], self.reflectance[self.mask], ring=rows[self.mask], label=label)
@@ -106,4 +110,5 @@ class RangeImage:
             mask=mask,
             label=label,
             xyz=xyz,
+            completed=None,
         )

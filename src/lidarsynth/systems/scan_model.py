@@ -12,10 +12,12 @@ import torch
 from torch import nn
 
 from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.lidar.measured import rays_with_points, with_measured
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.hub import push
 
 if TYPE_CHECKING:
@@ -77,19 +79,28 @@ class ScanModel(ABC):
         """
         raise self._generates_nothing()
 
-    @abstractmethod
     def complete(
         self,
         scan: Scan | RangeImage,
         known: np.ndarray | None = None,
         method: str = "auto",
         steps: int | None = None,
-        resamples: int = 10,
+        resamples: int | None = None,
         sampler: str | None = None,
         seed: int = 0,
         on_step: OnStep = None,
     ) -> RangeImage:
-        """Fill what was not measured; pixels of `known` (H, W) bool come back exactly as they were."""
+        """Fill what was not measured; what was comes back exactly.
+
+        scan       points, or an image of this model's sensor
+        known      (H, W) bool: pixels to keep bit by bit, where an empty pixel means that nothing returned. None =
+                   those measured, and of points also rays that only have some beyond the range limits
+        method, steps, resamples, sampler  as `Filling` says; which words and defaults, the class of the model says
+
+        Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
+        Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
+        """
+        return self.filled(scan, Filling(method, steps, resamples, sampler, seed), known, on_step)
 
     def upsample(
         self,
@@ -99,16 +110,71 @@ class ScanModel(ABC):
         steps: int | None = None,
         seed: int = 0,
         on_step: OnStep = None,
+        resamples: int | None = None,
+        sampler: str | None = None,
     ) -> RangeImage:
-        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor.
+        """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor; else as `complete`.
 
         sensor_in  the sensor that made the scan; None = recognised from the points. Its beams tell which rows of the
-                   image were looked at; points outside this model's view are left out.
+                   image were looked at; points outside this model's view are kept by `to_scan()` alone.
 
         Raises ValueError when the sensor is not recognised or sees nothing that the model does.
         """
-        image, known = sparse_image(scan, sensor_that_made(scan, sensor_in), self.sensor)
-        return self.complete(image, known, method, steps, seed=seed, on_step=on_step)
+        return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed), sensor_in, on_step)
+
+    def filled(
+        self, scan: Scan | RangeImage, how: Filling, known: np.ndarray | None = None, on_step: OnStep = None
+    ) -> RangeImage:
+        """`complete` of a record."""
+        how, image = self.resolved(how), self.image_of(scan)
+        if known is not None or isinstance(scan, RangeImage):
+            return self.fill(image, known_pixels(image, known), how, on_step)
+        if not image.mask.any():
+            raise ValueError(f"expected points within {self.sensor.name}'s view, found none of {len(scan)} points")
+        projection = self.experiment.data.projection
+        filled = self.fill(image, image.mask | rays_with_points(scan, self.sensor, projection), how, on_step)
+        return replace(filled, completed=with_measured(scan, image.mask, filled, projection))
+
+    def upsampled(
+        self, scan: Scan, how: Filling, sensor_in: Sensor | str | None = None, on_step: OnStep = None
+    ) -> RangeImage:
+        """`upsample` of a record."""
+        how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
+        sparse, known = sparse_image(scan, sensor_in, self.sensor)
+        loose = replace(scan, ring=None)  # its rings are not the model's
+        known |= rays_with_points(loose, self.sensor, "spherical")
+        filled = self.fill_beams(scan, sensor_in, sparse, known, how, on_step)
+        return replace(filled, completed=with_measured(loose, sparse.mask, filled, "spherical"))
+
+    @abstractmethod
+    def resolved(self, how: Filling) -> Filling:
+        """The request with this model's own choices. Raises ValueError for what it cannot do, or would ignore."""
+
+    @abstractmethod
+    def calls(self, how: Filling) -> int:
+        """How often a resolved request calls `on_step`."""
+
+    @abstractmethod
+    def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
+        """The image, filled as a resolved request says; pixels of `known` (H, W) bool come back as they were."""
+
+    def fill_beams(
+        self,
+        scan: Scan,
+        sensor_in: Sensor,
+        sparse: RangeImage,
+        known: np.ndarray,
+        how: Filling,
+        on_step: OnStep = None,
+    ) -> RangeImage:
+        """`fill` of a scan of `sensor_in`, drawn into `sparse`; here without a look at its own beams."""
+        return self.fill(sparse, known, how, on_step)
+
+    def into(self, sensor: Sensor | str) -> ScanModel:
+        """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""
+        name = sensor if isinstance(sensor, str) else sensor.name
+        raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as iln, lidar-sr or bilinear, "
+                         f"for --to {name}, found one of {self.sensor.name} only")  # fmt: skip
 
     def image_of(self, scan: Scan | RangeImage) -> RangeImage:
         """The scan in this model's image. Raises ValueError for an image of another size."""
@@ -122,9 +188,15 @@ class ScanModel(ABC):
         """How often `generate` calls `on_step` per batch. Raises ValueError as `stream` does."""
         raise self._generates_nothing()
 
-    @abstractmethod
-    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
-        """How often `complete` calls `on_step`."""
+    def evaluations(
+        self,
+        method: str = "auto",
+        steps: int | None = None,
+        resamples: int | None = None,
+        sampler: str | None = None,
+    ) -> int:
+        """How often `complete` calls `on_step`. Raises ValueError for what this model cannot do."""
+        return self.calls(self.resolved(Filling(method, steps, resamples, sampler)))
 
     def push_to_hub(self, repo_id: str, private: bool = False, half: bool = False) -> str:
         """Upload the model, with a card filled in from its experiment, to `owner/name` of the Hugging Face hub.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,12 +15,14 @@ from lidarsynth.diffusion.samplers import STEPS, Rng, State, even_log_snr, gener
 from lidarsynth.experiment.record import Experiment, Score
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.systems.scan_model import OnStep, ScanModel, known_pixels, with_known
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.scan_model import OnStep, ScanModel, with_known
 
 METHODS = ("auto", "conditional", "repaint", "posterior")
 SAMPLERS = (*STEPS, "langevin")
+REPAINT_STEPS, REPAINT_RESAMPLES = 32, 10  # R2DM, section IV-C
 
 
 @dataclass(frozen=True)
@@ -69,37 +71,50 @@ class LidarModel(ScanModel):
             for x in _last(self._states(self.denoiser, x_1, rng, sampler, steps), on_step):
                 yield self._image(x)
 
-    def complete(
-        self,
-        scan: Scan | RangeImage,
-        known: np.ndarray | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        resamples: int = 10,
-        sampler: str | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """Fill what was not measured; measured pixels come back exactly as they were, in metres.
+    def resolved(self, how: Filling) -> Filling:
+        """The request with this model's own choices.
 
-        scan    points, or an image of this model's sensor
-        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
-        method  `conditional`: the network is told the known pixels (one step, or few); `repaint`: R2DM's way, for any
-                network; `posterior`: LiDARGen's, for any network; `auto`: conditional where the network can, else
-                posterior after score matching, else repaint
-        steps   default 1, which errs least; or 32 for repaint, where `resamples` passes go over each step; or, for
-                posterior, at most so many network evaluations, default 1161
+        method     `conditional`: the network is told the known pixels (one step, or few); `repaint`: R2DM's way, for
+                   any network; `posterior`: LiDARGen's, also for any; `auto`: conditional where the network can, else
+                   posterior after score matching, else repaint
+        steps      default 1 where conditional, which errs least; 32 where repaint, and `resamples` passes, default
+                   10, go over each step; where posterior, at most so many network evaluations, default 1161
+        sampler    of conditional any, default ddim; of repaint the one that takes its steps, default ddpm
 
-        A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
+        Raises ValueError for other words, and for what the method would ignore.
         """
-        image = self.image_of(scan)
-        known = known_pixels(image, known)
+        how, method = how.at_least_one(), self._method(how.method)
+        if how.sampler is not None and how.sampler not in SAMPLERS:
+            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {how.sampler!r}")
+        if method == "posterior":
+            how.without("resamples", "sampler", reason="since posterior is Langevin dynamics")
+            return replace(how, method=method)
+        if method == "conditional":
+            how.without("resamples", reason="which only repaint has")
+            steps = 1 if how.steps is None else how.steps
+            return replace(how, method=method, steps=steps, sampler=how.sampler or "ddim")
+        if how.sampler not in (None, *STEPS):
+            raise ValueError(f"expected a sampler of {', '.join(STEPS)} for repaint, found {how.sampler!r}")
+        steps, resamples = how.steps or REPAINT_STEPS, how.resamples or REPAINT_RESAMPLES
+        return replace(how, method=method, steps=steps, resamples=resamples, sampler=how.sampler or "ddpm")
+
+    def calls(self, how: Filling) -> int:
+        """How many network evaluations a resolved request takes; of heun as a sampler, half of them."""
+        if how.method == "posterior":
+            return self._langevin_calls(how.steps)
+        assert how.steps is not None
+        if how.method == "conditional":
+            return self._langevin_calls(how.steps) if how.sampler == "langevin" else how.steps
+        assert how.resamples is not None
+        return repaint.evaluations(how.steps, how.resamples)
+
+    def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
+        """The image, filled; one whose reflectance is 0 everywhere gets a reflectance."""
         x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
         mask = torch.from_numpy(known).to(self._device).expand(1, 2, *known.shape).clone()
         mask[:, 1] &= bool(image.reflectance[known].any())
-        calls = self.evaluations(method, steps, resamples)
-        states = self._completion(x_0, mask, self._method(method), steps, resamples, sampler, generators(seed, 1))
-        filled = self._image(_last(states, on_step, calls)[0])
+        states = self._completion(x_0, mask, how, generators(how.seed, 1))
+        filled = self._image(_last(states, on_step, self.calls(how))[0])
         return with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
@@ -107,15 +122,6 @@ class LidarModel(ScanModel):
         if self._sampler(sampler) != "langevin":
             return 32 if steps is None else steps
         return self._langevin_calls(steps)
-
-    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
-        """How many network evaluations `complete` takes."""
-        method = self._method(method)
-        if method == "posterior":
-            return self._langevin_calls(steps)
-        if method == "conditional":
-            return 1 if steps is None else steps
-        return repaint.evaluations(32 if steps is None else steps, resamples)
 
     def _method(self, method: str) -> str:
         if method not in METHODS:
@@ -134,28 +140,20 @@ class LidarModel(ScanModel):
             raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {sampler!r}")
         return sampler
 
-    def _completion(
-        self,
-        x_0: Tensor,
-        mask: Tensor,
-        method: str,
-        steps: int | None,
-        resamples: int,
-        sampler: str | None,
-        rng: Rng,
-    ) -> Iterator[State]:
+    def _completion(self, x_0: Tensor, mask: Tensor, how: Filling, rng: Rng) -> Iterator[State]:
         """The states of completing x_0 (1, 2, H, W) where `mask` is False; the last pull of `posterior` is one more."""
-        x_1 = self._start(x_0, rng, method == "posterior")
-        if method == "conditional":
-            told = self.denoiser.given(x_0, mask)
-            return self._states(told, x_1, rng, self._sampler(sampler or "ddim"), 1 if steps is None else steps)
-        if method == "repaint":
-            return repaint.repaint(
-                self.denoiser, x_1, x_0, mask, rng, steps=32 if steps is None else steps, resamples=resamples
+        x_1 = self._start(x_0, rng, how.method == "posterior")
+        if how.method == "posterior":
+            levels, per_level, rate = self._annealing(how.steps)
+            return langevin.langevin_posterior(
+                self.denoiser, x_1, x_0, mask, rng, levels=levels, steps=per_level, rate=rate, grid=even_log_snr
             )
-        levels, per_level, rate = self._annealing(steps)
-        return langevin.langevin_posterior(
-            self.denoiser, x_1, x_0, mask, rng, levels=levels, steps=per_level, rate=rate, grid=even_log_snr
+        assert how.steps is not None and how.sampler is not None
+        if how.method == "conditional":
+            return self._states(self.denoiser.given(x_0, mask), x_1, rng, how.sampler, how.steps)
+        assert how.resamples is not None
+        return repaint.repaint(
+            self.denoiser, x_1, x_0, mask, rng, STEPS[how.sampler], steps=how.steps, resamples=how.resamples
         )
 
     def _states(self, denoiser: Denoiser, x_1: Tensor, rng: Rng, sampler: str, steps: int) -> Iterator[State]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,12 +12,13 @@ from torch import Tensor
 from lidarsynth.diffusion.samplers import generators
 from lidarsynth.experiment.record import Adversarial, Experiment
 from lidarsynth.lidar.depth import from_x_0
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.gan.inverse_depth import to_inverse_depth
 from lidarsynth.networks.gan.inversion import invert, unit_rms
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, known_pixels, with_known
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, with_known
 
 METHODS = ("auto", "inversion")
 STEPS = 500  # of an inversion, as published
@@ -79,32 +80,27 @@ class GanModel(ScanModel):
                 on_step()
             yield from map(self._image, images)
 
-    def complete(
-        self,
-        scan: Scan | RangeImage,
-        known: np.ndarray | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        resamples: int = 10,
-        sampler: str | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """Fill what was not measured by the image that agrees best with it: inversion, i.e. auto-decoding.
+    def resolved(self, how: Filling) -> Filling:
+        """The request with this model's own choices: method inversion, in 500 steps of the optimiser as published."""
+        if how.method not in METHODS:
+            raise ValueError(f"{self.experiment.name}: expected a method of {', '.join(METHODS)}, found {how.method!r}")
+        self._refuse(how.sampler)
+        how.at_least_one().without("resamples", reason="which only repaint has")
+        return replace(how, method="inversion", steps=STEPS if how.steps is None else how.steps)
 
-        scan    points, or an image of this model's sensor
-        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
-        steps   of the optimiser; default 500
+    def calls(self, how: Filling) -> int:
+        """How many steps the optimiser takes."""
+        assert how.steps is not None
+        return how.steps
 
-        Measured pixels come back exactly as they were, in metres; reflectance is 0 everywhere, since the network knows
-        none. Filled pixels are those that return more likely than not. Raises ValueError for other methods, for a
-        sampler, and when nothing is measured.
+    def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
+        """The image that agrees best with what is known: inversion, i.e. auto-decoding.
+
+        Known pixels come back exactly as they were, in metres; reflectance is 0 everywhere, since the network knows
+        none. Filled pixels are those that return more likely than not. Raises ValueError when nothing is measured.
         """
-        self._refuse(sampler)
-        steps = self.evaluations(method, steps)
-        image = self.image_of(scan)
-        known = known_pixels(image, known)
-        w = self._inverted(image, known & image.mask, steps, torch.Generator().manual_seed(seed), on_step)
+        rng = torch.Generator().manual_seed(how.seed)
+        w = self._inverted(image, known & image.mask, self.calls(how), rng, on_step)
         with torch.no_grad():
             images = self.network.synthesize(w, torch.full((1, 1, 1, 1), 0.5, device=self._device)).image
         return with_known(self._image(images[0]), image, known, keep_reflectance=False)
@@ -115,14 +111,6 @@ class GanModel(ScanModel):
         if steps not in (None, 1):
             raise ValueError(f"{self.experiment.name}: expected no steps, since a GAN takes one, found {steps}")
         return 1
-
-    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
-        """How many steps the optimiser of `complete` takes. Raises ValueError for other methods."""
-        if method not in METHODS:
-            raise ValueError(f"{self.experiment.name}: expected a method of {', '.join(METHODS)}, found {method!r}")
-        if steps is not None and steps < 1:
-            raise ValueError(f"expected steps of at least 1, found {steps}")
-        return STEPS if steps is None else steps
 
     def _refuse(self, sampler: str | None) -> None:
         if sampler is not None:

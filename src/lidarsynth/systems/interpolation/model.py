@@ -9,10 +9,11 @@ import numpy as np
 import torch
 
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.interpolation import Interpolation, interpolate
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, known_pixels, with_known
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, with_known
 
 
 def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImage:
@@ -43,34 +44,22 @@ class InterpolationModel(ScanModel):
         sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
         return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor))
 
-    def complete(
-        self,
-        scan: Scan | RangeImage,
-        known: np.ndarray | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        resamples: int = 10,
-        sampler: str | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """Fill what was not measured; pixels of `known` (H, W) bool come back exactly as they were.
+    def resolved(self, how: Filling) -> Filling:
+        """The request itself. Raises ValueError for a method, a sampler or more than one step."""
+        name = self.experiment.name
+        if how.method != "auto" or how.steps not in (None, 1):
+            raise ValueError(f"{name}: expected method auto and 1 step, found {how.method} and {how.steps}")
+        if how.sampler is not None:
+            raise ValueError(f"{name}: expected no sampler, for nothing is sampled, found {how.sampler!r}")
+        return how.without("resamples", reason="which only repaint has")
 
-        Whole known beams are interpolated between their true rows, any other mask as `interpolate` says. Raises
-        ValueError when shapes do not fit, or for a method, a sampler or more than one step.
-        """
-        image = self.image_of(scan)
-        known = known_pixels(image, known)
-        self.evaluations(method, steps)
-        if sampler is not None:
-            raise ValueError(f"{self.experiment.name}: expected no sampler, for nothing is sampled, found {sampler!r}")
+    def calls(self, how: Filling) -> int:
+        """1, whatever is filled."""
+        return 1
+
+    def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
+        """The image, filled: whole known beams between their true rows, any other mask as `interpolate` says."""
         filled = interpolated(image, known, self.network.method)
         if on_step is not None:
             on_step()
         return with_known(filled, image, known, keep_reflectance=True)
-
-    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
-        """1, whatever is filled. Raises ValueError for another method or more steps."""
-        if method != "auto" or steps not in (None, 1):
-            raise ValueError(f"{self.experiment.name}: expected method auto and 1 step, found {method} and {steps}")
-        return 1

@@ -18,13 +18,11 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.iln import ILN, LIIF
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
+from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import (
     OnStep,
     ScanModel,
     imaged_by,
-    known_pixels,
-    sensor_that_made,
-    sparse_image,
     with_known,
 )
 
@@ -52,95 +50,80 @@ class UpsamplingModel(ScanModel):
                              f"found {sensor.height} x {sensor.width}")  # fmt: skip
         return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor))
 
-    def complete(
-        self,
-        scan: Scan | RangeImage,
-        known: np.ndarray | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        resamples: int = 10,
-        sampler: str | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """Fill the beams between the known ones; known pixels come back exactly, new ones without reflectance.
+    def resolved(self, how: Filling) -> Filling:
+        """The request with this model's own choices.
 
-        known    (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured
-                 ones. LiDAR-SR needs the beams it was trained with, such as every fourth from row 0; ILN and LIIF
-                 any beams, two at least, and leave rows empty that are a spacing or more beyond the outermost
-        method   `network`: one pass; `monte-carlo`, LiDAR-SR only: the mean of `steps` passes under dropout, by default
-                 the experiment's, empty where they disagree; `auto`: monte-carlo where the network can
-        seed     of the dropout
+        method  `network`: one pass; `monte-carlo`, LiDAR-SR only: the mean of `steps` passes under dropout, by default
+                the experiment's, empty where they disagree; `auto`: monte-carlo where the network can
 
-        Raises ValueError when shapes or words do not fit, or other pixels than whole beams are missing.
+        Raises ValueError for other words, and for what the method would ignore.
         """
-        image = self.image_of(scan)
-        known = known_pixels(image, known)
+        name, samples = self.experiment.name, isinstance(self.network, LidarSR)
+        words = ("auto", "monte-carlo", "network") if samples else ("auto", "network")
+        if how.method not in words:
+            raise ValueError(f"{name}: expected a method of {', '.join(words)}, found {how.method!r}")
+        if how.sampler is not None:
+            raise ValueError(f"{name}: expected no sampler, for nothing is sampled, found {how.sampler!r}")
+        how.at_least_one().without("resamples", reason="which only repaint has")
+        if samples and how.method != "network":
+            return replace(how, method="monte-carlo", steps=self._group.passes if how.steps is None else how.steps)
+        if how.steps not in (None, 1):
+            raise ValueError(f"{name}: expected 1 step, the one pass of method network, found {how.steps}")
+        return replace(how, method="network", steps=1)
+
+    def calls(self, how: Filling) -> int:
+        """How many passes of the network a resolved request takes."""
+        assert how.steps is not None
+        return how.steps
+
+    def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
+        """The beams between the known ones; known pixels come back exactly, new ones without reflectance.
+
+        LiDAR-SR needs the beams it was trained with, such as every fourth from row 0; ILN and LIIF any beams, two at
+        least, and leave rows empty that are a spacing or more beyond the outermost. Raises ValueError when other pixels
+        than whole beams are missing.
+        """
         rows = self._beams(known)
         columns = self._group.factor[1]
         low = image.keep(known).range[rows, ::columns]
         if isinstance(self.network, LidarSR):
             place = (np.arange(self.sensor.height) - self._group.first) / self._group.factor[0]
-            filled = self._grid(low, method, steps, seed, sampler, on_step)[self._made(place, len(low))]
+            filled = self._grid(low, how, on_step)[self._made(place, len(low))]
         else:
             row = places(self.sensor.elevations, np.asarray(self.sensor.elevations)[rows])
-            self._passes(method, steps, sampler)
             filled = self._asked(low, row, np.arange(self.sensor.width) / columns, on_step)
         return with_known(self._image(filled), image, known, keep_reflectance=True)
 
-    def upsample(
+    def fill_beams(
         self,
         scan: Scan,
-        sensor_in: Sensor | str | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        seed: int = 0,
+        sensor_in: Sensor,
+        sparse: RangeImage,
+        known: np.ndarray,
+        how: Filling,
         on_step: OnStep = None,
     ) -> RangeImage:
-        """A scan of any sensor as an image of this model's: asked from all beams of `sensor_in` as they are.
+        """A scan of any sensor, asked from all beams of `sensor_in` as they are.
 
         Rows farther than one spacing beyond these beams stay empty. LiDAR-SR makes `factor` times as many beams, of
-        which each row of the image takes the one next to it.
-
-        Raises ValueError when the sensor is not recognised, has one beam or sees nothing that the model does.
+        which each row of the image takes the one next to it. Raises ValueError for a sensor of one beam.
         """
-        sensor_in = sensor_that_made(scan, sensor_in)
-        image, known = sparse_image(scan, sensor_in, self.sensor)
         if sensor_in.height < 2:
             raise ValueError(f"{self.experiment.name}: expected a sensor with at least 2 beams, found {sensor_in.name}")
         low = project(scan, sensor_in, "auto", width=self._columns(sensor_in)).range
         row = places(self.sensor.elevations, sensor_in.elevations)
         column = (np.arange(self.sensor.width) + 0.5) / self.sensor.width * low.shape[1] - 0.5
         if isinstance(self.network, LidarSR):
-            dense = self._grid(low, method, steps, seed, None, on_step)
+            dense = self._grid(low, how, on_step)
             made = np.rint((column + 0.5) * self._group.factor[1] - 0.5).astype(int).clip(0, dense.shape[1] - 1)
             filled = dense[np.ix_(self._made(row, len(low)), made)] * in_view(row, len(low))[:, None]
         else:
-            self._passes(method, steps, None)
             filled = self._asked(low, row, column, on_step)
-        return with_known(self._image(filled), image, known, keep_reflectance=True)
-
-    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
-        """How many passes of the network `complete` takes. Raises ValueError for what it cannot do."""
-        return self._passes(method, steps) or 1
+        return with_known(self._image(filled), sparse, known, keep_reflectance=True)
 
     @property
     def _group(self) -> Upsampling:
         return self.experiment.upsampling or Upsampling()
-
-    def _passes(self, method: str, steps: int | None, sampler: str | None = None) -> int | None:
-        """How many passes under dropout, or None for one without it. Raises ValueError for what it cannot do."""
-        name, samples = self.experiment.name, isinstance(self.network, LidarSR)
-        words = ("auto", "monte-carlo", "network") if samples else ("auto", "network")
-        if method not in words:
-            raise ValueError(f"{name}: expected a method of {', '.join(words)}, found {method!r}")
-        if sampler is not None:
-            raise ValueError(f"{name}: expected no sampler, for nothing is sampled, found {sampler!r}")
-        if samples and method != "network":
-            return self._group.passes if steps is None else steps
-        if steps not in (None, 1):
-            raise ValueError(f"{name}: expected 1 step, the one pass of method network, found {steps}")
-        return None
 
     def _beams(self, known: np.ndarray) -> np.ndarray:
         """(h,) the rows that are known. Raises ValueError where these are not what the network needs."""
@@ -171,19 +154,16 @@ class UpsamplingModel(ScanModel):
         return np.rint(row).astype(int).clip(0, made - 1)
 
     @torch.no_grad()
-    def _grid(
-        self, low: np.ndarray, method: str, steps: int | None, seed: int, sampler: str | None, on_step: OnStep
-    ) -> np.ndarray:
+    def _grid(self, low: np.ndarray, how: Filling, on_step: OnStep) -> np.ndarray:
         """LiDAR-SR's ranges, metres: (h, w) -> (h, w) times the factor."""
         assert isinstance(self.network, LidarSR)
-        passes = self._passes(method, steps, sampler)
         x = self._scaled(low)[None, None]
-        if passes is None:
+        if how.method == "network":
             y = self.network(x)
             if on_step is not None:
                 on_step()
         else:
-            mean, std = mc_dropout(self.network, x, torch.Generator().manual_seed(seed), passes, on_step)
+            mean, std = mc_dropout(self.network, x, torch.Generator().manual_seed(how.seed), self.calls(how), on_step)
             y = remove_uncertain(mean, std, self._group.threshold)
         return (y[0, 0].flip(0) * self._group.norm).cpu().numpy()
 

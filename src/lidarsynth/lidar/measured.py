@@ -1,0 +1,38 @@
+"""What a scan measured, beside an image of it: rays with any point at all, and all of its points beside new ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from lidarsynth.lidar.projection import project, row_of_points
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor
+
+
+def rays_with_points(scan: Scan, sensor: Sensor, projection: str) -> np.ndarray:
+    """(H, W) bool: pixels that any point falls into, at whatever range: nothing is to be put before it."""
+    return project(scan, replace(sensor, min_range=0.0, max_range=math.inf), projection).mask
+
+
+def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projection: str) -> Scan:
+    """Every point of the scan bit by bit, and the pixels of `filled` outside `measured` (H, W) bool as new points.
+
+    Points come row by row, each row from behind over the left; those above or below the view come last, and only
+    without any there is a `ring`, the row. A scan without reflectance takes that of its pixels.
+    """
+    new = replace(filled, mask=filled.mask & ~measured).to_scan()
+    row = row_of_points(scan, filled.sensor, projection)
+    reflectance = scan.reflectance
+    if not reflectance.any():
+        turn = (1 - np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) / np.pi) / 2
+        column = (turn * filled.sensor.width).astype(int).clip(0, filled.sensor.width - 1)
+        reflectance = np.where(row >= 0, filled.reflectance[row, column], reflectance)
+    assert new.ring is not None
+    xyz = np.concatenate([scan.xyz, new.xyz])
+    ring = np.concatenate([np.where(row < 0, filled.sensor.height, row), new.ring])
+    order = np.lexsort((-np.arctan2(xyz[:, 1], xyz[:, 0]), ring))
+    both = Scan(xyz, np.concatenate([reflectance, new.reflectance]), ring=None if (row < 0).any() else ring)
+    return both[order]

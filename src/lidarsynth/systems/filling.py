@@ -1,0 +1,39 @@
+"""What is asked of a model that fills a scan: one record, validated once, by the system that gets it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Filling:
+    """How the hidden pixels of a scan are to be filled. What is None is the system's own choice.
+
+    method     a word of the system, or `auto`
+    steps      of the network
+    resamples  passes over each step of repaint
+    sampler    a word of the system
+    seed       of all randomness
+
+    A system's `resolved` says what becomes of it, and raises ValueError for what the system would have to ignore.
+    """
+
+    method: str = "auto"
+    steps: int | None = None
+    resamples: int | None = None
+    sampler: str | None = None
+    seed: int = 0
+
+    def at_least_one(self) -> Filling:
+        """The same. Raises ValueError for counts below 1."""
+        for name in ("steps", "resamples"):
+            if (number := getattr(self, name)) is not None and number < 1:
+                raise ValueError(f"expected {name} of at least 1, found {number}")
+        return self
+
+    def without(self, *names: str, reason: str) -> Filling:
+        """The same. Raises ValueError, giving the reason, where one of these fields is not None."""
+        for name in names:
+            if (value := getattr(self, name)) is not None:
+                raise ValueError(f"expected no {name}, {reason}, found {value!r}")
+        return self
