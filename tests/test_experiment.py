@@ -204,3 +204,10 @@ def test_a_failed_save_leaves_the_old_model(tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         save(tmp_path, experiment, trained(experiment, seed=1))
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_info_of_kitti_raw_names_the_sensor_that_training_takes():
+    """Scan unfolding gives KITTI's own beams, and R2DM's even grid has none of them."""
+    from lidarsynth.data.sources import SOURCES
+
+    assert preset("r2dm-kitti-raw").data.sensor == SOURCES["kitti"].sensor == "hdl-64e-kitti"

@@ -90,10 +90,12 @@ def test_generated_images_are_sound_and_progress_is_told(model, sampler):
 
 def test_scan_i_depends_on_seed_and_i_only(model):
     alone = model.generate(3, steps=2, seed=5, batch_size=1)
-    for one, two in zip(alone, model.generate(3, steps=2, seed=5, batch_size=2), strict=True):
-        assert_same(one, two)
+    for other in (model.generate(3, steps=2, seed=5, batch_size=2), model.generate(3, steps=2, seed=5)):
+        for one, two in zip(alone, other, strict=True):
+            np.testing.assert_array_equal(one.range, two.range, "bit by bit, on a CPU for any batch size")
+            np.testing.assert_array_equal(one.reflectance, two.reflectance)
     for one, two in zip(alone[1:], model.stream(3, steps=2, seed=5, first=1), strict=True):
-        assert_same(one, two)
+        np.testing.assert_array_equal(one.range, two.range)
     np.testing.assert_array_equal(alone[2].range, model.generate(1, steps=2, seed=7, batch_size=1)[0].range)
     assert (alone[0].range != alone[1].range).mean() > 0.1
 
@@ -102,9 +104,9 @@ def test_streams_hold_one_batch(model):
     calls = []
     stream = model.stream(100, steps=2, batch_size=2, on_step=lambda: calls.append(1))
     next(stream), next(stream)
-    assert len(calls) == 2
+    assert len(calls) == 4, "one scan at a time on a CPU"
     next(stream)
-    assert len(calls) == 4
+    assert len(calls) == 6
 
 
 @pytest.mark.parametrize(

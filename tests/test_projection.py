@@ -10,7 +10,7 @@ import torch
 
 from lidarsynth.lidar.depth import to_x_0
 from lidarsynth.lidar.projection import project, ring_of_points, row_of_points
-from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
 CODECS = {"log_depth": "log", "inverse_depth": "inverse", "depth": "metric"}
@@ -163,6 +163,22 @@ def test_unfolding_of_incomplete_scans_follows_the_published_rule(incomplete, ca
     np.testing.assert_array_equal(rows, published_rows(points[:, :3], 64))
 
 
+def test_auto_never_unfolds_rings_onto_the_even_grid():
+    """The rows of R2DM's grid are no beams of a unit: a ring belongs where its points are."""
+    sensor = SENSORS["hdl-64e-kitti"]
+    scan = RangeImage(*(np.full((64, 1024), v, np.float32) for v in (20, 0.5)), np.ones((64, 1024), bool), sensor)
+    points = scan.to_scan()
+    auto, spherical = (project(points, "hdl-64e", method) for method in ("auto", "spherical"))
+    np.testing.assert_array_equal(auto.range, spherical.range)
+    found = np.degrees(np.arcsin(auto.xyz[auto.mask][:, 2] / 20))
+    rows = np.nonzero(auto.mask)[0]
+    view = -np.diff(SENSORS["hdl-64e"].elevations)[0]
+    off = np.abs(found - np.asarray(SENSORS["hdl-64e"].elevations)[rows] + view / 2)
+    assert np.median(off) < view, "degrees; unfolding puts them 1.8 off"
+    by_ring = project(points, "hdl-64e-kitti", "auto")
+    np.testing.assert_array_equal(by_ring.range, project(points, "hdl-64e-kitti", "unfolding").range)
+
+
 def test_points_in_another_order_are_refused_by_unfolding_and_turned_by_auto(points64):
     shuffled = points64[np.random.default_rng(0).permutation(len(points64))]
     for points, found in ((shuffled, r"\d{4}"), (points64[::-1], "0"), (points64[:0], "0")):
@@ -180,7 +196,8 @@ def test_a_ring_field_is_believed_whatever_the_order(points64):
     order = np.random.default_rng(0).permutation(len(points64))
     scan = replace(scan_of(points64[order]), ring=rows[order].astype(np.uint16))
     np.testing.assert_array_equal(project(scan, "hdl-64e", "unfolding").range, expected.range)
-    np.testing.assert_array_equal(project(scan, "hdl-64e", "auto").range, expected.range)
+    beams = [project(s, "hdl-64e-kitti", m).range for s, m in ((scan, "auto"), (scan_of(points64), "unfolding"))]
+    np.testing.assert_array_equal(*beams)
     assert ring_of_points(scan)[1] == 64
     low = scan[scan.ring < 62]  # its lowest beams saw nothing: the others stay where they are
     np.testing.assert_array_equal(project(low, "hdl-64e", "unfolding").range[:62], expected.range[:62])

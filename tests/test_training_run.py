@@ -121,6 +121,20 @@ def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
     torch.testing.assert_close(theirs, ours, rtol=1e-3, atol=1e-4)
 
 
+def test_a_run_can_be_extended(cache: Path, tmp_path: Path):
+    """More steps go on from the last checkpoint; fewer than are done, or any other change, are another run."""
+    out = tmp_path / "run"
+    list(run(tiny(4), cache, out, options=QUIET))
+    steps = [progress.step for progress in run(tiny(6), cache, out, options=QUIET)]
+    assert steps == [4, 5, 6] and len(table(out)) == 6
+    experiment, _ = load(out)
+    assert experiment.training.steps == 6 and experiment.card.history == ("6 steps of 4 on 1 x cpu",)
+    with pytest.raises(ValueError, match=r"run: expected training.steps of at least 6, which are done, found 5"):
+        list(run(tiny(5), cache, out, options=QUIET))
+    with pytest.raises(ValueError, match=r"expected its own run, with training.learning_rate"):
+        list(run(tiny(8, **{"training.learning_rate": 0.5}), cache, out, options=QUIET))
+
+
 def test_a_run_on_several_caches_says_so(cache: Path, tmp_path: Path):
     few = tmp_path / "few"
     list(write_cache(few, lambda i: noise_image(100 + i), 3, SENSOR, {"name": "few"}))

@@ -365,6 +365,30 @@ def test_official_iln_and_liif_are_recognised(name, network, tmp_path):
     assert "400 epochs" in described and "CARLA" in described
 
 
+def test_arguments_of_official_files_are_heard(tmp_path):
+    """488 of 512 outputs differ where 4 heads are taken for 8."""
+    torch.manual_seed(0)
+    theirs = ILN(1, heads=4).eval()
+    checkpoint = official("iln", theirs.state_dict())
+    checkpoint["model"]["args"] = {"d": 1, "h": 4}
+    torch.save(checkpoint, tmp_path / "four.pth")
+    model = lidarsynth.load(tmp_path / "four.pth")
+    asked = torch.rand(1, 1, 4, 8), torch.rand(1, 512, 2)
+    assert torch.equal(model.network(*asked), theirs(*asked))
+    save(tmp_path / "own", model.experiment, model.network)
+    assert torch.equal(lidarsynth.load(tmp_path / "own").network(*asked), theirs(*asked))
+    for name, network, args, said in (
+        ("iln", ILN(1), {"d": 2}, "tensors of d = 2 layers, as model.args says, found 1"),
+        ("iln", ILN(1), {"depth": 1}, r"expected model.args of d, h, found \{'depth': 1\}"),
+        ("liif_lidar", LIIF(), {"local_ensemble": False}, "expected a LIIF of .* found .*'local_ensemble': False"),
+    ):
+        checkpoint = official(name, network.state_dict())
+        checkpoint["model"]["args"] = args
+        torch.save(checkpoint, tmp_path / "other.pth")
+        with pytest.raises(ValueError, match=said):
+            lidarsynth.load(tmp_path / "other.pth")
+
+
 def test_other_files_are_named_as_what_they_are(tmp_path):
     path = tmp_path / "file.pth"
 

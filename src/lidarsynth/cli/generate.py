@@ -32,8 +32,7 @@ def generate(
     settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
     claim(out, settings)
     endings = (f".{format}", ".png") if picture else (f".{format}",)
-    # Batches of other sizes round differently on a CPU, and are no faster.
-    runs = batches(out, count, endings, 1 if device == "cpu" else batch_size)
+    runs = batches(out, count, endings, loaded.at_once(batch_size))
     with step_bar("generate", len(runs) * steps) as on_step:
-        new = sum(1 for _ in generate_into(out, loaded, runs, endings, steps, sampler, seed, on_step))
+        new = sum(1 for _ in generate_into(out, loaded, runs, batch_size, endings, steps, sampler, seed, on_step))
     say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -33,7 +33,7 @@ CLASS_OF_CATEGORY: dict[str, int] = {
 
 @dataclass(frozen=True)
 class NuScenes:
-    """A reader over LIDAR_TOP's files, turned into our frame: nuScenes' x right, y forward become x forward, y left.
+    """A reader over LIDAR_TOP's files, in our frame, into which reading a `.pcd.bin` turns nuScenes' own.
 
     frames   one per scan, by scene and time; `frames[i].labels` is its lidarseg file, if it has one
     classes  (256,) SemanticKITTI class of each lidarseg category number
@@ -50,9 +50,8 @@ class NuScenes:
     def __getitem__(self, index: int) -> Scan:
         frame = self.frames[index]
         scan, dropped = read_with_report(frame.path)
-        xyz = np.stack([scan.xyz[:, 1], -scan.xyz[:, 0], scan.xyz[:, 2]], axis=1)
         label = None if frame.labels is None else self._labels(frame.labels, len(scan), dropped)
-        return replace(scan, xyz=xyz, label=label)
+        return replace(scan, label=label)
 
     def _labels(self, path: str, count: int, dropped: int) -> np.ndarray:
         raw = np.fromfile(path, np.uint8) if Path(path).is_file() else np.zeros(0, np.uint8)

@@ -33,8 +33,12 @@ def read_bin(data: bytes) -> Fields:
 
 
 def read_pcd_bin(data: bytes) -> Fields:
-    """nuScenes: x y z intensity (0-255) ring, five float32 a point. Raises FileError as `read_bin`."""
+    """nuScenes: x y z intensity (0-255) ring, five float32 a point; x right, y forward there, x forward, y left here.
+
+    Raises FileError as `read_bin`.
+    """
     fields = _floats(data, 5, "")
+    fields["x"], fields["y"] = fields["y"], -fields["x"]
     if np.nanmax(fields["intensity"], initial=0) <= 255:
         fields["intensity"] = fields["intensity"] / np.float32(255)  # the format fixes the scale, however dark the scan
     return fields

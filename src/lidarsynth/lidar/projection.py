@@ -14,7 +14,8 @@ def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int |
     """Draw a scan into the sensor's image; the nearest point of a pixel wins (R2DM, section III-A).
 
     method  `spherical`: row by elevation; `unfolding`: row by ring (Triess et al. 2020), from `scan.ring` or from the
-            point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, else spherical
+            point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, else spherical;
+            also on an even grid, whose rows are no beam's
     width   columns of the image, if other than the sensor's
 
     Points outside the range limits leave their pixel empty, also where they hide a farther point, as in the published
@@ -66,6 +67,8 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     """(N,) int64 row of each point in the sensor's image, methods as in `project`; -1 outside the field of view."""
     if method == "spherical":
         return _rows_by_elevation(scan.xyz, sensor)
+    if method == "auto" and is_even_grid(sensor):
+        return _rows_by_elevation(scan.xyz, sensor)
     ring, count = ring_of_points(scan)
     if method == "auto" and count != sensor.height:
         return _rows_by_elevation(scan.xyz, sensor)
@@ -78,6 +81,11 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
         return np.where(ring < sensor.height, ring, -1)
     # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
     return np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
+
+
+def is_even_grid(sensor: Sensor) -> bool:
+    """Whether the rows are edges of evenly spaced pixels, as R2DM's `hdl-64e` has them, and not the beams of a unit."""
+    return sensor.edges and (sensor.height < 3 or bool(np.ptp(np.diff(sensor.elevations)) < 1e-3))
 
 
 def ring_of_points(scan: Scan) -> tuple[np.ndarray, int]:

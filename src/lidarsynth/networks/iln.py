@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarsynth.networks.tensors import fill, iln_tensors
+from lidarsynth.networks.tensors import fill, iln_arguments, iln_tensors
 
+LIIF_ARGUMENTS: dict[str, int | bool] = {"local_ensemble": True, "feat_unfold": False, "cell_decode": False}
 SHIFTS = ((-1, -1), (-1, 1), (1, -1), (1, 1))  # of the four neighbours: (vertical, horizontal), in half pixels
 
 
@@ -137,6 +138,7 @@ class ILN(nn.Module):
         super().__init__()
         if channels % heads:
             raise ValueError(f"heads must divide {channels} channels, got {heads}")
+        self.heads = heads
         self.encoder = Encoder(channels, blocks)
         self.attention = NeighbourWeights(channels, depth, heads, dropout)
 
@@ -243,14 +245,25 @@ def angle_queries(elevation: Tensor, azimuth: Tensor, size: tuple[int, int], min
 
 
 def from_official(checkpoint: object, model: str = "iln") -> ILN | LIIF:
-    """The network, in evaluation mode, of a checkpoint of ILN's repository; model "iln" (8 heads) or "liif_lidar".
+    """The network, in evaluation mode, of a checkpoint of ILN's repository; model "iln" or "liif_lidar".
 
-    The number of layers is read from the tensors. Raises ValueError if something does not fit.
+    Its arguments are those of the checkpoint, `d` layers of `h` heads; where it tells none, as published. The number of
+    layers is also read from the tensors. Raises ValueError if something does not fit, and for a LIIF with arguments
+    other than the published ones.
     """
     if model not in ("iln", "liif_lidar"):
         raise ValueError(f'model must be "iln" or "liif_lidar", got {model!r}')
     weights = iln_tensors(checkpoint, model)
-    depth = sum(key.startswith("attention.transformer") and key.endswith(".to_qkv.weight") for key in weights)
-    network = ILN(depth) if model == "iln" else LIIF()
+    assert isinstance(checkpoint, dict)
+    if model == "liif_lidar":
+        if (found := iln_arguments(checkpoint, LIIF_ARGUMENTS)) != LIIF_ARGUMENTS:
+            raise ValueError(f"expected a LIIF of {LIIF_ARGUMENTS}, found {found}")
+        network: ILN | LIIF = LIIF()
+    else:
+        depth = sum(key.startswith("attention.transformer") and key.endswith(".to_qkv.weight") for key in weights)
+        found = iln_arguments(checkpoint, {"d": depth, "h": 8})
+        if found["d"] != depth:
+            raise ValueError(f"expected tensors of d = {found['d']} layers, as model.args says, found {depth}")
+        network = ILN(depth, heads=found["h"])
     fill(network, weights)
     return network.eval()

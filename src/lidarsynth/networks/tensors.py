@@ -69,6 +69,18 @@ def iln_tensors(checkpoint: object, name: str) -> dict[str, Tensor]:
     return tensors_of(model["state_dict"], expected)
 
 
+def iln_arguments(checkpoint: dict, defaults: dict[str, int | bool]) -> dict[str, int | bool]:
+    """The network's arguments `model.args` of such a checkpoint over the published `defaults`.
+
+    Raises ValueError for an argument that is not among these, or of another type.
+    """
+    args = checkpoint["model"].get("args") or {}
+    known = isinstance(args, dict) and all(type(value) is type(defaults.get(key)) for key, value in args.items())
+    if not known:
+        raise ValueError(f"expected model.args of {', '.join(defaults)}, found {args!r:.80}")
+    return {**defaults, **args}
+
+
 def fill(network: nn.Module, weights: dict[str, Tensor]) -> None:
     """Put tensors into a network. Raises ValueError, naming the first, when names or shapes do not fit."""
     expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}

@@ -57,7 +57,11 @@ class ScanModel(ABC):
         batch_size: int = 4,
         on_step: OnStep = None,
     ) -> list[RangeImage]:
-        """`n` new scans as range images; scan i depends on seed + i only, not on n or batch_size.
+        """`n` new scans as range images; scan i depends on seed + i only.
+
+        A CPU makes scans one by one, which is as fast, so that there this holds bit by bit for any n and batch_size,
+        with one number of threads; a GPU makes batch_size at once, and there it holds for one batch_size. Other
+        numbers of threads, batches and processors add up in another order: scans differ by rounding.
 
         Raises ValueError as `stream` does.
         """
@@ -175,6 +179,10 @@ class ScanModel(ABC):
         name = sensor if isinstance(sensor, str) else sensor.name
         raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as iln, lidar-sr or bilinear, "
                          f"for --to {name}, found one of {self.sensor.name} only")  # fmt: skip
+
+    def at_once(self, batch_size: int) -> int:
+        """How many scans to make at once: one on a CPU, where more are no faster and differ by rounding."""
+        return 1 if next(self.network.parameters()).device.type == "cpu" else batch_size
 
     def image_of(self, scan: Scan | RangeImage) -> RangeImage:
         """The scan in this model's image. Raises ValueError for an image of another size."""

@@ -76,6 +76,7 @@ def generate_into(
     folder: Path,
     model: ScanModel,
     runs: list[range],  # of `batches`
+    batch_size: int,
     endings: tuple[str, ...],
     steps: int | None = None,
     sampler: str | None = None,
@@ -85,7 +86,7 @@ def generate_into(
     """Make the scans of `runs`, a batch in memory at a time, and yield each file when it and its picture are there."""
     try:
         for run in runs:
-            images = model.stream(run.stop, steps, seed, sampler, len(run), run.start, on_step)
+            images = model.stream(run.stop, steps, seed, sampler, batch_size, run.start, on_step)
             for i, image in zip(run, images, strict=True):
                 yield _store(folder, f"{i:06d}", image, endings)
     finally:

@@ -80,7 +80,8 @@ def run(
 ) -> Iterator[Progress]:
     """Train on a cache, or on `synthetic` streets, into folder `out`; in the main process, yield after every step.
 
-    The first yield says where the run stands: at 0, or at the step of the newest checkpoint; that is continued exactly.
+    The first yield says where the run stands: at 0, or at the step of the newest checkpoint; that is continued exactly,
+    or, with more `training.steps`, extended: behind the checkpoint the learning rate is that of the longer run.
     weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet
     validation  cache of images that are not trained on
     resume      insist that there is a checkpoint
@@ -141,6 +142,9 @@ def _begin(
         # The history's last line is this run's, written anew at each checkpoint.
         card = replace(card, history=card.history[:-1], licence=experiment.card.licence or card.licence)
         load_run(saved[-1] / STATE, state)
+        if state.step > experiment.training.steps:
+            raise ValueError(f"{out}: expected training.steps of at least {state.step}, which are done, "
+                             f"found {experiment.training.steps}")  # fmt: skip
     elif accelerator.is_main_process:
         out.mkdir(parents=True, exist_ok=True)
         sweep(out)
@@ -156,9 +160,10 @@ def _learned_from(images: Learned) -> str:
 
 
 def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
-    """The checkpoint's record. Raises ValueError that names the first field that differs."""
+    """The checkpoint's record. Raises ValueError that names the first field that differs; the number of steps may."""
     found = read_experiment(checkpoint)
-    if replace(found, card=experiment.card) != experiment:
+    steps = experiment.training.steps
+    if replace(found, card=experiment.card, training=replace(found.training, steps=steps)) != experiment:
         theirs, ours = (_flat(e.to_dict()) for e in (found, experiment))
         key = next(key for key in ours if key.partition(".")[0] != "card" and ours[key] != theirs.get(key))
         raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {theirs.get(key)!r:.60}, "

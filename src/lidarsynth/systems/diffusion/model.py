@@ -64,11 +64,11 @@ class LidarModel(ScanModel):
         sampler, steps = self._sampler(sampler), self.generation_steps(steps, sampler)
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
-        for start in range(first, n, batch_size):
-            count = min(batch_size, n - start)
-            rng = generators(seed, count, offset=start)
-            x_1 = self._start(self._blank(count), rng, sampler == "langevin")
-            for x in _last(self._states(self.denoiser, x_1, rng, sampler, steps), on_step):
+        size = self.at_once(batch_size)
+        for start in range(first, n, size):
+            rng = generators(seed, size, offset=start)  # also of the last batch: a smaller one would round differently
+            x_1 = self._start(self._blank(size), rng, sampler == "langevin")
+            for x in _last(self._states(self.denoiser, x_1, rng, sampler, steps), on_step)[: n - start]:
                 yield self._image(x)
 
     def resolved(self, how: Filling) -> Filling:

@@ -71,14 +71,15 @@ class GanModel(ScanModel):
             raise ValueError(f"expected n and batch_size of at least 1, found {n} and {batch_size}")
         fixed = torch.Generator().manual_seed(0)
         uniform = torch.rand(1, 1, *self._size, generator=fixed).to(self._device)
-        for start in range(first, n, batch_size):
-            streams = generators(seed, min(batch_size, n - start), offset=start)
+        size = self.at_once(batch_size)
+        for start in range(first, n, size):
+            streams = generators(seed, size, offset=start)
             z = torch.stack([self._latent(rng) for rng in streams])
             with torch.no_grad():
                 images = self.network(z.to(self._device), uniform).image
             if on_step is not None:
                 on_step()
-            yield from map(self._image, images)
+            yield from map(self._image, images[: n - start])
 
     def resolved(self, how: Filling) -> Filling:
         """The request with this model's own choices: method inversion, in 500 steps of the optimiser as published."""

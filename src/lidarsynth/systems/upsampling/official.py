@@ -54,8 +54,10 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
         width = network.width
     else:
         network = iln_from_official(checkpoint, model["name"])
-        depth = len(network.attention.transformer.layers) if isinstance(network, ILN) else group.depth
-        group, width = replace(group, depth=depth), start.model.base_channels
+        if isinstance(network, ILN):
+            group = replace(group, depth=len(network.attention.transformer.layers))
+            start = replace(start, model=replace(start.model, attn_num_heads=network.heads))
+        width = start.model.base_channels
     if sensor is not None:
         start, group = _with_sensor(start, group, sensor, name)
     history = (f"official checkpoint of ILN's repository, {checkpoint.get('epoch')} epochs",)
