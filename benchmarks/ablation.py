@@ -29,10 +29,10 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.bev import bev_histograms
 from lidarsynth.metrics.distributions import gaussian_mmd, jensen_shannon_distance
 from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.systems.build import build_denoiser, build_network
+from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.diffusion.validation import fixed_losses
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import build_network, task_of
 from lidarsynth.training.checkpoint import load_run, save_run
 from lidarsynth.training.loop import Run, start, train
 

@@ -24,7 +24,8 @@ from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.networks.interpolation import METHODS
 from lidarsynth.networks.pointnet import PointNet
-from lidarsynth.systems.build import GANS, build_discriminator, build_network
+from lidarsynth.systems.gan.build import build_discriminator
+from lidarsynth.systems.table import GANS, build_network
 from lidarsynth.systems.upsampling.model import queries_at
 
 ROWS = (

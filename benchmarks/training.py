@@ -21,8 +21,7 @@ from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.systems.build import build_network
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import build_network, task_of
 from lidarsynth.training.examples import Examples, Learned, Streets, load_batches, open_images
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.machine import accelerator_of, workers_of

@@ -3,7 +3,7 @@
 import torch
 
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.systems.build import build_network
+from lidarsynth.systems.table import build_network
 
 
 def trained(experiment: Experiment, seed: int = 0) -> torch.nn.Module:

@@ -15,10 +15,10 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.systems.assemble import assemble
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import interpolated
+from lidarsynth.systems.table import assemble
 from lidarsynth.verbs.completion import complete_scan, judged, named_sensor, upsample_scan
 
 FLAT = Sensor("flat", (2.0, 0.0, -2.0, -4.0), width=8, min_range=1.0, max_range=50.0)

@@ -233,7 +233,7 @@ def test_a_wrong_projection_stops_at_once(tmp_path: Path):
 
 LIMITED = """
 import resource, sys
-from lidarsynth.cli import main
+from lidarsynth.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
 main(sys.argv[1:])
 """

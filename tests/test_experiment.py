@@ -12,8 +12,9 @@ from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Data, Training, from_dict, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.systems.build import build_denoiser, build_network
-from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.diffusion.build import build_denoiser
+from lidarsynth.systems.table import build_network
+from lidarsynth.systems.table import load_folder as load
 
 
 @pytest.mark.parametrize("name", PRESETS)

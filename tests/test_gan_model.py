@@ -27,9 +27,8 @@ from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.depth import decode, encode
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network
 from lidarsynth.systems.gan.model import GanModel
+from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.verbs.description import describe
 from lidarsynth.weights.load import load_parts
 from lidarsynth.weights.official import read_official

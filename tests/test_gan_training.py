@@ -23,14 +23,13 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.gan.losses import r1_penalty
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
-from lidarsynth.systems.build import build_discriminator, build_network
-from lidarsynth.systems.build import load_folder as load
-from lidarsynth.systems.finetune import transfer
 from lidarsynth.systems.gan import training as adversarial
 from lidarsynth.systems.gan.batch import Batch, draw, warmup_drop
+from lidarsynth.systems.gan.build import build_discriminator
 from lidarsynth.systems.gan.model import GanModel
 from lidarsynth.systems.gan.training import ADVERSARIAL, Players
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import build_network, task_of, transfer
+from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.loop import Run, start, train, update_ema
 from lidarsynth.training.machine import accelerator_of
 from lidarsynth.training.options import Options

@@ -13,11 +13,9 @@ import torch
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Card, Data, with_fields
 from lidarsynth.lidar.sensor import from_dict
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.hub import fetch, is_repository
-from lidarsynth.systems.model_card import card_text
+from lidarsynth.systems.table import assemble, build_network, card_of
 from lidarsynth.weights.load import load, load_parts
 
 CARD = Card("MIT", "200 scans of one street", ("20 steps of 4 on 1 x cpu",), ("range MAE 1.5 m",))
@@ -73,7 +71,7 @@ def test_what_was_pushed_is_what_loads(hub: Repositories, model: LidarModel):
     assert found.experiment == model.experiment
     torch.testing.assert_close(found.network.state_dict(), model.network.state_dict(), rtol=0, atol=0)
     card = (hub.root / "someone/street-1/main/README.md").read_text()
-    assert card == card_text(model.experiment, "someone/street-1") and 'ls.load("someone/street-1")' in card
+    assert card == card_of(model.experiment, "someone/street-1") and 'ls.load("someone/street-1")' in card
 
 
 def test_half_of_the_size_and_revisions(hub: Repositories, model: LidarModel):
@@ -131,7 +129,7 @@ def test_paths_and_files_are_no_repositories():
 def test_the_card_says_what_the_experiment_says():
     own = from_dict({"name": "my-lidar", "beams": 32, "top": 15, "bottom": -25, "max_range": 120})
     data = Data(own.to_dict(), "auto", 32, 512, roll=True)
-    text = card_text(replace(preset("tiny"), data=data, card=CARD))
+    text = card_of(replace(preset("tiny"), data=data, card=CARD))
     assert text.startswith("---\nlibrary_name: lidarsynth\n") and "\nlicense: mit\n---\n" in text
     assert "my-lidar, 32 beams from +15.00 to -25.00 degrees, 1 to 120 m" in text
     assert "| images | 32 x 512, auto projection, log range" in text and "| augmentation | roll |" in text
@@ -141,12 +139,12 @@ def test_the_card_says_what_the_experiment_says():
 
 
 def test_the_card_keeps_back_nothing_and_makes_nothing_up():
-    bare = card_text(preset("r2dm-h"))
+    bare = card_of(preset("r2dm-h"))
     assert "license" not in bare and "Not stated" in bare and "Not recorded" in bare and "Results" not in bare
     assert "A diffusion model that generates LiDAR scans" in bare
-    kitti = card_text(replace(preset("r2dm-h"), card=Card("CC BY-NC-SA 3.0, that of KITTI-360")))
+    kitti = card_of(replace(preset("r2dm-h"), card=Card("CC BY-NC-SA 3.0, that of KITTI-360")))
     assert "\nlicense: cc-by-nc-sa-3.0\n" in kitti
-    house = card_text(replace(preset("r2dm-h"), card=Card('for "us": only')))
+    house = card_of(replace(preset("r2dm-h"), card=Card('for "us": only')))
     assert '\nlicense: other\nlicense_name: "for \\"us\\": only"\n' in house
 
 

@@ -34,14 +34,13 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, get_sensor
 from lidarsynth.networks.refinenet import geometric_sigmas
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_denoiser, build_network
-from lidarsynth.systems.build import load_folder as load
 from lidarsynth.systems.diffusion import score_matching as matching
+from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.diffusion.score_matching import SCORE, ScoreMatching
 from lidarsynth.systems.diffusion.validation import TIMES, fixed_losses
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import assemble, build_network, task_of
+from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.checkpoint import checkpoints
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.options import Options

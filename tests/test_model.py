@@ -16,9 +16,9 @@ from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.systems.assemble import assemble
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.scan_model import sparse_image
+from lidarsynth.systems.table import assemble
 
 
 def model_of(experiment: Experiment) -> LidarModel:

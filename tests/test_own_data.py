@@ -18,8 +18,8 @@ from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import with_fields
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.sensor import read_sensor
-from lidarsynth.systems.build import build_network
-from lidarsynth.systems.build import load_folder as load
+from lidarsynth.systems.table import build_network
+from lidarsynth.systems.table import load_folder as load
 
 DOC = REPO_ROOT / "docs" / "own-data.md"
 SHOWN = blocks(DOC.read_text())

@@ -14,7 +14,7 @@ from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.metrics.reconstruction import Errors
-from lidarsynth.systems.build import build_network
+from lidarsynth.systems.table import build_network
 from lidarsynth.verbs.description import describe, describe_sensor, errors_table, mean_table
 
 

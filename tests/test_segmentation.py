@@ -17,10 +17,6 @@ from lidarsynth.experiment.record import Experiment, from_dict, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.rangenet import RangeNet
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network
-from lidarsynth.systems.build import load_folder as load
-from lidarsynth.systems.finetune import transfer
 from lidarsynth.systems.segmentation.training import (
     Batch,
     CrossEntropy,
@@ -33,7 +29,8 @@ from lidarsynth.systems.segmentation.training import (
     judge,
     pictures,
 )
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import assemble, build_network, task_of, transfer
+from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.options import Options
 from lidarsynth.training.randomness import sample_rng

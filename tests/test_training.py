@@ -15,10 +15,10 @@ from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Experiment, Training, with_fields
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.systems.build import build_denoiser, build_network
+from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.training import Batch, Objective, draw, draw_images, random_known, scaled
 from lidarsynth.systems.diffusion.validation import TIMES, fixed_losses
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import build_network, task_of
 from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
 from lidarsynth.training.loop import learning_rate, start, train, update_ema
 from lidarsynth.training.options import Options

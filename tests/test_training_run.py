@@ -20,9 +20,8 @@ from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.systems.build import build_network
-from lidarsynth.systems.build import load_folder as load
-from lidarsynth.systems.finetune import transfer
+from lidarsynth.systems.table import build_network, transfer
+from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.checkpoint import checkpoints
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import resolve, run

@@ -19,11 +19,9 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.iln import ILN, LIIF, angle_queries
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated
-from lidarsynth.systems.tasks import TASKS
+from lidarsynth.systems.table import SYSTEMS, assemble, build_network
 from lidarsynth.systems.upsampling.model import UpsamplingModel, places, queries_at, scaled
 from lidarsynth.verbs.completion import complete_scan, upsample_scan
 from lidarsynth.verbs.description import describe
@@ -302,7 +300,7 @@ def test_interpolation_upsamples_and_says_what_it_cannot_do(image):
     ):
         with pytest.raises(ValueError, match=text):
             ask()
-    assert "bilinear" not in TASKS
+    assert SYSTEMS["bilinear"].task is None
 
 
 def test_info_tells_the_published_counts():

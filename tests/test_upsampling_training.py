@@ -15,11 +15,9 @@ from lidarsynth.experiment.record import Experiment, Training, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.reconstruction import reconstruction_errors
-from lidarsynth.systems.build import build_network
-from lidarsynth.systems.build import load_folder as load
-from lidarsynth.systems.finetune import transfer
 from lidarsynth.systems.interpolation.model import interpolated
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import build_network, task_of, transfer
+from lidarsynth.systems.table import load_folder as load
 from lidarsynth.systems.upsampling.training import Asked, Pair, draw_pairs, draw_queries
 from lidarsynth.training.loop import Run, learning_rate, start, train
 from lidarsynth.training.options import Options

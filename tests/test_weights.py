@@ -14,8 +14,7 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Data, Model
 from lidarsynth.experiment.sensor import build_sensor
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network
+from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.weights import load as weights
 from lidarsynth.weights.download import cache_folder, download
 from lidarsynth.weights.load import RELEASES, load_parts, shipped

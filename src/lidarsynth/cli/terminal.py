@@ -90,7 +90,7 @@ def load_with_bar(source: str, device: str) -> ScanModel:
     """The model, under a progress bar where it has to be downloaded. Raises ValueError."""
     from tqdm import tqdm
 
-    from lidarsynth.systems.assemble import assemble
+    from lidarsynth.systems.table import assemble
     from lidarsynth.weights.load import load_parts
 
     with tqdm(desc=f"download {source}", unit="B", unit_scale=True, delay=2) as bar:

@@ -12,7 +12,6 @@ from torch import nn
 
 from lidarsynth.experiment.folder import RECORD, WEIGHTS, save
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.systems.model_card import card_text
 
 REPOSITORY = re.compile(r"(?P<id>[\w-][\w.-]*/[\w-][\w.-]*)(@(?P<revision>[\w./-]+))?", re.ASCII)
 HUB = "https://huggingface.co"
@@ -40,8 +39,10 @@ def fetch(source: str) -> Path:
     return folder
 
 
-def push(experiment: Experiment, network: nn.Module, repo_id: str, private: bool = False, half: bool = False) -> str:
-    """Upload weights (float16 if `half`), record and model card to `owner/name` in one commit; returns its address.
+def push(
+    experiment: Experiment, network: nn.Module, repo_id: str, card: str, private: bool = False, half: bool = False
+) -> str:
+    """Upload weights (float16 if `half`), record and Markdown `card` to `owner/name` at once; returns its address.
 
     The repository is made where there is none. Needs a token, from `hf auth login` or HF_TOKEN. Raises ValueError in
     one line when the hub refuses or there is no network, ImportError naming the extra `hub`.
@@ -52,7 +53,7 @@ def push(experiment: Experiment, network: nn.Module, repo_id: str, private: bool
     hub = _huggingface_hub()
     with tempfile.TemporaryDirectory() as scratch:
         save(scratch, experiment, network, half)
-        (Path(scratch) / "README.md").write_text(card_text(experiment, repo_id), encoding="utf-8")
+        (Path(scratch) / "README.md").write_text(card, encoding="utf-8")
         with _in_one_line(f"{repo_id}: expected to write to {HUB}"):
             hub.create_repo(repo_id, private=private, exist_ok=True)
             hub.upload_folder(repo_id=repo_id, folder_path=scratch, commit_message=f"lidarsynth: {experiment.name}")

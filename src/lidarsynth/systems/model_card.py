@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 
-from lidarsynth.experiment.record import Card, Experiment, Model
+from lidarsynth.experiment.record import Card, Data, Experiment
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.systems.description import Description
 
 LICENCES = {  # how a card's licence begins -> the hub's word for it
     "MIT": "mit",
@@ -17,18 +19,26 @@ LICENCES = {  # how a card's licence begins -> the hub's word for it
 }
 
 
-def card_text(experiment: Experiment, repo_id: str = "owner/name") -> str:
+def card_text(experiment: Experiment, description: Description, repo_id: str = "owner/name") -> str:
     """The model card of a repository, Markdown under the hub's metadata: what it is, where it learned, its licence.
 
-    Everything in it comes from the experiment and its card. Raises ValueError when the experiment has no valid sensor.
+    Everything in it comes from the experiment, its card and its system's description. Raises ValueError when the
+    experiment has no valid sensor.
     """
-    sections = [_metadata(experiment.card.licence), _title(experiment), _usage(experiment, repo_id), _table(experiment)]
-    sections += _story(experiment.card)
+    about, sensor = description.about(experiment), build_sensor(experiment)
+    usage = ["```python", "import lidarsynth as ls  # pip install 'lidarsynth[hub]'", *about.usage, "```"]
+    sections = [
+        _metadata(experiment.card.licence, about.tags),
+        f"# {experiment.name}, {sensor.name}\n\n{about.sentence}",
+        "\n".join(usage).replace("{repo_id}", repo_id),
+        _table(experiment, {"network": description.network(experiment), **description.details(experiment)}),
+        *_story(experiment.card),
+    ]
     return "\n\n".join(sections) + "\n"
 
 
-def _metadata(licence: str) -> str:
-    lines = ["library_name: lidarsynth", "tags: [lidar, point-cloud, range-image, diffusion]"]
+def _metadata(licence: str, tags: Sequence[str]) -> str:
+    lines = ["library_name: lidarsynth", f"tags: [{', '.join(('lidar', 'point-cloud', 'range-image', *tags))}]"]
     if licence:
         word = next((word for start, word in LICENCES.items() if licence.startswith(start)), "other")
         lines.append(f"license: {word}")
@@ -36,51 +46,31 @@ def _metadata(licence: str) -> str:
     return "\n".join(["---", *lines, "---"])
 
 
-def _title(experiment: Experiment) -> str:
-    what = "generates and completes" if experiment.model.network == "conditional-unet" else "generates"
-    kind, paper, number = ("diffusion", "R2DM", "2309.09256")
-    if experiment.score is not None:
-        kind, paper, number = ("score-based", "LiDARGen", "2209.03954")
-    return (
-        f"# {experiment.name}, {build_sensor(experiment).name}\n\nA {kind} model that {what} LiDAR scans, made with "
-        f"lidarsynth after {paper} ([arXiv {number}](https://arxiv.org/abs/{number}))."
-    )
-
-
-def _usage(experiment: Experiment, repo_id: str) -> str:
-    steps = "steps=32, " if experiment.score is None else ""  # few steps are not enough for Langevin dynamics
-    return f"""```python
-import lidarsynth as ls  # pip install 'lidarsynth[hub]'
-
-model = ls.load("{repo_id}")
-images = model.generate(4, {steps}seed=0)
-dense = model.complete(ls.read("scan.pcd"))
-```"""
-
-
-def _table(experiment: Experiment) -> str:
-    data, model, diffusion, training = experiment.data, experiment.model, experiment.diffusion, experiment.training
-    sensor, weighted = build_sensor(experiment), "none" if diffusion.gamma is None else f"min-SNR {diffusion.gamma:g}"
+def _table(experiment: Experiment, own: Mapping[str, str]) -> str:
+    """Sensor, images, training, and between them the rows of the system's `own`."""
+    data, training, sensor = experiment.data, experiment.training, build_sensor(experiment)
+    reflectance = ", reflectance 0 to 1" if data.reflectance else ", no reflectance"
     rows = {
         "sensor": f"{sensor.name}, {sensor.height} beams from {sensor.elevations[0]:+.2f} to "
         f"{sensor.elevations[-1]:+.2f} degrees, {sensor.min_range:g} to {sensor.max_range:g} m",
-        "images": f"{data.height} x {data.width}, {data.projection} projection, {data.codec} range, reflectance 0 to 1",
-        "network": f"{model.network}, base {model.base_channels}"
-        + ("" if model.network == "refinenet" else _unet(model)),
-        "diffusion": f"{diffusion.schedule} schedule, predicts {diffusion.kind}, {diffusion.loss} loss, "
-        f"weighting {weighted}",
+        "images": f"{data.height} x {data.width}, {data.projection} projection, {data.codec} range{reflectance}",
+        **own,
         "training": f"{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}, "
         f"seed {training.seed}",
-        "augmentation": ", ".join(w for w, on in (("roll", data.roll), ("mirror", data.mirror)) if on) or "none",
+        "augmentation": _augmentation(data),
     }
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows.items())])
 
 
-def _unet(model: Model) -> str:
-    return (
-        f" x {list(model.channel_multipliers)}, blocks {list(model.num_residual_blocks)}, "
-        f"stem {model.stem[0]}x{model.stem[1]}, {model.coords_encoding}"
-    )
+def _augmentation(data: Data) -> str:
+    """All that changes a training image, with how often or how much."""
+    parts = {
+        "roll": data.roll,
+        "mirror": data.mirror,
+        f"worlds up to {data.scale:.0%} larger or smaller": data.scale > 0,
+        f"a sector of another scan in {data.mix:.0%} of those to be completed": data.mix > 0,
+    }
+    return ", ".join(words for words, on in parts.items() if on) or "none"
 
 
 def _story(card: Card) -> list[str]:

@@ -17,8 +17,10 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.hub import push
+from lidarsynth.systems.model_card import card_text
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -41,6 +43,7 @@ class ScanModel(ABC):
     network: nn.Module
     sensor: Sensor
     experiment: Experiment
+    description: ClassVar[Description]  # what a card says of it
     kind: ClassVar[str] = "one that completes scans"  # said of those that generate nothing
 
     def to(self, device: str | torch.device) -> Self:
@@ -214,7 +217,8 @@ class ScanModel(ABC):
         Returns the address; `load("owner/name")` then gives the model anywhere. Needs the extra `hub` and a token.
         Raises ValueError in one line when the hub refuses or cannot be reached.
         """
-        return push(self.experiment, self.network, repo_id, private, half)
+        card = card_text(self.experiment, self.description, repo_id)
+        return push(self.experiment, self.network, repo_id, card, private, half)
 
     def _generates_nothing(self) -> ValueError:
         return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found "

@@ -84,7 +84,7 @@ def upsample_scan(
     Raises ValueError when no point is in the model's view.
     """
     filled = model.upsampled(scan, how, sensor_in, on_step)
-    measured = project(replace(scan, ring=None), model.sensor, "spherical")
+    measured = project(replace(scan, ring=None), filled.sensor, "spherical")
     return Filled(filled, {f"measured, {sensor_in.name}": measured, "upsampled": filled}, {})
 
 

@@ -17,9 +17,7 @@ from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Card, Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.systems.build import build_network
-from lidarsynth.systems.finetune import transfer
-from lidarsynth.systems.tasks import task_of
+from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
 from lidarsynth.training.examples import Learned, Streets, open_images
 from lidarsynth.training.journal import Journal

@@ -16,10 +16,9 @@ from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network, load_folder
 from lidarsynth.systems.hub import fetch, is_repository
 from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.systems.table import assemble, build_network, load_folder
 from lidarsynth.weights.download import OnBytes, cache_folder, download
 from lidarsynth.weights.official import read_official
 

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.networks.tensors import load_weights
-from lidarsynth.systems.build import build_network
 from lidarsynth.systems.diffusion.official_r2dm import experiment_of
-from lidarsynth.systems.official import STAND_INS, SYSTEMS, system_of
+from lidarsynth.systems.table import build_network, official_readers
 from lidarsynth.systems.upsampling.official import is_keras, read_keras
 
 
@@ -27,11 +26,11 @@ def read_official(path: str | Path, ema: bool = True) -> tuple[Experiment, nn.Mo
     if is_keras(path):
         return _read_keras(path)
     checkpoint = _unpickled(path)
-    system = system_of(checkpoint)
+    reader = next((reader for reader in official_readers().values() if reader.belongs(checkpoint)), None)
     name = "ema_weights" if ema else "weights"
     try:
-        if system is not None:
-            return system.read(checkpoint, path.stem, ema)
+        if reader is not None:
+            return reader.read(checkpoint, path.stem, ema)
         _check(checkpoint)
         weights = {key.removeprefix("model."): v for key, v in checkpoint[name].items() if key != "_dummy"}
         experiment = experiment_of(checkpoint, weights.get("coords"), path.stem)
@@ -49,7 +48,7 @@ def _read_keras(path: Path) -> tuple[Experiment, nn.Module]:
         raise ValueError(f"{path}: {error}") from None
 
 
-EXPECTED = f"expected an official R2DM checkpoint, or one of {', '.join(SYSTEMS)}"
+EXPECTED = f"expected an official R2DM checkpoint, or one of {', '.join(official_readers())}"
 
 
 def _unpickled(path: Path) -> Any:
@@ -61,9 +60,10 @@ def _unpickled(path: Path) -> Any:
             start = file.read(4)
     except OSError as error:
         raise ValueError(f"{expected}, found {error.strerror or error}") from None
+    stand_ins = [pair for reader in official_readers().values() for pair in reader.stand_ins]
     try:
         # Mapped, so that the optimiser's two thirds of the file are not read.
-        with torch.serialization.safe_globals(STAND_INS):
+        with torch.serialization.safe_globals(stand_ins):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except Exception as error:  # a damaged pickle raises whatever it likes
         raise ValueError(f"{expected}, found {_damage(start, zipped, error)}") from None

@@ -16,6 +16,7 @@ from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import STEPS, even_log_snr, generators, noise_like, sample
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
@@ -24,12 +25,15 @@ from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_ra
 from lidarsynth.networks.fill_unet import NOISES, Known, draw_noise
 from lidarsynth.networks.rays import decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, known_pixels, sensor_that_made, with_known
+from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.description import Description
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, sensor_that_made, with_known
 
 METHODS = ("auto", "conditional", "sample", "repaint")
 SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
-STEPS_DEFAULT = 16
+STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class CascadeModel(ScanModel):
     network: Cascade
     sensor: Sensor
     experiment: Experiment
+    description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
 
     def into(self, sensor: Sensor | str) -> CascadeModel:
@@ -81,8 +86,9 @@ class CascadeModel(ScanModel):
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         rows, columns = self._grid()
-        for start in range(first, n, batch_size):
-            rng = generators(seed, min(batch_size, n - start), offset=start)
+        size = self.at_once(batch_size)
+        for start in range(first, n, size):
+            rng = generators(seed, size, offset=start)
             told, standing = self._grid_rays(rows, columns, len(rng))
             x_1 = noise_like(torch.zeros(len(rng), 3, ROWS, COLUMNS, device=self._device), rng)
             x_0 = x_1
@@ -91,44 +97,49 @@ class CascadeModel(ScanModel):
                 if on_step is not None:
                     on_step()
             metres, reflectance = self.network.coarse.decode(x_0, standing)
-            yield from self._filled_grids(metres, reflectance, rows, columns, rng)
+            yield from self._filled_grids(metres, reflectance, rows, columns, rng)[: n - start]
             if on_step is not None:
                 on_step()
 
-    def complete(
-        self,
-        scan: Scan | RangeImage,
-        known: np.ndarray | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        resamples: int = 10,
-        sampler: str | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-    ) -> RangeImage:
-        """Fill what was not measured; measured pixels come back exactly as they were, in metres.
+    def resolved(self, how: Filling) -> Filling:
+        """The request with this model's own choices.
 
-        scan    points, or an image of this model's sensor
-        known   (H, W) bool: pixels to keep, where an empty pixel means that nothing returned; None = the measured ones
         method  `conditional` (`auto`): the most likely image, of least error; `sample`: one of many possible images,
                 with the grain of a recorded scan; `repaint`: large holes first by the coarse network, then a sample
-        steps   1; of `repaint`, those of the coarse network, default 16, with `resamples` passes over each
+        steps   1; of `repaint`, those of the coarse network, default 16, with `resamples` passes, default 10, over each
 
-        A scan whose reflectance is 0 everywhere gets a reflectance. Raises ValueError when shapes or words do not fit.
+        Raises ValueError for other words, and for what the method would ignore.
         """
-        image = self.image_of(scan)
-        known = known_pixels(image, known)
-        self.evaluations(method, steps, resamples)
-        rng = generators(seed, 1)
-        lit = bool(image.reflectance[known].any())
-        metres, reflectance, told = image.range, image.reflectance, known | (self._blocked & ~image.mask)
-        if method == "repaint":
-            metres, reflectance, told = self._holes(metres, reflectance, told, rng, steps, resamples, on_step)
-        noise = None if method in ("auto", "conditional") else rng
+        name = self.experiment.name
+        if how.method not in METHODS:
+            raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, found {how.method!r}")
+        how.at_least_one().without("sampler", reason="since repaint takes ancestral steps and the fill is one")
+        if how.method == "repaint":
+            return replace(how, steps=how.steps or STEPS_DEFAULT, resamples=how.resamples or RESAMPLES_DEFAULT)
+        how.without("resamples", reason="which only repaint has")
+        if how.steps not in (None, 1):
+            raise ValueError(f"{name}: expected 1 step, for the fill is one, found {how.steps}")
+        return replace(how, method="conditional" if how.method == "auto" else how.method, steps=1)
+
+    def calls(self, how: Filling) -> int:
+        """How many network evaluations a resolved request takes."""
+        if how.method != "repaint":
+            return 1
+        assert how.steps is not None and how.resamples is not None
+        return 1 + repaint.evaluations(how.steps, how.resamples)
+
+    def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
+        """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
+        rng, lit = generators(how.seed, 1), bool(image.reflectance[known].any())
+        known = known | (self._blocked & ~image.mask)
+        metres, reflectance, told = image.range, image.reflectance, known
+        if how.method == "repaint":
+            metres, reflectance, told = self._holes(metres, reflectance, told, rng, how, on_step)
+        noise = None if how.method == "conditional" else rng
         filled = self._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         if on_step is not None:
             on_step()
-        return with_known(filled, image, known | (self._blocked & ~image.mask), keep_reflectance=lit)
+        return with_known(filled, image, known, keep_reflectance=lit)
 
     def upsample(
         self,
@@ -138,32 +149,36 @@ class CascadeModel(ScanModel):
         steps: int | None = None,
         seed: int = 0,
         on_step: OnStep = None,
+        resamples: int | None = None,
+        sampler: str | None = None,
         times: int = 4,
     ) -> RangeImage:
         """A scan with `times` - 1 new beams between each two of its own sensor's, whose rays stay where they are.
 
         sensor_in  the sensor that made the scan; None = recognised from the points
         """
-        own = sensor_that_made(scan, sensor_in)
+        return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed), sensor_in, on_step, times)
+
+    def upsampled(
+        self,
+        scan: Scan,
+        how: Filling,
+        sensor_in: Sensor | str | None = None,
+        on_step: OnStep = None,
+        times: int = 4,
+    ) -> RangeImage:
+        """`upsample` of a record; `to_scan()` gives every measured point bit by bit beside the new ones."""
+        own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
         model = self.into(own.denser(times))
         image, known = spread(sparse, model.sensor, times)
-        return model.complete(image, known, method, steps, seed=seed, on_step=on_step)
+        filled = model.fill(image, known, how, on_step)
+        return replace(filled, completed=with_measured(replace(scan, ring=None), image.mask, filled, "spherical"))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch: the coarse steps and the fill."""
         self._sampler(sampler)
         return 1 + (STEPS_DEFAULT if steps is None else steps)
-
-    def evaluations(self, method: str = "auto", steps: int | None = None, resamples: int = 10) -> int:
-        """How often `complete` calls `on_step`. Raises ValueError for another method or more steps."""
-        if method not in METHODS:
-            raise ValueError(f"{self.experiment.name}: expected a method of {', '.join(METHODS)}, found {method!r}")
-        if method == "repaint":
-            return 1 + repaint.evaluations(STEPS_DEFAULT if steps is None else steps, resamples)
-        if steps not in (None, 1):
-            raise ValueError(f"{self.experiment.name}: expected 1 step, for the fill is one, found {steps}")
-        return 1
 
     def _sampler(self, sampler: str | None) -> str:
         if sampler is not None and sampler not in SAMPLERS:
@@ -202,8 +217,7 @@ class CascadeModel(ScanModel):
         reflectance: np.ndarray,
         told: np.ndarray,
         rng: list[torch.Generator],
-        steps: int | None,
-        resamples: int,
+        how: Filling,
         on_step: OnStep,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Metres, reflectance and known pixels with a grid of new ones where nothing is known around."""
@@ -216,10 +230,17 @@ class CascadeModel(ScanModel):
         values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
         known = coarse.encode(*values, standing)  # type: ignore[call-arg]
         x_1 = noise_like(known, rng)
-        count = STEPS_DEFAULT if steps is None else steps
+        assert how.steps is not None and how.resamples is not None
         x_0 = x_1
         for state in repaint.repaint(
-            self._coarse(rays), x_1, known, here[:, None], rng, steps=count, resamples=resamples, grid=even_log_snr
+            self._coarse(rays),
+            x_1,
+            known,
+            here[:, None],
+            rng,
+            steps=how.steps,
+            resamples=how.resamples,
+            grid=even_log_snr,
         ):
             x_0 = state.x_s
             if on_step is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,6 +18,8 @@ from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.systems.description import Description
+from lidarsynth.systems.diffusion.description import DESCRIPTION
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel, with_known
 
@@ -37,6 +40,7 @@ class LidarModel(ScanModel):
     denoiser: Denoiser
     sensor: Sensor
     experiment: Experiment
+    description: ClassVar[Description] = DESCRIPTION
 
     @property
     def conditional(self) -> bool:

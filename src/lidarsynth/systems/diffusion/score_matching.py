@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from lidarsynth.diffusion import langevin
 from lidarsynth.experiment.record import Experiment, Score, Training
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.systems.build import build_denoiser
+from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.validation import judge_diffusion, picture_samples
 from lidarsynth.training.randomness import augment, sample_rng
 from lidarsynth.training.task import Images, Phase, Task, ema_due

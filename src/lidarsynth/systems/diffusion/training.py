@@ -19,7 +19,7 @@ from lidarsynth.experiment.record import Experiment, Training
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.depth import CODECS, decode, encode, valid
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.systems.build import build_denoiser
+from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.validation import EVERY, judge_diffusion, picture_samples
 from lidarsynth.training.randomness import augment, sample_rng, sample_seed
 from lidarsynth.training.task import Images, Phase, Task

@@ -16,7 +16,7 @@ from lidarsynth.lidar.depth import to_x_0
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.pictures.figure import panel
 from lidarsynth.pictures.render import range_strip, reflectance_strip
-from lidarsynth.systems.build import build_denoiser
+from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.model import LidarModel
 
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # noise levels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +18,9 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.gan.inverse_depth import to_inverse_depth
 from lidarsynth.networks.gan.inversion import invert, unit_rms
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
+from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.gan.description import DESCRIPTION
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, with_known
 
 METHODS = ("auto", "inversion")
@@ -34,6 +37,7 @@ class GanModel(ScanModel):
     network: ScanGenerator
     sensor: Sensor
     experiment: Experiment
+    description: ClassVar[Description] = DESCRIPTION
 
     def into(self, sensor: Sensor | str) -> GanModel:
         """The same weights with images of another sensor, for DUSty v2, which renders any ray angles.

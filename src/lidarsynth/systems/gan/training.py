@@ -33,8 +33,8 @@ from lidarsynth.networks.gan.losses import (
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
 from lidarsynth.pictures.figure import panel
 from lidarsynth.pictures.render import range_strip
-from lidarsynth.systems.build import build_discriminator
 from lidarsynth.systems.gan.batch import Batch, View, draw, group_of
+from lidarsynth.systems.gan.build import build_discriminator
 from lidarsynth.systems.gan.model import GanModel
 from lidarsynth.training.machine import fixed_randomness
 from lidarsynth.training.task import Phase, Task

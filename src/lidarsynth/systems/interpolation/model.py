@@ -12,7 +12,9 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.interpolation import Interpolation, interpolate
+from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.interpolation.description import DESCRIPTION
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, with_known
 
 
@@ -37,6 +39,7 @@ class InterpolationModel(ScanModel):
     network: Interpolation
     sensor: Sensor
     experiment: Experiment
+    description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "an interpolation"
 
     def into(self, sensor: Sensor | str) -> InterpolationModel:

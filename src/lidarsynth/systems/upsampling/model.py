@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.iln import ILN, LIIF
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
+from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import (
     OnStep,
@@ -25,6 +27,7 @@ from lidarsynth.systems.scan_model import (
     imaged_by,
     with_known,
 )
+from lidarsynth.systems.upsampling.description import DESCRIPTION
 
 HARDLY = 0.02  # share of a row's pixels; of a beam with fewer known ones nothing is known
 PIECE = 16_384  # queries at once: what bounds the memory of ILN
@@ -41,6 +44,7 @@ class UpsamplingModel(ScanModel):
     network: LidarSR | ILN | LIIF
     sensor: Sensor
     experiment: Experiment
+    description: ClassVar[Description] = DESCRIPTION
 
     def into(self, sensor: Sensor | str) -> UpsamplingModel:
         """The same network with images of another sensor. Raises ValueError where LiDAR-SR cannot have that size."""

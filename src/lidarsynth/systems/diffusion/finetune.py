@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.networks.tensors import load_weights
-from lidarsynth.systems.build import GANS, UPSAMPLERS
 
 # Fields of the model that do not change what weights mean; residual blocks more than the weights have begin as identity
 FREE = ("model.network", "model.ring", "model.dropout", "model.candidates", "model.around", "model.num_residual_blocks")
@@ -27,12 +26,6 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     position encoding start at zero. A network that is not told the known pixels may become one that is, and back: their
     channels start at zero. Everything else must be equal. Raises ValueError that lists the fields that differ.
     """
-    if {experiment.model.network, source.model.network} & set(GANS):
-        return _transfer_gan(network, experiment, weights, source, name)
-    if {experiment.model.network, source.model.network} & set(UPSAMPLERS):
-        return _transfer_upsampling(network, experiment, weights, source, name)
-    if "rangenet" in (experiment.model.network, source.model.network):
-        return load_weights(network, weights.state_dict(), name)
     different = differences(experiment, source)
     if different:
         wanted = "--set " + " ".join(f"{field}={_word(theirs)}" for field, _, theirs in different)
@@ -51,31 +44,6 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
         elif ".residual_blocks." in bare:
             start[key] = own[key]
     load_weights(network, {**dict(network.named_buffers()), **start}, name)
-
-
-def _transfer_gan(
-    network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str
-) -> None:
-    """A generator of the same kind and widths, into the angles of `experiment`; the discriminator begins anew."""
-    (ours, theirs), codec = (e.model.network for e in (experiment, source)), "data.codec"
-    if ours != theirs or _value(experiment, codec) != _value(source, codec):
-        found, expected = (f"{e.model.network} of {e.data.codec} range" for e in (source, experiment))
-        raise ValueError(f"{name}: expected weights of {expected}, found {found}")
-    own = {key: value for key, value in network.state_dict().items() if key == "angles"}
-    load_weights(network, {**weights.state_dict(), **own}, name)
-
-
-def _transfer_upsampling(
-    network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str
-) -> None:
-    """Weights of the same kind and widths, of any sensor; which rows are known, and how far 1 is, may differ."""
-    ours, theirs = (
-        (e.model.network, *((g.factor, g.keras) if (g := e.upsampling) else ())) for e in (experiment, source)
-    )
-    if ours != theirs:
-        raise ValueError(f"{name}: expected weights of {', '.join(map(str, ours))} (network, factor, keras), "
-                         f"found {', '.join(map(str, theirs))}")  # fmt: skip
-    load_weights(network, weights.state_dict(), name)
 
 
 def image_channels(experiment: Experiment) -> int:

@@ -1,0 +1,26 @@
+"""What is said of the cascade."""
+
+from __future__ import annotations
+
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.systems.description import About, Description
+
+
+def _network(experiment: Experiment) -> str:
+    return "cascade: a coarse layout from noise, and one step that fills in the rest, for any sensor"
+
+
+def _details(experiment: Experiment) -> dict[str, str]:
+    return {"diffusion": "flow matching of a grid of 16 beams x 128 columns; all pixels are filled in one step"}
+
+
+def _about(experiment: Experiment) -> About:
+    return About(
+        "A model that generates, completes and upsamples LiDAR scans of any sensor, made with lidarsynth.",
+        ('model = ls.load("{repo_id}")', "images = model.generate(4, seed=0)",
+         'dense = model.complete(ls.read("scan.pcd"))', 'up = model.upsample(ls.read("vlp16.pcd"), times=4)'),
+        ("diffusion", "super-resolution"),
+    )  # fmt: skip
+
+
+DESCRIPTION = Description(_network, _details, _about)

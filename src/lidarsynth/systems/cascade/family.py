@@ -1,0 +1,41 @@
+"""What the cascade brings: one model for any sensor."""
+
+from __future__ import annotations
+
+from torch import nn
+
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import CoarseUNet
+from lidarsynth.networks.fill_unet import FillUNet
+from lidarsynth.networks.tensors import load_weights
+from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.training import CASCADE as TASK
+from lidarsynth.systems.system import System
+
+
+def build(experiment: Experiment, sensor: Sensor) -> Cascade:
+    """Both networks; neither knows a sensor. Raises ValueError for other numbers of blocks from level to level."""
+    model, width = experiment.model, experiment.model.base_channels
+    if len(set(model.num_residual_blocks)) > 1:
+        raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
+                         f"{model.num_residual_blocks}")  # fmt: skip
+    coarse = CoarseUNet(width, model.channel_multipliers, model.num_residual_blocks[0])
+    return Cascade(coarse, FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2)))
+
+
+def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
+    """The cascade with the sensor of its images."""
+    assert isinstance(network, Cascade)
+    return CascadeModel(network, build_sensor(experiment), experiment)
+
+
+def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str) -> None:
+    """All weights, of equally wide networks; the sensor may differ."""
+    load_weights(network, weights.state_dict(), name)
+
+
+CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer)

@@ -1,0 +1,36 @@
+"""What is said of a model: by `info`, and by the card of a repository."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from lidarsynth.experiment.record import Experiment
+
+
+@dataclass(frozen=True)
+class About:
+    """What a model card says of a model beyond its experiment.
+
+    sentence  what it is, in one sentence, with the paper
+    usage     lines of Python behind `import lidarsynth as ls`, {repo_id} where it is loaded from
+    tags      the hub's words
+    """
+
+    sentence: str
+    usage: tuple[str, ...]
+    tags: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Description:
+    """How a family of networks is described.
+
+    network  experiment -> what it is made of, in a line
+    details  experiment -> more such lines by their titles
+    about    experiment -> what a model card says
+    """
+
+    network: Callable[[Experiment], str]
+    details: Callable[[Experiment], dict[str, str]]
+    about: Callable[[Experiment], About]

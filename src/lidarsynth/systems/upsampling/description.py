@@ -1,0 +1,42 @@
+"""What is said of networks that put beams between known ones."""
+
+from __future__ import annotations
+
+from lidarsynth.experiment.record import Experiment, Upsampling
+from lidarsynth.systems.description import About, Description
+
+PAPERS = {"lidar-sr": "2004.05242", "iln": "2205.01343", "liif": "2012.09161"}  # on arXiv
+
+
+def _network(experiment: Experiment) -> str:
+    model, group = experiment.model, experiment.upsampling or Upsampling()
+    if model.network == "lidar-sr":
+        program = "Keras" if group.keras else "PyTorch"
+        return f"lidar-sr ({program}), base {model.base_channels}, dropout {model.dropout:g}; range only"
+    size = f"{sum(model.num_residual_blocks)} blocks of {model.base_channels} channels"
+    layers = f", {group.depth} layers of {model.attn_num_heads} heads" if model.network == "iln" else ""
+    return f"{model.network}, {size}{layers}; range only"
+
+
+def _shown(experiment: Experiment) -> dict[str, str]:
+    """What a network that puts beams between known ones is shown, and how it answers."""
+    group, height = experiment.upsampling or Upsampling(), experiment.data.height
+    rows = f"{height // group.factor[0]} to {height} rows (beams:{group.factor[0]}:{group.first})"
+    range_ = f"1 is {group.norm:g} m, up to {group.max_range:g} m, no return is {0 if group.keras else 1}"
+    if experiment.model.network != "lidar-sr":
+        return {"upsampling": f"{rows}, and any other known beams and rays; {range_}"}
+    answer = f"mean of {group.passes} passes under dropout, empty where they vary by more than {group.threshold:.0%}"
+    return {"upsampling": f"{rows}; {range_}; {answer}"}
+
+
+def _about(experiment: Experiment) -> About:
+    word = experiment.model.network
+    return About(
+        f"A network that puts beams between the known ones of a LiDAR scan, without reflectance, made with lidarsynth "
+        f"after {word} ([arXiv {PAPERS[word]}](https://arxiv.org/abs/{PAPERS[word]})). It makes no new scans.",
+        ('model = ls.load("{repo_id}")', 'dense = model.upsample(ls.read("scan.pcd"))  # recognises its sensor'),
+        ("super-resolution",),
+    )
+
+
+DESCRIPTION = Description(_network, _shown, _about)
