@@ -218,3 +218,13 @@ def test_noise_has_three_grains():
     assert_close(noise.std((0, 2, 3)), torch.ones(3), atol=0.03, rtol=0)
     assert torch.equal(noise[:, 1, :, 0], noise[:, 1, :, 5])
     assert torch.equal(noise[:, 2, 0, 0], noise[:, 2, 3, 7])
+
+
+def test_a_scan_is_completed_in_its_own_sensor_until_another_is_named(model: CascadeModel):
+    scan = SyntheticStreets(4, 16, SENSORS["vlp-16"])[2]
+    assert model.complete(scan).sensor.name == "vlp-16"
+    assert model.into("hdl-32e").upsample(scan, "vlp-16").shape == (32, 1024)
+    with pytest.raises(ValueError, match="found both"):
+        model.into("hdl-32e").upsample(scan, "vlp-16", times=2)
+    with pytest.raises(ValueError, match="name the sensor"):
+        model.complete(replace(scan, xyz=scan.xyz[:, [2, 0, 1]], ring=None))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, Source, arg
+from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, SensorWord, Source, arg
 from lidarsynth.cli.terminal import at_least, load_with_bar, say, step_bar
 
 
@@ -14,8 +14,9 @@ def generate(
     out: Annotated[Path, arg(help="folder to write to.")] = Path("out"),
     model: Source = "default",
     format: Annotated[Format, arg(help="of the files.")] = "ply",
+    sensor: Annotated[SensorWord, arg(help="of the scans, for a model of any sensor; default the model's.")] = None,
     steps: GenerationSteps = None,
-    sampler: Annotated[Sampler | None, arg(help="of the reverse process; default ddpm.")] = None,
+    sampler: Annotated[Sampler | None, arg(help="of the reverse process; default the model's.")] = None,
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one, as fast.")] = 4,
     device: Device = "cpu",
@@ -28,6 +29,7 @@ def generate(
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
     at_least(0, {"seed": seed})
     loaded = load_with_bar(model, device)
+    loaded = loaded.into(sensor) if sensor else loaded
     steps = loaded.generation_steps(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
     claim(out, settings)

@@ -133,6 +133,8 @@ class ScanModel(ABC):
         self, scan: Scan | RangeImage, how: Filling, known: np.ndarray | None = None, on_step: OnStep = None
     ) -> RangeImage:
         """`complete` of a record."""
+        if isinstance(scan, Scan) and (model := self.suited_to(scan)) is not self:
+            return model.filled(scan, how, known, on_step)
         how, image = self.resolved(how), self.image_of(scan)
         if known is not None or isinstance(scan, RangeImage):
             return self.fill(image, known_pixels(image, known), how, on_step)
@@ -182,6 +184,13 @@ class ScanModel(ABC):
         name = sensor if isinstance(sensor, str) else sensor.name
         raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as iln, lidar-sr or bilinear, "
                          f"for --to {name}, found one of {self.sensor.name} only")  # fmt: skip
+
+    def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> ScanModel:
+        """The model that completes this scan in its own sensor's image; here itself, which knows one sensor.
+
+        sensor  that made the scan; None = as recognised from the points
+        """
+        return self
 
     def at_once(self, batch_size: int) -> int:
         """How many scans to make at once: one on a CPU, where more are no faster and differ by rounding."""

@@ -34,6 +34,7 @@ METHODS = ("auto", "conditional", "sample", "repaint")
 SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
+TIMES = 4  # as many beams
 
 
 @dataclass(frozen=True)
@@ -42,28 +43,35 @@ class CascadeModel(ScanModel):
 
     network.coarse   velocity of flow matching on a grid of 16 beams x 128 columns of the sensor
     network.fill     known pixels and rays -> all pixels, in one step
+    own              whether scans are completed, and made denser, in the sensor that made them: until `into`
     """
 
     network: Cascade
     sensor: Sensor
     experiment: Experiment
+    own: bool = True
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
 
     def into(self, sensor: Sensor | str) -> CascadeModel:
         """The same model with images of another sensor."""
         sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
-        return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor))
+        return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor), own=False)
 
-    def suited_to(self, scan: Scan) -> CascadeModel:
-        """The same model with images of the sensor that made the scan, as recognised from its points.
+    def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> CascadeModel:
+        """The model with images of the sensor that made the scan; itself after `into`.
+
+        sensor  None = as recognised from the points
 
         Raises ValueError when it is not recognised.
         """
-        name, reason = recognise(scan)
-        if name is None:
-            raise ValueError(f"{reason}, or give its sensor file")
-        return self if name == self.sensor.name else self.into(name)
+        if not self.own:
+            return self
+        if sensor is None:
+            sensor, reason = recognise(scan)
+            if sensor is None:
+                raise ValueError(f"{reason}, or into(SENSOR)")
+        return self.into(sensor)
 
     def stream(
         self,
@@ -151,9 +159,11 @@ class CascadeModel(ScanModel):
         on_step: OnStep = None,
         resamples: int | None = None,
         sampler: str | None = None,
-        times: int = 4,
+        times: int | None = None,
     ) -> RangeImage:
-        """A scan with `times` - 1 new beams between each two of its own sensor's, whose rays stay where they are.
+        """A scan with `times` - 1 (default 3) new beams between each two of its own sensor's, whose rays stay.
+
+        After `into`, in the rays of that sensor.
 
         sensor_in  the sensor that made the scan; None = recognised from the points
         """
@@ -165,9 +175,14 @@ class CascadeModel(ScanModel):
         how: Filling,
         sensor_in: Sensor | str | None = None,
         on_step: OnStep = None,
-        times: int = 4,
+        times: int | None = None,
     ) -> RangeImage:
         """`upsample` of a record; `to_scan()` gives every measured point bit by bit beside the new ones."""
+        if not self.own:
+            if times is not None:
+                raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
+            return super().upsampled(scan, how, sensor_in, on_step)
+        times = TIMES if times is None else times
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
         model = self.into(own.denser(times))
