@@ -1,0 +1,127 @@
+"""Point clouds into a new bag: ROS 1 `.bag`, or `.mcap` as ROS 2 records it; other topics are copied as they are."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, naming, typestore
+from lidarsynth.data.fields import FileError
+from lidarsynth.files.point_cloud2 import encode
+
+Put = Callable[[Topic, int, bytes], None]  # topic, nanoseconds, message
+FORMATS = {".bag": "ros1", ".mcap": "cdr"}  # what each kind of file holds
+MSG_CDR, MSG_ROS1 = "ros2msg", "ros1msg"
+
+
+@dataclass
+class BagWriter:
+    """An open new bag."""
+
+    path: Path
+    encoding: str
+    put: Put
+    topics: dict[str, Topic] = field(default_factory=dict)
+
+    def write_cloud(self, topic: str, cloud: Cloud) -> None:
+        """A PointCloud2 with the cloud's stamp, frame and fields, recorded at its time."""
+        if topic not in self.topics:
+            self.topics[topic] = points_topic(topic, self.encoding)
+        self.put(self.topics[topic], cloud.time, message_of(cloud, self.encoding))
+
+    def copy(self, message: Message) -> None:
+        """A message of another bag as it is. Raises FileError where this kind of file cannot hold it."""
+        if self.path.suffix == ".bag" and message.topic.encoding != "ros1":
+            raise FileError(f"{self.path}: expected messages of ROS 1 to copy into a .bag, found {message.topic.name} "
+                            f"in {message.topic.encoding}; write a .mcap")  # fmt: skip
+        self.put(message.topic, message.time, message.data)
+
+
+@contextmanager
+def write_bag(path: str | Path) -> Iterator[BagWriter]:
+    """A new `.bag` or `.mcap`; it appears whole or not at all, over an old one of that name. Raises FileError."""
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise FileError(f"{path}: expected a name that ends in {', '.join(FORMATS)} for a bag, found {path.suffix!r}")
+    scratch = path.with_name(f".{secrets.token_hex(8)}{path.suffix.lower()}")
+    opened = {".bag": _bag, ".mcap": _mcap}[path.suffix.lower()]
+    try:
+        with naming(path), opened(scratch) as put:
+            yield BagWriter(path, FORMATS[path.suffix.lower()], put)
+        os.replace(scratch, path)
+    finally:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+
+
+def points_topic(name: str, encoding: str) -> Topic:
+    """A topic of PointCloud2 with its definition in the words of ROS 1 (`ros1`) or ROS 2 (`cdr`)."""
+    store = typestore(encoding)
+    if encoding == "ros1":
+        text, digest = store.generate_msgdef(POINTS)
+        return Topic(name, POINTS, encoding, (MSG_ROS1, text.encode()), 0, digest)
+    text, _ = store.generate_msgdef(POINTS, ros_version=2)
+    return Topic(name, POINTS, encoding, (MSG_CDR, text.encode()), 0, store.hash_rihs01(POINTS))
+
+
+def message_of(cloud: Cloud, encoding: str) -> bytes:
+    """The bytes of a PointCloud2: little endian, packed, one row."""
+    store, layout = typestore(encoding), encode(cloud.fields)
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](cloud.stamp // 10**9, cloud.stamp % 10**9)
+    first = encoding == "ros1"
+    header = types["std_msgs/msg/Header"](*([0] if first else []), stamp, cloud.frame_id)
+    fields = [types["sensor_msgs/msg/PointField"](n, at, kind, 1) for n, at, kind in layout.fields]
+    count = len(layout.data) // layout.point_step
+    points: Any = types[POINTS](header, 1, count, fields, False, layout.point_step, len(layout.data), layout.data,
+                                _dense(cloud))  # fmt: skip
+    return bytes((store.serialize_ros1 if first else store.serialize_cdr)(points, POINTS))
+
+
+def _dense(cloud: Cloud) -> bool:
+    return all(bool(np.isfinite(cloud.fields[axis]).all()) for axis in "xyz" if axis in cloud.fields)
+
+
+@contextmanager
+def _bag(path: Path) -> Iterator[Put]:
+    from rosbags.rosbag1 import Writer
+
+    with Writer(path) as writer:
+        connections: dict[str, Any] = {}
+
+        def put(topic: Topic, time: int, data: bytes) -> None:
+            if topic.name not in connections:
+                text = topic.schema[1].decode()
+                connections[topic.name] = writer.add_connection(
+                    topic.name, topic.kind, msgdef=text, md5sum=topic.digest
+                )
+            writer.write(connections[topic.name], time, data)
+
+        yield put
+
+
+@contextmanager
+def _mcap(path: Path) -> Iterator[Put]:
+    from mcap.writer import Writer
+
+    with open(path, "xb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="lidarsynth")
+        channels: dict[str, int] = {}
+
+        def put(topic: Topic, time: int, data: bytes) -> None:
+            if topic.name not in channels:
+                kind = topic.kind.replace("/msg/", "/") if topic.schema[0] == MSG_ROS1 else topic.kind
+                schema = writer.register_schema(kind, *topic.schema)
+                channels[topic.name] = writer.register_channel(topic.name, topic.encoding, schema)
+            writer.add_message(channels[topic.name], time, data, time)
+
+        yield put
+        writer.finish()

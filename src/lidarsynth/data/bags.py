@@ -1,0 +1,271 @@
+"""ROS 1 bags, ROS 2 bags (sqlite3, MCAP) and bare MCAP files as streams of messages, without ROS (the extra `ros`).
+
+Three libraries' readers behind one record: `rosbags` for `.bag` and ROS 2 folders or `.db3`, `mcap` for `.mcap`. Messages
+stay bytes until they are asked for, so that a bag of any size passes in the memory of one chunk.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+from lidarsynth.data.fields import Fields, FileError
+from lidarsynth.files.point_cloud2 import decode
+
+POINTS = "sensor_msgs/msg/PointCloud2"
+SUFFIXES = (".bag", ".mcap", ".db3")
+BROKEN = (OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, AssertionError, TypeError, struct.error)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What one connection of a bag carries.
+
+    name      such as /points
+    kind      message type in ROS 2's style, such as sensor_msgs/msg/PointCloud2, or the schema's name
+    encoding  of the messages: ros1, cdr (ROS 2), json, ...
+    schema    (its own encoding, its text): the message definition
+    count     messages, or 0 where the bag does not tell
+    digest    checksum of the definition, ROS 1 and 2 only
+    """
+
+    name: str
+    kind: str
+    encoding: str
+    schema: tuple[str, bytes]
+    count: int
+    digest: str = ""
+
+
+class Message(NamedTuple):
+    """One message: its topic, when it was recorded (nanoseconds), its bytes."""
+
+    topic: Topic
+    time: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The points of one message.
+
+    stamp     nanoseconds, of the header
+    frame_id  the coordinate frame's name
+    time      nanoseconds, when it was recorded
+    fields    as `point_cloud2.decode`
+    """
+
+    stamp: int
+    frame_id: str
+    time: int
+    fields: Fields
+
+
+@dataclass(frozen=True)
+class Bag:
+    """An open bag. `messages(names)` streams those of the topics named, or all; `seconds` is its duration."""
+
+    path: Path
+    topics: tuple[Topic, ...]
+    seconds: float
+    source: Callable[[frozenset[str]], Iterator[Message]]
+
+    def messages(self, names: frozenset[str] = frozenset()) -> Iterator[Message]:
+        """Messages in the order of their times. Raises FileError where the bag is broken."""
+        with naming(self.path):
+            yield from self.source(names)
+
+    def clouds(self, topic: str) -> Iterator[Cloud | FileError]:
+        """The point clouds of a topic, one at a time; a broken one comes as its error, and the next follow."""
+        for message in self.messages(frozenset([topic])):
+            try:
+                yield cloud_of(message)
+            except (*BROKEN, *library_errors()) as error:
+                yield FileError(f"{self.path}: {topic}: expected a point cloud, found: {_line(error)}")
+
+    def point_topic(self, name: str | None = None) -> str:
+        """The topic named, or the only one of points. Raises ValueError that lists those there are."""
+        clouds = [topic.name for topic in self.topics if topic.kind == POINTS]
+        listed = ", ".join(clouds) or "none; it holds " + (", ".join(sorted({t.kind for t in self.topics})) or "nothing")
+        if name is None and len(clouds) == 1:
+            return clouds[0]
+        if name is None:
+            expected = "one topic of points, or --topic" if clouds else f"a topic of {POINTS}"
+            raise ValueError(f"{self.path}: expected {expected}, found {listed}")
+        if name not in clouds:
+            raise ValueError(f"{self.path}: expected a topic of points named {name}, found {listed}")
+        return name
+
+
+def is_bag(path: str | Path) -> bool:
+    """Whether a path is a bag by its name, or a folder that holds a ROS 2 bag."""
+    path = Path(path)
+    return path.name.lower().endswith(SUFFIXES) or (path / "metadata.yaml").is_file()
+
+
+@contextmanager
+def open_bag(path: str | Path) -> Iterator[Bag]:
+    """A bag for reading. Raises FileError, in one line, for what is none, and where the extra `ros` is missing."""
+    path = Path(path)
+    if not path.exists():
+        raise FileError(f"{path}: expected a bag, found nothing")
+    _packages()
+    inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    bare = [path] if path.suffix.lower() == ".mcap" else inside
+    opened = _mcap(path, bare) if bare else _rosbags(path)
+    with naming(path):
+        bag = next(opened)
+    try:
+        yield bag
+    finally:
+        opened.close()
+
+
+def cloud_of(message: Message) -> Cloud:
+    """The point cloud in a message of PointCloud2."""
+    store = typestore(message.topic.encoding)
+    read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
+    points: Any = read(message.data, POINTS)
+    stamp = points.header.stamp
+    return Cloud(stamp.sec * 10**9 + stamp.nanosec, points.header.frame_id, message.time, decode(points))
+
+
+_STORES: dict[str, Any] = {}  # encoding -> the types of that ROS; a second to build, so once
+
+
+def typestore(encoding: str) -> Any:
+    """rosbags' message types of ROS 1 (`ros1`) or ROS 2 (`cdr`). Raises ValueError for another encoding."""
+    from rosbags.typesys import Stores, get_typestore
+
+    stores = {"ros1": Stores.ROS1_NOETIC, "cdr": Stores.LATEST}
+    if encoding not in stores:
+        raise ValueError(f"expected messages of ROS 1 or ROS 2, found the encoding {encoding!r}")
+    if encoding not in _STORES:
+        _STORES[encoding] = get_typestore(stores[encoding])
+    return _STORES[encoding]
+
+
+def _rosbags(path: Path) -> Iterator[Bag]:
+    """A ROS 1 `.bag`, a ROS 2 folder or a `.db3`, through rosbags."""
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+
+    first = path.suffix.lower() == ".bag"
+    with (Reader1 if first else Reader2)(path) as reader:
+        topics = {c.id: _topic(c, "ros1" if first else "cdr") for c in reader.connections}
+
+        def messages(names: frozenset[str]) -> Iterator[Message]:
+            chosen = [c for c in reader.connections if not names or c.topic in names]
+            for connection, time, data in reader.messages(connections=chosen):  # type: ignore[arg-type]
+                yield Message(topics[connection.id], time, bytes(data))
+
+        duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
+        yield Bag(path, tuple(topics.values()), duration, messages)
+
+
+def _topic(connection: Any, encoding: str) -> Topic:
+    kind = {"ros1": "ros1msg"}.get(encoding, "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg")
+    text = connection.msgdef.data.encode()
+    return Topic(connection.topic, connection.msgtype, encoding, (kind, text), connection.msgcount, connection.digest)
+
+
+def _mcap(path: Path, files: list[Path]) -> Iterator[Bag]:
+    """MCAP files one after the other: a bare one, or those of a ROS 2 folder."""
+    from contextlib import ExitStack
+
+    with ExitStack() as stack:
+        streams = [stack.enter_context(open(file, "rb")) for file in files]
+        parts = [_mcap_topics(stream) for stream in streams]
+        topics: dict[str, Topic] = {}
+        for found, _ in parts:
+            for topic in found.values():
+                before = topics.get(topic.name, topic)
+                more = topic.count if before is not topic else 0
+                topics[topic.name] = Topic(*(*_values(before)[:4], before.count + more, before.digest))
+
+        def messages(names: frozenset[str]) -> Iterator[Message]:
+            for stream in streams:
+                yield from _mcap_messages(stream, names, topics)
+
+        yield Bag(path, tuple(topics.values()), sum(seconds for _, seconds in parts), messages)
+
+
+def _values(topic: Topic) -> tuple:
+    return topic.name, topic.kind, topic.encoding, topic.schema, topic.count, topic.digest
+
+
+def _mcap_topics(stream: IO[bytes]) -> tuple[dict[int, Topic], float]:
+    """Channel -> topic, and the seconds from first to last message. A file without summary is read through once."""
+    from mcap.reader import make_reader
+
+    summary = make_reader(stream).get_summary()
+    if summary is not None and summary.statistics is not None:
+        counts, s = summary.statistics.channel_message_counts, summary.statistics
+        topics = {
+            number: _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
+            for number, channel in summary.channels.items()
+        }
+        return topics, (s.message_end_time - s.message_start_time) / 1e9
+    stream.seek(0)
+    seen: dict[int, list[Any]] = {}
+    times = [0, 0]
+    for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+        times = [min(times[0] or message.log_time, message.log_time), max(times[1], message.log_time)]
+        seen.setdefault(channel.id, [channel, schema, 0])[2] += 1
+    return {number: _mcap_topic(*found) for number, found in seen.items()}, (times[1] - times[0]) / 1e9
+
+
+def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
+    name = schema.name if schema else ""
+    parts = name.split("/")
+    kind = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name  # ROS 1 leaves out msg
+    text = (schema.encoding, schema.data) if schema else ("", b"")
+    return Topic(channel.topic, kind, channel.message_encoding, text, count)
+
+
+def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, Topic]) -> Iterator[Message]:
+    from mcap.reader import make_reader
+
+    stream.seek(0)
+    reader = make_reader(stream)
+    for _, channel, message in reader.iter_messages(topics=sorted(names) or None):
+        yield Message(topics[channel.topic], message.log_time, message.data)
+
+
+def library_errors() -> tuple[type[Exception], ...]:
+    """What the libraries raise of their own."""
+    from mcap.exceptions import McapError
+    from rosbags.rosbag1 import ReaderError as Error1
+    from rosbags.rosbag2 import ReaderError as Error2
+    from rosbags.serde import SerdeError
+
+    return McapError, Error1, Error2, SerdeError
+
+
+def _packages() -> None:
+    try:
+        import mcap
+        import rosbags
+    except ImportError:
+        raise FileError("expected rosbags and mcap to read and write bags (pip install 'lidarsynth[ros]'), "
+                        "found none") from None  # fmt: skip
+    del mcap, rosbags
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Turns whatever a broken bag makes a library raise into one line that names the bag."""
+    try:
+        yield
+    except FileError:
+        raise
+    except (*BROKEN, *library_errors()) as error:
+        raise FileError(f"{path}: expected a bag of ROS 1 or ROS 2, or MCAP, found: {_line(error)}") from None
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__

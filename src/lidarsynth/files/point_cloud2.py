@@ -1,0 +1,115 @@
+"""`sensor_msgs/PointCloud2`, of ROS 1 and ROS 2, of any field layout: to named columns and back. Plain numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from lidarsynth.data.fields import MAX_POINTS, Fields, FileError, rings_of_grid
+
+# PointField.datatype -> numpy (ros2/common_interfaces, sensor_msgs/msg/PointField.msg)
+TYPES: dict[int, str] = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+DATATYPE_OF: dict[str, int] = {kind: number for number, kind in TYPES.items()}
+
+
+class PointField(Protocol):
+    """One field of a message: `count` numbers of `datatype` (a key of TYPES), `offset` bytes into each point."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
+class PointCloud2(Protocol):
+    """What the decoder reads of a message; `data` is anything with a buffer."""
+
+    height: int
+    width: int
+    fields: Sequence[PointField]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: np.ndarray
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The fields (name, offset, datatype) of packed points, the bytes per point, and the points' bytes."""
+
+    fields: list[tuple[str, int, int]]
+    point_step: int
+    data: np.ndarray
+
+
+def decode(message: PointCloud2) -> Fields:
+    """The scalar fields under their own names, each (N,) in the machine's byte order, N = height * width.
+
+    Padding between fields, points and rows is skipped; fields of several numbers are left out. Rows or columns of an
+    organised cloud that are beams become `ring`. Raises FileError where layout and data do not fit.
+    """
+    table = _table(message)
+    fields = {name: np.ascontiguousarray(table[name].astype(table[name].dtype.newbyteorder("=")))
+              for name in table.dtype.names or ()}  # fmt: skip
+    shape = (int(message.height), int(message.width))
+    if shape[0] > 1 and (ring := rings_of_grid(fields, shape)) is not None:
+        fields["ring"] = ring
+    return fields
+
+
+def _table(message: PointCloud2) -> np.ndarray:
+    """(N,) structured view of the message's points."""
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    if not 1 <= height * width <= MAX_POINTS:
+        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {height} x {width}")
+    dtype = _dtype(message.fields, step, ">" if message.is_bigendian else "<")
+    data = np.frombuffer(message.data, np.uint8)
+    stride = int(message.row_step) or width * step  # some drivers leave it 0
+    if stride < width * step:
+        raise FileError(f"expected row_step of at least {width} points x {step} bytes, found {stride}")
+    need = (height - 1) * stride + width * step
+    if len(data) < need:
+        raise FileError(f"expected {need} bytes for {height} x {width} points of {step} bytes, found {len(data)}")
+    if stride == width * step:
+        return np.frombuffer(data, dtype, height * width)
+    padded = np.zeros(height * stride, np.uint8)
+    padded[: min(len(data), height * stride)] = data[: height * stride]
+    rows = np.ascontiguousarray(padded.reshape(height, stride)[:, : width * step])
+    return np.frombuffer(rows.reshape(-1), dtype)
+
+
+def _dtype(fields: Sequence[PointField], step: int, order: str) -> np.dtype:
+    names, formats, offsets = [], [], []
+    for field in fields:
+        if field.datatype not in TYPES:
+            raise FileError(f"expected a datatype of 1-8 for the field {field.name}, found {field.datatype}")
+        kind = np.dtype(order + TYPES[field.datatype])
+        if field.offset + kind.itemsize * max(int(field.count), 1) > step:
+            raise FileError(f"expected the field {field.name} within the {step} bytes of a point, "
+                            f"found it at {field.offset}")  # fmt: skip
+        if field.count <= 1 and field.name not in names:  # a count of 0 is taken for 1, as drivers do
+            names.append(field.name)
+            formats.append(kind)
+            offsets.append(int(field.offset))
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+
+
+def encode(fields: Mapping[str, np.ndarray]) -> Layout:
+    """Columns (N,) of one length as packed little-endian points; types that the message lacks become float64."""
+    columns = {name: _storable(column) for name, column in fields.items()}
+    dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    table = np.empty(len(next(iter(columns.values()))), dtype)
+    for name, column in columns.items():
+        table[name] = column
+    places = dtype.fields or {}
+    described = [(name, int(places[name][1]), DATATYPE_OF[columns[name].dtype.str[1:]]) for name in columns]
+    return Layout(described, dtype.itemsize, np.frombuffer(table.tobytes(), np.uint8))
+
+
+def _storable(column: np.ndarray) -> np.ndarray:
+    if column.dtype == np.bool_:
+        return column.astype(np.uint8)
+    return column if column.dtype.str[1:] in DATATYPE_OF else column.astype(np.float64)
