@@ -1,0 +1,135 @@
+"""Network captures `.pcap` and `.pcapng`: the UDP payloads in them. Fragments of large packets are put together."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from lidarsynth.data.fields import FileError
+
+MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
+NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
+NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
+MAX_RECORD = 1 << 18
+ETHERNET, RAW_IP, LOOPBACK, LINUX = 1, (12, 101, 228), 0, 113  # link types (the tcpdump group's list)
+IPV4, UDP = 0x0800, 17
+
+
+class Datagram(NamedTuple):
+    """One UDP packet: nanoseconds of its capture, its destination port, its payload."""
+
+    time: int
+    port: int
+    payload: bytes
+
+
+def is_capture(path: str | Path) -> bool:
+    """Whether a path is a capture by its name."""
+    return Path(path).name.lower().endswith((".pcap", ".pcapng"))
+
+
+def datagrams(path: str | Path) -> Iterator[Datagram]:
+    """The UDP packets over IPv4 of a capture, in order, in flat memory; anything else in it is passed over.
+
+    A record cut short at the end of the file ends it. Raises FileError for a file that is no capture.
+    """
+    path = Path(path)
+    fragments: dict[bytes, dict[int, bytes]] = {}
+    with _open(path) as file:
+        start = file.read(4)
+        if start == NEXT_GENERATION:
+            frames = _blocks(file)
+        elif start in MAGIC:
+            frames = _records(file, MAGIC[start], start in NANO)
+        else:
+            raise FileError(f"{path}: expected a capture (pcap or pcapng), found a file that begins with {start!r}")
+        for time, link, frame in frames:
+            if (found := _udp(_ip(frame, link), fragments)) is not None:
+                yield Datagram(time, *found)
+
+
+def _open(path: Path) -> IO[bytes]:
+    try:
+        return open(path, "rb")
+    except OSError as error:
+        raise FileError(f"{path}: expected a readable file, found: {error.strerror}") from None
+
+
+def _records(file: IO[bytes], order: str, nano: bool) -> Iterator[tuple[int, int, bytes]]:
+    """(nanoseconds, link type, frame) of each record of a classic pcap, after its magic number."""
+    header = file.read(20)
+    if len(header) < 20:
+        return
+    link = struct.unpack(order + "I", header[16:])[0] & 0xFFFF
+    while len(head := file.read(16)) == 16:
+        seconds, part, size, _ = struct.unpack(order + "4I", head)
+        if size > MAX_RECORD or len(frame := file.read(size)) < size:
+            return
+        yield seconds * 10**9 + part * (1 if nano else 1000), link, frame
+
+
+def _blocks(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
+    """The same of a pcapng file: sections (their byte order), interfaces (link type), enhanced and simple packets."""
+    file.seek(0)
+    order, links = "<", [ETHERNET]
+    while len(head := file.read(8)) == 8:
+        if head[:4] == NEXT_GENERATION:
+            magic = file.read(4)
+            order, links = ("<" if magic == b"\x4d\x3c\x2b\x1a" else ">"), []
+            file.seek(-4, 1)
+        kind, size = struct.unpack(order + "2I", head)
+        if not 12 <= size <= MAX_RECORD or len(body := file.read(size - 8)) < size - 8:
+            return
+        if kind == 1:
+            links.append(struct.unpack(order + "H", body[:2])[0])
+        elif kind == 6 and len(body) >= 20:
+            which, high, low, length, _ = struct.unpack(order + "5I", body[:20])
+            link = links[which] if which < len(links) else ETHERNET
+            yield ((high << 32) | low) * 1000, link, body[20 : 20 + length]  # microseconds, unless an option says else
+
+
+def _ip(frame: bytes, link: int) -> bytes:
+    """The IPv4 packet in a frame of a link layer, or nothing."""
+    if link in RAW_IP:
+        return frame
+    if link == LOOPBACK:
+        return frame[4:]
+    at = 16 if link == LINUX else 14
+    kind = frame[at - 2 : at]
+    while kind == b"\x81\x00" and link == ETHERNET:  # a VLAN's tag
+        kind, at = frame[at + 2 : at + 4], at + 4
+    return frame[at:] if kind == IPV4.to_bytes(2, "big") else b""
+
+
+def _udp(packet: bytes, fragments: dict[bytes, dict[int, bytes]]) -> tuple[int, bytes] | None:
+    """(destination port, payload) once a UDP packet is whole, else None; `fragments` keeps what waits."""
+    if len(packet) < 20 or packet[0] >> 4 != 4 or packet[9] != UDP:
+        return None
+    head, total = (packet[0] & 15) * 4, int.from_bytes(packet[2:4], "big")
+    body = packet[head : total or None]
+    place = int.from_bytes(packet[6:8], "big")
+    offset, more = (place & 0x1FFF) * 8, bool(place & 0x2000)
+    if more or offset:
+        body = _joined(packet[4:6] + packet[12:20], offset, more, body, fragments)
+    if len(body) < 8:
+        return None
+    return int.from_bytes(body[2:4], "big"), body[8:]
+
+
+def _joined(key: bytes, offset: int, more: bool, body: bytes, fragments: dict[bytes, dict[int, bytes]]) -> bytes:
+    """The whole packet when its last missing fragment has come, else nothing."""
+    waiting = fragments.setdefault(key, {})
+    waiting[offset] = body
+    if not more:
+        waiting[-1] = (offset + len(body)).to_bytes(4, "big")
+    if len(fragments) > 64:  # packets that lost a fragment
+        del fragments[next(iter(fragments))]
+    if -1 not in waiting:
+        return b""
+    whole = b"".join(waiting[at] for at in sorted(waiting) if at >= 0)
+    if len(whole) < int.from_bytes(waiting[-1], "big"):
+        return b""
+    fragments.pop(key, None)
+    return whole

@@ -1,0 +1,103 @@
+"""Points as text: `.csv`, `.xyz`, `.txt`, `.asc`, `.pts`, with named columns or with columns told by their numbers."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from lidarsynth.data.fields import MAX_POINTS, NAMES, Fields, FileError
+
+SEPARATORS = (",", ";", "\t", None)  # None: any white space
+COMMENT = ("#", "//", "%")
+HEADER_LINES = 64
+
+
+def read_text(data: bytes) -> Fields:
+    """Columns under their own names where a line names them, else x y z, then what the numbers can be.
+
+    The line with names may be a comment, as CloudCompare and numpy write it; a lone count of points before them (.pts)
+    is passed over. Of unnamed columns the fourth is the intensity, and a fifth of whole numbers 0-255 the ring; three
+    whole columns of 0-255 after x y z are colours, which are left out. Raises FileError for anything else.
+    """
+    lines, start = _lines(data), 0
+    names: list[str] | None = None
+    separator: str | None = None
+    for start, line in enumerate(lines):  # noqa: B007, the place of the first numbers
+        separator = _separator(line)
+        words = _words(line.lstrip("#/% "), separator)
+        if _numeric(words) and len(words) >= 3 and not line.startswith(COMMENT):
+            break
+        if {"x", "y", "z"} <= {_ours(word) for word in words}:
+            names = words
+        elif not (line.startswith(COMMENT) or (len(words) == 1 and words[0].isdecimal())) or start >= HEADER_LINES:
+            raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
+    else:
+        raise FileError(f"expected lines of x y z and more numbers, found none in {len(lines)} lines")
+    table = _table(lines[start:], separator)
+    if names is not None and len(names) != table.shape[1]:
+        raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")
+    return dict(zip(names, table.T, strict=True)) if names else guessed(table)
+
+
+def guessed(table: np.ndarray) -> Fields:
+    """The columns (N, 3 or more) of points without names, by what their numbers can be."""
+    fields = dict(zip("xyz", table[:, :3].T, strict=True))
+    more = [table[:, i] for i in range(3, table.shape[1])]
+    whole = [bool(np.all((c >= 0) & (c <= 255) & (c == np.floor(c)))) for c in more]
+    if len(more) == 3 and all(whole):
+        return fields  # x y z r g b
+    if more:
+        fields["intensity"] = _scan_station(more[0]) if len(more) == 4 and all(whole[1:]) else more[0]
+    if len(more) == 2 and whole[1]:
+        fields["ring"] = more[1]
+    return fields
+
+
+def _scan_station(values: np.ndarray) -> np.ndarray:
+    """A .pts file's intensity of -2048 to 2047 (Leica), as 0-1; others as they are."""
+    return (values + 2048) / 4095 if values.min() < 0 and abs(values).max() <= 2048 else values
+
+
+def _lines(data: bytes) -> list[str]:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise FileError(f"expected lines of numbers as text, found bytes: {data[:12]!r}") from None
+    lines = [line for line in map(str.strip, text.splitlines()) if line]
+    if len(lines) > MAX_POINTS:
+        raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {len(lines)} lines")
+    return lines
+
+
+def _separator(line: str) -> str | None:
+    return next((s for s in SEPARATORS if s is not None and s in line), None)
+
+
+def _words(line: str, separator: str | None) -> list[str]:
+    return [word.strip().strip("\"'") for word in line.split(separator)]
+
+
+def _ours(word: str) -> str:
+    """x, y or z for a name that means it."""
+    name = re.sub(r"[\[(].*", "", word.strip().lower()).strip()
+    return next((axis for axis in "xyz" if name in NAMES[axis]), name)
+
+
+def _numeric(words: list[str]) -> bool:
+    try:
+        return all(word == "" or float(word) is not None for word in words) and any(words)
+    except ValueError:
+        return False
+
+
+def _table(lines: list[str], separator: str | None) -> np.ndarray:
+    """(N, columns) float64; an empty cell is NaN."""
+    width = len(_words(lines[0], separator))
+    rows = [line.split(separator) for line in lines if not line.startswith(COMMENT)]
+    if uneven := next((row for row in rows if len(row) != width), None):
+        raise FileError(f"expected {width} numbers a line, found {len(uneven)}: {' '.join(uneven)[:40]!r}")
+    try:
+        return np.array([[word.strip("\"' ") or "nan" for word in row] for row in rows], dtype=np.float64)
+    except ValueError as error:
+        raise FileError(f"expected numbers, found {str(error).rpartition(':')[2].strip()[:40]}") from None
