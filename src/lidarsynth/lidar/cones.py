@@ -1,0 +1,127 @@
+"""A ring of a spinning LiDAR is a cone: its points obey z = tan(e) rho + h. Fits of that to measured rings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NEAR = 2.0  # metres: nearer points are the carrier's own, and their angle says little of the beam
+ROUNDS = 12
+POINTS = 8_000  # of a scan are enough
+
+
+@dataclass(frozen=True)
+class Cones:
+    """How the rings of a scan stand in its frame: z = t_ring rho + a x + b y + h.
+
+    axis      (3,) unit vector that the sensor turns about
+    height    metres of the sensor's origin in the frame, along z
+    residual  degrees, a robust standard deviation, of the points from their cones
+    upright   degrees, the same of cones about z through the frame's origin
+    error     (3,) standard errors of a, b (radians) and h (metres)
+    """
+
+    axis: np.ndarray
+    height: float
+    residual: float
+    upright: float
+    error: np.ndarray
+
+    @property
+    def tilt(self) -> float:
+        """Degrees between the axis and z."""
+        return float(np.degrees(np.arccos(np.clip(self.axis[2], -1, 1))))
+
+
+def fit_cones(xyz: np.ndarray, ring: np.ndarray, seed: int = 0) -> Cones:
+    """The cones of points (N, 3) metres by their rings (N,): common axis and origin, each ring its own elevation.
+
+    Angles are fitted, v = z / rho = t_ring + a cos + b sin + h / rho, by least squares that give less weight to points
+    far off (Huber, and none beyond six deviations). Raises ValueError for fewer than 100 points beyond 2 m.
+    """
+    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    chosen = np.flatnonzero(rho > NEAR)
+    if len(chosen) < 100:
+        raise ValueError(f"expected at least 100 points beyond {NEAR:g} m to fit rings to, found {len(chosen)}")
+    chosen = np.random.default_rng(seed).permutation(chosen)[:POINTS]
+    x, y, z = xyz[chosen].astype(np.float64).T
+    rho = rho[chosen].astype(np.float64)
+    _, ring = np.unique(ring[chosen], return_inverse=True)
+    known = np.stack([x / rho, y / rho, 1 / rho], axis=1)
+    values, weight = z / rho, np.ones(len(rho))
+    fitted = np.zeros(3)
+    normal, scale = np.eye(3), 1.0
+    for _ in range(ROUNDS):
+        left = np.stack([_without_mean(known[:, k], ring, weight) for k in range(3)], axis=1)
+        right = _without_mean(values, ring, weight)
+        normal = (left * weight[:, None]).T @ left + 1e-9 * np.eye(3)
+        fitted = np.linalg.solve(normal, (left * weight[:, None]).T @ right)
+        residual = right - left @ fitted
+        scale = _deviation(residual)
+        weight = robust_weight(residual, scale)
+    axis = np.array([-fitted[0], -fitted[1], 1.0])
+    spread = float(np.degrees(_deviation(values - _medians(values, ring)[ring])))
+    errors = np.sqrt(np.diag(np.linalg.inv(normal))) * scale
+    return Cones(axis / np.linalg.norm(axis), float(fitted[2]), float(np.degrees(scale)), spread, errors)
+
+
+@dataclass(frozen=True)
+class Ring:
+    """One ring's cone about z: elevation in degrees, height of its origin in metres, its error, and what it fits.
+
+    residual  degrees, a robust standard deviation of the points from the cone
+    """
+
+    elevation: float
+    height: float
+    height_error: float
+    residual: float
+    points: int
+
+
+def fit_ring(xyz: np.ndarray, height: float | None = None) -> Ring:
+    """z = tan(e) rho + h of one ring's points (N, 3) metres; with `height` only e is sought."""
+    rho = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
+    values, inverse = xyz[:, 2] / rho, 1 / rho
+    slope, lift, error, scale = float(np.median(values)), height or 0.0, np.inf, 1.0
+    if height is None:  # starting from a nearly right line: medians of the near and of the far half
+        far = rho > np.median(rho)
+        near_value, far_value = float(np.median(values[~far])), float(np.median(values[far]))
+        gap = float(np.median(inverse[~far]) - np.median(inverse[far]))
+        lift = (near_value - far_value) / gap if gap > 1e-3 else 0.0
+    for _ in range(ROUNDS):
+        residual = values - slope - lift * inverse
+        scale = _deviation(residual)
+        weight = robust_weight(residual, scale)
+        total = weight.sum()
+        mean_value, mean_inverse = weight @ values / total, weight @ inverse / total
+        spread = weight @ (inverse - mean_inverse) ** 2
+        if height is None and spread > 1e-9:
+            lift = float(weight @ ((inverse - mean_inverse) * (values - mean_value)) / spread)
+            error = float(scale / np.sqrt(spread))
+        slope = float(mean_value - lift * mean_inverse)
+    return Ring(float(np.degrees(np.arctan(slope))), lift, error, float(np.degrees(scale)), len(xyz))
+
+
+def robust_weight(residual: np.ndarray, scale: float) -> np.ndarray:
+    """(N,) weights: 1 within 1.5 deviations, falling as 1 / r beyond (Huber 1964), 0 beyond 6."""
+    far = np.abs(residual) / scale
+    return np.where(far > 6, 0, 1 / np.maximum(far / 1.5, 1))
+
+
+def _deviation(residual: np.ndarray) -> float:
+    """A standard deviation that outliers do not move: 1.4826 medians of the absolute value."""
+    return max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+
+
+def _without_mean(values: np.ndarray, ring: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    total = np.maximum(np.bincount(ring, weight), 1e-12)
+    return values - (np.bincount(ring, weight * values) / total)[ring]
+
+
+def _medians(values: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """(rings,) median of each ring's values; rings are numbered without gaps."""
+    order = np.lexsort((values, ring))
+    ends = np.cumsum(np.bincount(ring))
+    return values[order][(ends + np.concatenate([[0], ends[:-1]])) // 2]

@@ -1,0 +1,193 @@
+"""Whether a scan's points are in their sensor's frame (x forward, y left, z up, the sensor at the origin), or in which.
+
+Rings tell: they are cones about the axis that the sensor turns about, through its origin (`cones.fit_cones`), so a scan
+that was raised, tilted or written in other axes shows it, whatever the road does. The ground tells up from down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsynth.data.recognise import recognise, rings_in_order
+from lidarsynth.lidar.cones import fit_cones
+from lidarsynth.lidar.ground import levels, road_axis
+from lidarsynth.lidar.scan import Scan
+
+RAISED = 0.6  # metres; beams of an HDL-64E leave up to 0.2 m above its origin
+TILTED = 2.0  # degrees; no real scan at hand exceeds 0.3
+FIT = 2.0  # degrees: cones that fit worse are none
+CLEAR = 0.7  # degrees: cones that fit better leave no doubt of the axis
+UPSIDE = 1.5  # times more level ground above than below
+ACROSS = -0.2  # `road_axis` of a road that runs along y; of 133 real scans the lowest is -0.11
+
+# Which axis of the file is up -> rotation into x forward, y left, z up, and the words for it.
+AXES: dict[str, tuple[tuple[tuple[int, int, int], ...], str]] = {
+    "+z": (((1, 0, 0), (0, 1, 0), (0, 0, 1)), ""),
+    "-z": (((1, 0, 0), (0, -1, 0), (0, 0, -1)), "upside down"),
+    "-y": (((0, 0, 1), (-1, 0, 0), (0, -1, 0)), "in camera axes (x right, y down, z forward)"),
+    "+y": (((0, 0, -1), (-1, 0, 0), (0, 1, 0)), "with y up instead of z"),
+    "+x": (((0, 0, -1), (0, 1, 0), (1, 0, 0)), "with x up instead of z"),
+    "-x": (((0, 0, 1), (0, 1, 0), (-1, 0, 0)), "with x down instead of z up"),
+}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What was found of a scan's frame.
+
+    faults     what is not as it should be, in words; none for a scan in its sensor's frame
+    hints      what only seems so, in words: never a reason to refuse
+    transform  (4, 4) that brings the file's points into the sensor's frame
+    """
+
+    faults: tuple[str, ...]
+    hints: tuple[str, ...]
+    transform: np.ndarray
+
+    def warning(self) -> str | None:
+        """One line that says what the points are and what to do, or None."""
+        found = [*self.faults, *self.hints]
+        if not found:
+            return None
+        way = ":".join(f"{v:.4g}" for v in pose_of(self.transform))
+        return f"expected points in the sensor's frame (x forward, z up), found them {', '.join(found)}: " \
+               f"try --transform {way}"  # fmt: skip
+
+
+def check_frame(scan: Scan) -> Frame:
+    """In which frame a scan's points are. A scan without rings is only tested for its axes, by the ground."""
+    up, has_rings = _upright(scan)
+    turn, words = np.array(AXES[up][0], np.float64), AXES[up][1]
+    tip, height = _tilt_and_height(scan, turn) if has_rings else (np.eye(3), 0.0)
+    faults, hints = [words] if words else [], []
+    tilt = float(np.degrees(np.arccos(np.clip(tip[2, 2], -1, 1))))
+    if tilt > TILTED:
+        faults.append(f"tilted by {tilt:.1f} degrees")
+        turn = tip @ turn
+    if abs(height) > RAISED:
+        faults.append(f"with the sensor {abs(height):.2f} m {'above' if height > 0 else 'below'} the origin")
+    if not faults and road_axis(scan.xyz) < ACROSS:
+        hints.append("with the road along y, as if turned by 90 degrees")
+        turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    matrix[2, 3] = -height if abs(height) > RAISED else 0.0
+    return Frame(tuple(faults), tuple(hints), matrix)
+
+
+def _tilt_and_height(scan: Scan, turn: np.ndarray) -> tuple[np.ndarray, float]:
+    """The rotation that puts the sensor's axis onto z, after `turn`, and its height in metres above the origin then.
+
+    Height counts along the sensor's axis. The fit is linear in a tilt, so it is repeated on what it straightened.
+    """
+    tip, height = np.eye(3), 0.0
+    for _ in range(3):
+        xyz = (scan.xyz @ (tip @ turn).T - np.array([0, 0, height])).astype(np.float32)
+        if (ring := rings_of(scan, xyz)) is None:
+            break
+        cones = fit_cones(xyz, ring)
+        if cones.residual > FIT or cones.residual > 0.7 * cones.upright:
+            break  # cones about z through the origin fit as well
+        tip, height = _onto_z(cones.axis) @ tip, height + cones.height * float(cones.axis[2])
+    return tip, height
+
+
+def _upright(scan: Scan) -> tuple[str, bool]:
+    """Which of AXES points up, and whether the scan has rings about it. Nothing found: z."""
+    fits: dict[str, float] = {}
+    for axis in "zyx":  # the first that fits well is it
+        if (fit := _residual(scan, np.array(AXES["+" + axis][0]))) is not None and fit < FIT:
+            fits[axis] = fit
+            if fit < CLEAR:
+                break
+    if fits:
+        best = min(fits, key=lambda axis: fits[axis])
+        return _side(scan, best), True
+    shares = {axis: _shares(scan, axis) for axis in AXES}
+    level = max(shares, key=lambda axis: shares[axis])
+    clear = shares[level] > max(0.6, UPSIDE * shares["+z"]) and shares["+z"] < 1 / 3
+    return (level if clear else "+z"), False
+
+
+def _side(scan: Scan, axis: str) -> str:
+    """+axis or -axis: where the ground is below; where both sides look alike, where the beams are a known sensor's."""
+    upper, lower = _shares(scan, "+" + axis), _shares(scan, "-" + axis)
+    if upper > 0.6 and upper > UPSIDE * lower:
+        return "+" + axis
+    up, down = (_known(scan, sign + axis) for sign in "+-")
+    if up != down:
+        return ("+" if up else "-") + axis
+    return ("-" if lower > UPSIDE * upper and lower > 1 / 3 else "+") + axis
+
+
+def _known(scan: Scan, up: str) -> bool:
+    """Whether the beams are a known sensor's, were `up` the upper side."""
+    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T
+    ring = rings_of(scan, xyz)
+    return recognise(Scan(xyz, scan.reflectance, ring=ring))[0] is not None
+
+
+def _residual(scan: Scan, turn: np.ndarray) -> float | None:
+    """Degrees by which the points miss cones about the axis that `turn` makes z, or None without rings."""
+    xyz = scan.xyz @ turn.T.astype(np.float32)
+    ring = rings_of(scan, xyz)
+    try:
+        return None if ring is None else fit_cones(xyz, ring).residual
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+
+
+def _shares(scan: Scan, up: str) -> float:
+    """The share of the cells around the sensor that have points of one level below, were `up` the upper side."""
+    return levels(scan.xyz @ np.array(AXES[up][0], np.float32).T)[0].share
+
+
+def rings_of(scan: Scan, xyz: np.ndarray | None = None) -> np.ndarray | None:
+    """(N,) ring of each point by its field, else by the order of the points (of `xyz`, where turned), else None."""
+    ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz if xyz is None else xyz)
+    return None if ring is None or len(np.unique(ring)) < 4 else ring
+
+
+def _onto_z(axis: np.ndarray) -> np.ndarray:
+    """(3, 3) the shortest rotation that brings a unit vector onto z (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])  # of axis x z, as a matrix
+    return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def parse_transform(text: str) -> np.ndarray:
+    """(4, 4) from x:y:z:roll:pitch:yaw (metres, degrees: roll about x, then pitch about y, then yaw about z).
+
+    Raises ValueError for anything but six numbers.
+    """
+    try:
+        x, y, z, *angles = (float(word) for word in text.split(":"))
+        roll, pitch, yaw = np.radians(angles)
+    except ValueError:
+        raise ValueError(f"expected a transform x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers, found {text!r}") from None
+    (a, b), (c, d), (e, f) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
+    about_x = np.array([[1, 0, 0], [0, a, -b], [0, b, a]])
+    about_y = np.array([[c, 0, d], [0, 1, 0], [-d, 0, c]])
+    about_z = np.array([[e, -f, 0], [f, e, 0], [0, 0, 1]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = about_z @ about_y @ about_x, (x, y, z)
+    return matrix
+
+
+def pose_of(matrix: np.ndarray) -> tuple[float, ...]:
+    """x y z roll pitch yaw of a (4, 4) rigid transform, the inverse of `parse_transform`."""
+    r = matrix[:3, :3]
+    pitch = -np.arcsin(np.clip(r[2, 0], -1, 1))
+    if abs(r[2, 0]) > 1 - 1e-9:  # nose straight up or down: roll and yaw are one
+        roll, yaw = np.arctan2(-r[1, 2], r[1, 1]), 0.0
+    else:
+        roll, yaw = np.arctan2(r[2, 1], r[2, 2]), np.arctan2(r[1, 0], r[0, 0])
+    angles = np.degrees([roll, pitch, yaw])
+    return tuple(float(round(v, 6)) + 0.0 for v in (*matrix[:3, 3], *angles))
+
+
+def transformed(xyz: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 points through a (4, 4) rigid transform."""
+    return (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
