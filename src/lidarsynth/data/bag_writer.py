@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, naming, typestore
-from lidarsynth.data.fields import FileError
+from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
 
 Put = Callable[[Topic, int, bytes], None]  # topic, nanoseconds, message

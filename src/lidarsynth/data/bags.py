@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from lidarsynth.data.fields import Fields, FileError
+from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
 
 POINTS = "sensor_msgs/msg/PointCloud2"
@@ -90,7 +90,9 @@ class Bag:
     def point_topic(self, name: str | None = None) -> str:
         """The topic named, or the only one of points. Raises ValueError that lists those there are."""
         clouds = [topic.name for topic in self.topics if topic.kind == POINTS]
-        listed = ", ".join(clouds) or "none; it holds " + (", ".join(sorted({t.kind for t in self.topics})) or "nothing")
+        listed = ", ".join(clouds) or "none; it holds " + (
+            ", ".join(sorted({t.kind for t in self.topics})) or "nothing"
+        )
         if name is None and len(clouds) == 1:
             return clouds[0]
         if name is None:

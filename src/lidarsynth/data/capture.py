@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from lidarsynth.data.fields import FileError
+from lidarsynth.files.fields import FileError
 
 MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
 NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")

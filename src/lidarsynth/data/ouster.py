@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.fields import Fields, FileError
+from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.lidar.sensor import Sensor
 
 MODES = {"512x10": 512, "512x20": 512, "1024x10": 1024, "1024x20": 1024, "2048x10": 2048, "4096x5": 4096}

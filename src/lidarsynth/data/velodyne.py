@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.fields import Fields, FileError
+from lidarsynth.files.fields import Fields, FileError
 
 SIZE = 1206  # bytes of a packet's payload
 FLAG = 0xEEFF  # of a block

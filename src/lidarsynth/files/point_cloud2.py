@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarsynth.data.fields import MAX_POINTS, Fields, FileError, rings_of_grid
+from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, rings_of_grid
 
 # PointField.datatype -> numpy (ros2/common_interfaces, sensor_msgs/msg/PointField.msg)
 TYPES: dict[int, str] = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

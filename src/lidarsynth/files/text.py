@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from lidarsynth.data.fields import MAX_POINTS, NAMES, Fields, FileError
+from lidarsynth.files.fields import MAX_POINTS, NAMES, Fields, FileError
 
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
@@ -23,7 +23,7 @@ def read_text(data: bytes) -> Fields:
     lines, start = _lines(data), 0
     names: list[str] | None = None
     separator: str | None = None
-    for start, line in enumerate(lines):  # noqa: B007, the place of the first numbers
+    for start, line in enumerate(lines):
         separator = _separator(line)
         words = _words(line.lstrip("#/% "), separator)
         if _numeric(words) and len(words) >= 3 and not line.startswith(COMMENT):

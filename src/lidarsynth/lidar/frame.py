@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsynth.data.recognise import recognise, rings_in_order
 from lidarsynth.lidar.cones import fit_cones
 from lidarsynth.lidar.ground import levels, road_axis
+from lidarsynth.lidar.recognition import recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 
 RAISED = 0.6  # metres; beams of an HDL-64E leave up to 0.2 m above its origin
@@ -166,7 +166,9 @@ def parse_transform(text: str) -> np.ndarray:
         x, y, z, *angles = (float(word) for word in text.split(":"))
         roll, pitch, yaw = np.radians(angles)
     except ValueError:
-        raise ValueError(f"expected a transform x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers, found {text!r}") from None
+        raise ValueError(
+            f"expected a transform x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers, found {text!r}"
+        ) from None
     (a, b), (c, d), (e, f) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
     about_x = np.array([[1, 0, 0], [0, a, -b], [0, b, a]])
     about_y = np.array([[c, 0, d], [0, 1, 0], [-d, 0, c]])
