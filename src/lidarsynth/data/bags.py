@@ -1,7 +1,7 @@
 """ROS 1 bags, ROS 2 bags (sqlite3, MCAP) and bare MCAP files as streams of messages, without ROS (the extra `ros`).
 
-Three libraries' readers behind one record: `rosbags` for `.bag` and ROS 2 folders or `.db3`, `mcap` for `.mcap`. Messages
-stay bytes until they are asked for, so that a bag of any size passes in the memory of one chunk.
+Two libraries behind one record: `rosbags` for `.bag`, ROS 2 folders and `.db3`, `mcap` for `.mcap`. Messages stay bytes
+until they are asked for, so that a bag of any size passes in the memory of one chunk.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Ouster captures: lidar packets and the sensor's metadata `.json`, into whole turns and into a `Sensor`.
 
-Packet layouts and the point formula are those of Ouster's published sensor documentation; equal to `ouster-sdk` 1.0.1 point
-by point (tests/test_captures.py). That library itself is not asked for: it pins click, Flask and psutil to old versions.
+Packet layouts and the point formula are those of Ouster's published sensor documentation; equal to `ouster-sdk` 1.0.1
+point by point (tests/test_captures.py). That library is not asked for: it pins click, Flask and psutil to old versions.
 """
 
 from __future__ import annotations

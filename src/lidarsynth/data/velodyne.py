@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -105,7 +106,7 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
     """Runs (first block, block after the last) of a packet, cut where the azimuth passes 0."""
     cuts = [0, *(np.flatnonzero(np.diff(azimuth.astype(int)) < -TURN // 2) + 1).tolist(), len(azimuth)]
-    return list(zip(cuts, cuts[1:], strict=False))
+    return list(pairwise(cuts))
 
 
 def _joined(parts: list[Fields]) -> Fields:
