@@ -174,7 +174,7 @@ BROKEN: dict[str, Maker] = {
     "named pipe": _pipe,
     "endless device": _device,
     "a terabyte": _huge,
-    "unknown suffix": _bytes("scan.xyz", BODY),
+    "unknown suffix": _bytes("scan.foo", BODY),
     "no suffix": _bytes("scan", BODY),
     # bin
     "bin empty": _bytes("empty.bin", b""),

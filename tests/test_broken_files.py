@@ -51,7 +51,7 @@ def test_broken_file_is_refused_in_one_line(name: str, tmp_path: Path):
         "folder": ("found a folder",),
         "named pipe": ("found a device or pipe",),
         "a terabyte": ("1099511627776",),
-        "unknown suffix": (".pcd.bin", "'scan.xyz'"),
+        "unknown suffix": (".pcd.bin", "'scan.foo'"),
         "bin empty": ("found 0",),
         "bin truncated": ("16 bytes", "found 797 bytes"),
         "bin text": ("found text", "1.0 2.0"),

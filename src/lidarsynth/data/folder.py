@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidarsynth.data.frames import Frame, Frames
-from lidarsynth.files.formats import READERS
+from lidarsynth.files.formats import NAMED_ONLY, READERS
 
 
 def folder(root: str | Path, intensity: str = "auto") -> Frames:
@@ -29,7 +29,8 @@ def scan_files(root: str | Path) -> list[Path]:
     root = Path(root)
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
-    paths = sorted(p for p in root.rglob("*") if p.is_file() and p.name.lower().endswith(tuple(READERS)))
+    endings = tuple(suffix for suffix in READERS if suffix not in NAMED_ONLY)
+    paths = sorted(p for p in root.rglob("*") if p.is_file() and p.name.lower().endswith(endings))
     if not paths:
         raise ValueError(f"{root}: expected scans ({', '.join(READERS)}), found none")
     return paths

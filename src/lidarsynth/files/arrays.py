@@ -203,7 +203,7 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
 def scan_fields(scan: Scan) -> Fields:
     """Our own npz keys, xyz split into x, y, z."""
     fields = {axis: scan.xyz[:, i] for i, axis in enumerate("xyz")} | {"reflectance": scan.reflectance}
-    optional = {"ring": scan.ring, "time": scan.time, "label": scan.label}
+    optional = {"ring": scan.ring, "time": scan.time, "label": scan.label, **scan.extra}
     return fields | {name: value for name, value in optional.items() if value is not None}
 
 
@@ -227,5 +227,6 @@ def write_npz(file: BufferedIOBase, scan: Scan | RangeImage) -> None:
         arrays = {name: getattr(scan, name) for name in ("range", "reflectance", "mask", "label", "xyz")}
         arrays["sensor"] = np.array(json.dumps(scan.sensor.to_dict()))
     else:
-        arrays = {name: getattr(scan, name) for name in ("xyz", "reflectance", "ring", "time", "label")}
+        own = {name: getattr(scan, name) for name in ("xyz", "reflectance", "ring", "time", "label")}
+        arrays = {name.replace("/", "_"): values for name, values in scan.extra.items()} | own
     np.savez_compressed(file, **{name: array for name, array in arrays.items() if array is not None})

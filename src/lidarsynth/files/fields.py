@@ -15,12 +15,22 @@ MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coor
 MAX_RINGS = 1024
 
 NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found wins; case does not matter
-    "x": ("x", "points:0"),
+    "x": ("x", "points:0", "//x"),
     "y": ("y", "points:1"),
     "z": ("z", "points:2"),
     "reflectance": ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i", "scalar_intensity"),
-    "ring": ("ring", "channel", "laser", "laser_number", "laser_id", "scalar_ring"),
-    "time": ("time", "timestamp", "t", "offset_ns", "time_offset", "gps_time", "timestamps", "scalar_timestamp"),
+    "ring": ("ring", "channel", "line", "laser", "laser_number", "laser_id", "scalar_ring"),
+    "time": (
+        "time",
+        "timestamp",
+        "t",
+        "offset_time",
+        "offset_ns",
+        "time_offset",
+        "gps_time",
+        "timestamps",
+        "scalar_timestamp",
+    ),
     "label": ("label", "class", "scalar_label"),
 }
 
@@ -64,12 +74,15 @@ def scan_from_fields(fields: Fields, intensity: str = "auto") -> tuple[Scan, int
     xyz = xyz.astype(np.float32, copy=False)
     values = reflectance_from(values[kept], "unit" if intensity == "none" else intensity)
     ring, time, label = (fields[key][kept] if (key := find(fields, n)) else None for n in ("ring", "time", "label"))
+    classes = None if label is None else _training_classes(label)
+    taken = {find(fields, name) for name in NAMES if name != "label" or classes is not None}
     return Scan(
         xyz,
         values,
         ring=None if ring is None else rings_from_top(ring, xyz),
-        time=None if time is None else seconds_from(time, find(fields, "time") == "offset_ns"),
-        label=None if label is None else _training_classes(label),
+        time=None if time is None else seconds_from(time, find(fields, "time") in ("offset_ns", "offset_time")),
+        label=classes,
+        extra={key: column[kept] for key, column in fields.items() if key not in taken and column.dtype.kind in "biuf"},
     ), dropped
 
 
@@ -147,10 +160,13 @@ def _beams(found: int) -> int:
 
 
 def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
-    """(N,) float64 seconds. Floats are seconds already; integers are the unit of 1, 1e-3, 1e-6 or 1e-9 s that
-    brings the span nearest to 0.1 s (`nanoseconds`: 1e-9), counted from the first instant so that no digit is lost.
+    """(N,) float64 seconds. Floats are seconds already, or, beyond 1e15, nanoseconds since 1970 (Livox); integers are
+    the unit of 1, 1e-3, 1e-6 or 1e-9 s that brings the span nearest to 0.1 s (`nanoseconds`: 1e-9). All but seconds are
+    counted from the first instant so that no digit is lost.
     """
-    if _numbers(time, "time").dtype.kind == "f":
+    if _numbers(time, "time").dtype.kind == "f" and np.nanmax(time, initial=0) > 1e15:
+        return (time.astype(np.float64) - np.nanmin(time)) * 1e-9
+    if time.dtype.kind == "f":
         return time.astype(np.float64) * (1e-9 if nanoseconds else 1.0)
     first = time.min()
     span = max(int(time.max()) - int(first), 1)
@@ -188,8 +204,17 @@ def _training_classes(label: np.ndarray) -> np.ndarray | None:
     return label.astype(np.int32)
 
 
+def _storable(column: np.ndarray) -> np.ndarray:
+    """The column in a little-endian type that point files have: no bool, no float16."""
+    plain = {"b": "u1", "f2": "f4"}.get("b" if column.dtype.kind == "b" else column.dtype.str[1:], column.dtype.str[1:])
+    return column.astype("<" + plain)
+
+
 def scan_table(scan: Scan) -> np.ndarray:
-    """Packed structured array (N,): x y z intensity float32; ring uint16, timestamp float64, label uint16 if known."""
+    """Packed structured array (N,): x y z intensity float32; ring uint16, timestamp float64, label uint16 if known.
+
+    Further fields follow in their own types; one that has the name of one of these gets `file_` before it.
+    """
     columns = {axis: scan.xyz[:, i].astype("<f4") for i, axis in enumerate("xyz")}
     columns["intensity"] = scan.reflectance.astype("<f4")
     for name, value, kind in (
@@ -199,6 +224,9 @@ def scan_table(scan: Scan) -> np.ndarray:
     ):
         if value is not None:
             columns[name] = value.astype(kind)
+    own = ("x", "y", "z", "intensity", "ring", "timestamp", "label")
+    for name, value in scan.extra.items():
+        columns[f"file_{name}" if name in own else name] = _storable(value)
     table = np.empty(len(scan), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         table[name] = column

@@ -11,7 +11,7 @@ from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.files import arrays, feather, las, pcd, ply
+from lidarsynth.files import arrays, feather, las, pcd, ply, text
 from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -26,7 +26,13 @@ READERS: dict[str, Callable[[bytes], Fields]] = {
     ".las": las.read_las,
     ".laz": las.read_las,
     ".feather": feather.read_feather,
+    ".csv": text.read_text,
+    ".txt": text.read_text,
+    ".xyz": text.read_text,
+    ".asc": text.read_text,
+    ".pts": text.read_text,
 }
+NAMED_ONLY = (".csv", ".txt")  # in a folder they may be anything, such as KITTI's times.txt: read where they are named
 
 WRITERS: dict[str, Callable[[BufferedIOBase, Any], None]] = {  # a Scan; .npz also takes a RangeImage
     ".bin": arrays.write_bin,
@@ -48,7 +54,7 @@ def read_with_report(path: str | Path, intensity: str = "auto", labels: str | Pa
     intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" by type and range
                (`fields.reflectance_from`), "none" to read a file without intensity with reflectance 0
     labels     a SemanticKITTI `.label` file with one word per point of the file
-    Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`).
+    Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`), other fields as `extra`.
     Raises FileError, a ValueError of one line "path: expected ..., found ...".
     """
     if intensity not in INTENSITIES:

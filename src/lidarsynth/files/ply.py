@@ -17,7 +17,10 @@ TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8", "int64": "i8", "long": "i8", "uint64": "u8", "ulong": "u8",
 }  # fmt: skip
-WRITTEN = {"f4": "float", "f8": "double", "u2": "ushort"}
+WRITTEN = {
+    "f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "u4": "uint", "u8": "uint64",
+    "i1": "char", "i2": "short", "i4": "int", "i8": "int64",
+}  # fmt: skip
 
 
 class Element(NamedTuple):
@@ -156,7 +159,9 @@ def _skip(data: bytes, at: int, element: Element, dtypes: dict[tuple[str, ...], 
 def write_ply(file: BufferedIOBase, scan: Scan) -> None:
     """The scan as binary PLY: x y z intensity (reflectance 0-1), and ring, timestamp, label where known."""
     table = scan_table(scan)
-    properties = [f"property {WRITTEN[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
+    properties = [
+        f"property {WRITTEN[table.dtype[name].str[1:]]} {name.replace(' ', '_')}" for name in table.dtype.names or ()
+    ]
     header = [
         "ply",
         "format binary_little_endian 1.0",

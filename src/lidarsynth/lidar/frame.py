@@ -147,7 +147,7 @@ def _shares(scan: Scan, up: str) -> float:
 def rings_of(scan: Scan, xyz: np.ndarray | None = None) -> np.ndarray | None:
     """(N,) ring of each point by its field, else by the order of the points (of `xyz`, where turned), else None."""
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz if xyz is None else xyz)
-    return None if ring is None or len(np.unique(ring)) < 4 else ring
+    return None if ring is None or np.count_nonzero(np.bincount(ring)) < 4 else ring
 
 
 def _onto_z(axis: np.ndarray) -> np.ndarray:

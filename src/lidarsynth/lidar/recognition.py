@@ -144,3 +144,24 @@ def _share_on_beams(elevation: np.ndarray, sensor: Sensor) -> float:
     on = np.abs(elevation - table[row]) < 0.1 * spacing[row]
     used = np.bincount(row[on], minlength=len(table)) > 0
     return float(on.mean() * used.mean())
+
+
+def rings_by_elevation(xyz: np.ndarray) -> np.ndarray | None:
+    """(N,) int ring of each point, 0 the highest, where elevations crowd around 8 to 256 beams, else None.
+
+    For points in any order without a ring field. Beams are the crowded runs of a histogram of 0.02 degrees, cut where
+    it is nearly empty; at least nine tenths of the points beyond FAR must lie in them.
+    """
+    elevation = elevations_of(xyz)
+    far = np.hypot(xyz[:, 0], xyz[:, 1]) > FAR
+    edges = np.arange(-90, 90.01, 0.02)
+    count = np.histogram(elevation[far], edges)[0]
+    smooth = np.convolve(count, np.ones(5) / 5, "same")
+    crowded = smooth > max(0.15 * float(np.quantile(smooth[smooth > 0], 0.9)), 2)
+    starts = np.flatnonzero(np.diff(np.concatenate([[0], crowded.astype(int)])) == 1)
+    ends = np.flatnonzero(np.diff(np.concatenate([crowded.astype(int), [0]])) == -1)
+    if not 8 <= len(starts) <= 256 or count[crowded].sum() < 0.9 * far.sum():
+        return None
+    middle = (edges[starts] + edges[ends + 1]) / 2
+    border = (middle[1:] + middle[:-1]) / 2
+    return len(middle) - 1 - np.searchsorted(border, elevation)

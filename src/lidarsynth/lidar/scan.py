@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lidarsynth.lidar.sensor import Sensor
+
+_UNKNOWN = np.zeros(0, np.float32)  # stands for a reflectance that is not given
 
 
 @dataclass(frozen=True)
@@ -14,25 +17,30 @@ class Scan:
     """N points in the sensor frame: x forward, y left, z up.
 
     xyz          (N, 3) float32, metres
-    reflectance  (N,)   float32 in [0, 1]
+    reflectance  (N,)   float32 in [0, 1]; 0 where it is not given
     ring         (N,)   int, beam number counted from the top (row 0 is the highest beam), or None
     time         (N,)   float, seconds relative to any fixed instant, or None
     label        (N,)   int, SemanticKITTI training class 0-19, or None
+    extra        further fields of the file by name, each (N,), such as ambient or return_type; `new` is 1 for a point
+                 that was filled in, 0 for a measured one
 
     Raises ValueError when a shape does not fit.
     """
 
     xyz: np.ndarray
-    reflectance: np.ndarray
+    reflectance: np.ndarray = field(default_factory=lambda: _UNKNOWN)
     ring: np.ndarray | None = None
     time: np.ndarray | None = None
     label: np.ndarray | None = None
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
             raise ValueError(f"xyz must be (N, 3), got {self.xyz.shape}")
-        for name in ("reflectance", "ring", "time", "label"):
-            value = getattr(self, name)
+        if self.reflectance is _UNKNOWN:
+            object.__setattr__(self, "reflectance", np.zeros(len(self.xyz), np.float32))
+        own = {name: getattr(self, name) for name in ("reflectance", "ring", "time", "label")}
+        for name, value in [*own.items(), *self.extra.items()]:
             if value is not None and value.shape != (len(self.xyz),):
                 raise ValueError(f"{name} must be ({len(self.xyz)},) like xyz, got {value.shape}")
 
@@ -41,7 +49,9 @@ class Scan:
 
     def __getitem__(self, index: np.ndarray | slice) -> Scan:
         """The scan of the chosen points: a boolean mask (N,), integer indices or a slice."""
-        return Scan(*[None if (v := getattr(self, f.name)) is None else v[index] for f in fields(self)])  # type: ignore[arg-type]
+        own = (self.xyz, self.reflectance, self.ring, self.time, self.label)
+        chosen = [None if values is None else values[index] for values in own]
+        return Scan(*chosen, {name: values[index] for name, values in self.extra.items()})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
