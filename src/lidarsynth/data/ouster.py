@@ -118,11 +118,20 @@ def _metadata(flat: dict[str, Any], name: str) -> Metadata:
                     int(flat.get("columns_per_packet", 16)), origin, matrix, profile)  # fmt: skip
 
 
-def sensor_of(metadata: Metadata) -> Sensor:
+def is_metadata(path: str | Path) -> bool:
+    """Whether a `.json` file is Ouster metadata: it has the beams' altitudes."""
+    path = Path(path)
+    try:
+        return path.suffix.lower() == ".json" and b'"beam_altitude_angles"' in path.read_bytes()
+    except OSError:
+        return False
+
+
+def sensor_of(metadata: Metadata, name: str | None = None) -> Sensor:
     """The sensor that the metadata describes: its beams, columns, and the height of their origin in its frame."""
     lift = float(metadata.to_sensor[2, 3])
     pairs = sorted(set(metadata.altitudes), reverse=True)
-    return Sensor(metadata.name, tuple(pairs), metadata.columns, 0.3, 240.0, (lift,) * len(pairs))
+    return Sensor(name or metadata.name, tuple(pairs), metadata.columns, 0.3, 240.0, (lift,) * len(pairs))
 
 
 def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
@@ -147,13 +156,6 @@ def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
         turn.add(packet.payload, column)
     if turn.columns:
         yield turn.fields()
-
-
-def packet_sizes(metadata: Metadata) -> int:
-    """Bytes of a lidar packet of this sensor. Raises KeyError for an unknown profile."""
-    profile = PROFILES[metadata.profile]
-    column = sum(profile.column) + len(metadata.altitudes) * profile.pixel
-    return profile.header + metadata.packet_columns * column + profile.footer
 
 
 def _frame_number(payload: bytes, profile: Profile) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarsynth.lidar.cones import fit_cones
 from lidarsynth.lidar.ground import levels, road_axis
-from lidarsynth.lidar.recognition import recognise, rings_in_order
+from lidarsynth.lidar.recognition import recognise, rings_by_elevation, rings_in_order
 from lidarsynth.lidar.scan import Scan
 
 RAISED = 0.6  # metres; beams of an HDL-64E leave up to 0.2 m above its origin
@@ -145,8 +145,11 @@ def _shares(scan: Scan, up: str) -> float:
 
 
 def rings_of(scan: Scan, xyz: np.ndarray | None = None) -> np.ndarray | None:
-    """(N,) ring of each point by its field, else by the order of the points (of `xyz`, where turned), else None."""
-    ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz if xyz is None else xyz)
+    """(N,) ring of each point by its field, else by the order of the points (of `xyz`, where turned), else by crowded
+    elevations, else None."""
+    xyz = scan.xyz if xyz is None else xyz
+    ring = scan.ring if scan.ring is not None else rings_in_order(xyz)
+    ring = rings_by_elevation(xyz) if ring is None else ring
     return None if ring is None or np.count_nonzero(np.bincount(ring)) < 4 else ring
 
 

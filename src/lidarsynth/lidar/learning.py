@@ -10,6 +10,7 @@ import numpy as np
 from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
 from lidarsynth.lidar.ground import plane
+from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
@@ -48,14 +49,12 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> Learned:
     without rings, or with too few points.
     """
     kept, left = _alike(scans)
-    count = kept[0][1]
+    count = int(kept[0][1].max()) + 1
     points: list[list[np.ndarray]] = [[] for _ in range(count)]
     steps, depths, grounds = [], [], []
-    for number, (scan, _) in enumerate(kept):
-        ring = rings_of(scan)
-        assert ring is not None
+    for number, (scan, ring) in enumerate(kept):
         rng = np.random.default_rng(number)
-        for row, xyz in _rows(scan.xyz, ring, count):
+        for row, xyz in _rows(straighten(scan.xyz, ring, scan.time), ring, count):
             points[row].append(rng.permutation(xyz)[:SAMPLE])
         steps.append(_step(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
@@ -82,21 +81,24 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> Learned:
     return Learned(sensor, tuple(rings), returned, len(kept), tuple(left))
 
 
-def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, int]], list[str]]:
-    """(scan, rings) of the scans with the most frequent number of rings, and in words what was left out."""
-    found: list[tuple[Scan, int]] = []
+def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[str]]:
+    """(scan, ring of each point) of the scans with the usual number of rings, and in words what was left out."""
+    found: list[tuple[Scan, np.ndarray]] = []
     without = 0
     for scan in scans:
         ring = rings_of(scan)
         if ring is None:
             without += 1
         else:
-            found.append((scan, int(ring.max()) + 1))
+            found.append((scan, ring))
     if not found:
-        raise ValueError(f"expected scans with a ring field, or with one ring after the other, found none in {without}")
-    counts = np.array([count for _, count in found])
+        raise ValueError(
+            "expected scans with a ring field, one ring after the other, or beams that elevations show, "
+            f"found none in {without}"
+        )
+    counts = np.array([int(ring.max()) + 1 for _, ring in found])
     usual = int(np.bincount(counts).argmax())
-    kept = [pair for pair in found if pair[1] == usual]
+    kept = [pair for pair, count in zip(found, counts, strict=True) if count == usual]
     left = [f"{without} without rings"] if without else []
     left += [f"{len(found) - len(kept)} with other than {usual} rings"] if len(kept) < len(found) else []
     return kept, left
@@ -146,14 +148,12 @@ def _step(xyz: np.ndarray, ring: np.ndarray) -> float:
     return float(np.mean(step[(step > 0.25 * usual) & (step < 1.5 * usual)]))
 
 
-def _returned(kept: list[tuple[Scan, int]], width: int, rows: list[int]) -> np.ndarray:
+def _returned(kept: list[tuple[Scan, np.ndarray]], width: int, rows: list[int]) -> np.ndarray:
     """(rows, width) share of the scans in which a ray returned."""
     place = np.full(max(rows) + 1, -1)
     place[rows] = np.arange(len(rows))
     total = np.zeros((len(rows), width), np.int32)
-    for scan, _ in kept:
-        ring = rings_of(scan)
-        assert ring is not None
+    for scan, ring in kept:
         inside = (ring <= max(rows)) & (place[np.minimum(ring, max(rows))] >= 0)
         turn = (1 - np.arctan2(scan.xyz[inside, 1], scan.xyz[inside, 0]) / np.pi) / 2
         seen = np.zeros_like(total, bool)

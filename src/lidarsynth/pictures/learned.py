@@ -1,0 +1,47 @@
+"""The picture of a learned sensor: how often each ray returned, what is blocked, and how well each beam is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from lidarsynth.lidar.learning import Learned
+from lidarsynth.pictures.colours import viridis
+from lidarsynth.pictures.figure import FAINT, INK, PAPER, panel
+
+STRIP = 1200  # pixels
+BLOCKED = (214, 48, 49)
+
+
+def learned_figure(learned: Learned) -> np.ndarray:
+    """(H', W', 3) uint8: share of returns per ray with blocked ones red, and elevation and residual of every beam."""
+    sensor = learned.sensor
+    share = np.rint(viridis(learned.returned)).astype(np.uint8)
+    share[sensor.blocked_rays()] = BLOCKED
+    tall = max(round(320 / sensor.height), 1)
+    strip = Image.fromarray(np.repeat(share, tall, axis=0)).resize((STRIP, tall * sensor.height), Image.Resampling.BOX)
+    what = f"{sensor.name}: {sensor.height} beams, {sensor.width} columns, from {learned.scans} scans"
+    caption = "share of scans in which each ray returned (dark 0, bright 1; red: blocked)"
+    beams = "each beam's elevation (left, degrees) and how far its points lie from it (bar, degrees)"
+    bars = _bars(sensor.elevations, [ring.residual for ring in learned.rings])
+    return panel([[(caption, np.asarray(strip))], [(beams, bars)]], what)
+
+
+def _bars(elevations: Sequence[float], residuals: Sequence[float]) -> np.ndarray:
+    """(H', STRIP, 3) uint8: a line per beam at its elevation, beside a bar as long as its residual."""
+    height, left, right = 480, 90, STRIP - 60
+    picture = Image.new("RGB", (STRIP, height), PAPER)
+    draw = ImageDraw.Draw(picture)
+    top, bottom = max(elevations) + 1, min(elevations) - 1
+    longest = max(*residuals, 0.01)
+    for elevation, residual in zip(elevations, residuals, strict=True):
+        y = (top - elevation) / (top - bottom) * height
+        draw.line([(left, y), (left + 40, y)], fill=INK)
+        draw.line([(left + 60, y), (left + 60 + residual / longest * (right - left - 60), y)], fill=BLOCKED, width=2)
+    step = max(round((top - bottom) / 8), 1)
+    for degrees in range(int(np.ceil(bottom)), int(top) + 1, step):
+        draw.text((20, (top - degrees) / (top - bottom) * height - 6), f"{degrees:+d}", fill=FAINT)
+    draw.text((right - 60, 4), f"{longest:.3f} degrees", fill=FAINT)
+    return np.asarray(picture)

@@ -1,0 +1,264 @@
+"""What verbs read: files, folders, globs, bags and captures alike, as one row of scans that are read when asked for."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from lidarsynth.data import ouster, velodyne
+from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
+from lidarsynth.data.capture import datagrams, is_capture
+from lidarsynth.data.folder import scan_files
+from lidarsynth.files.fields import Fields, FileError, scan_from_fields
+from lidarsynth.files.formats import READERS, read_with_report
+from lidarsynth.lidar.frame import transformed
+from lidarsynth.lidar.scan import Scan
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How scans are read.
+
+    intensity  scale, as in `files.formats.read_with_report`
+    topic      of a bag; None = the only one of points
+    metadata   `.json` of an Ouster capture; None = the only one beside it
+    transform  (4, 4) that brings the points into the sensor's frame, or None
+    """
+
+    intensity: str = "auto"
+    topic: str | None = None
+    metadata: Path | None = None
+    transform: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A scan that was read.
+
+    scan     in the sensor's frame; where a transform was asked for, `extra["point"]` is each point's place in `given`
+    given    the scan as the file has it
+    dropped  points without a return, or not finite
+    stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
+    """
+
+    scan: Scan
+    given: Scan
+    dropped: int
+    stamp: int = 0
+    frame_id: str = ""
+    time: int = 0
+
+
+class Input(Protocol):
+    """One scan to come. `name` is where its result belongs below the output folder, without an ending."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def path(self) -> Path: ...
+    def read(self) -> Loaded: ...
+
+
+@dataclass(frozen=True)
+class FileInput:
+    """A scan file."""
+
+    name: str
+    path: Path
+    reading: Reading
+
+    def read(self) -> Loaded:
+        """The scan. Raises FileError."""
+        return _loaded(*read_with_report(self.path, self.reading.intensity), self.reading)
+
+
+@dataclass(frozen=True)
+class MessageInput:
+    """A point cloud in a bag, still in its bytes."""
+
+    name: str
+    path: Path
+    reading: Reading
+    message: Message
+
+    def read(self) -> Loaded:
+        """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
+        try:
+            cloud = cloud_of(self.message)
+            loaded = _loaded(*scan_from_fields(cloud.fields, self.reading.intensity), self.reading)
+        except ValueError as error:
+            raise FileError(f"{self.path}: {self.name}: {error}") from None
+        return replace(loaded, stamp=cloud.stamp, frame_id=cloud.frame_id, time=cloud.time)
+
+
+@dataclass(frozen=True)
+class TurnInput:
+    """A turn of a capture."""
+
+    name: str
+    path: Path
+    reading: Reading
+    fields: Fields
+
+    def read(self) -> Loaded:
+        """The scan. Raises FileError that names the capture."""
+        try:
+            return _loaded(*scan_from_fields(self.fields, self.reading.intensity), self.reading)
+        except ValueError as error:
+            raise FileError(f"{self.path}: {self.name}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Scans to come, in order.
+
+    single  True where one file was named, whose result may go to a file of any name
+    count   how many there are, or None where only reading tells (captures)
+    stream  gives them; from the start each time
+    """
+
+    single: bool
+    count: int | None
+    stream: Callable[[], Iterator[Input]]
+
+
+def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
+    """The scans of files, folders, globs, bags and captures. Raises ValueError where there is nothing to read."""
+    reading = reading or Reading()
+    if not paths:
+        raise ValueError("expected one scan or more, found none")
+    expanded = [found for path in paths for found in _expanded(path)]
+    streams = [path for path in expanded if is_stream(path)]
+    files = [FileInput(name, path, reading) for name, path in _names(expanded, paths)]
+    single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
+    count: int | None = len(files)
+    for path in streams:
+        more = _stream_count(path, reading)
+        count = None if more is None or count is None else count + more
+
+    def stream() -> Iterator[Input]:
+        yield from files
+        for path in streams:
+            yield from _bag_inputs(path, reading) if is_bag(path) else _capture_inputs(path, reading)
+
+    return Inputs(single, count, stream)
+
+
+def is_stream(path: Path) -> bool:
+    """Whether a path holds many scans one after the other: a bag or a capture."""
+    return is_bag(path) or is_capture(path)
+
+
+def _expanded(path: Path) -> list[Path]:
+    """The path, the files of a folder, or those that a glob finds; bags in a folder come too."""
+    if not path.exists() and any(c in str(path) for c in "*?["):
+        found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
+        if not found:
+            raise ValueError(f"{path}: expected files of this pattern, found none")
+        return [p for p in found if _is_scan(p) or is_stream(p)]
+    if path.is_dir() and not is_bag(path) and not _is_scan(path):
+        bags = sorted(p for p in path.iterdir() if is_stream(p))
+        return bags if bags and not _any_scan(path) else scan_files(path)
+    return [path]
+
+
+def _is_scan(path: Path) -> bool:
+    return path.name.lower().endswith(tuple(READERS))
+
+
+def _any_scan(folder: Path) -> bool:
+    try:
+        return bool(scan_files(folder))
+    except ValueError:
+        return False
+
+
+def _names(expanded: list[Path], given: Sequence[Path]) -> Iterator[tuple[str, Path]]:
+    """(name, path) of each scan file: its stem, with the folders above it as far as names repeat without them."""
+    files = [path for path in expanded if not is_stream(path)]
+    stems = [stem(path) for path in files]
+    if len(set(stems)) == len(stems):
+        return iter(zip(stems, files, strict=True))
+    root = Path(os.path.commonpath([path.absolute().parent for path in files]))
+    names = [str(path.absolute().parent.relative_to(root) / stem(path)) for path in files]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"expected scans of different names, found two named {twice[0]}")
+    return iter(zip(names, files, strict=True))
+
+
+def stem(path: Path) -> str:
+    """The name without the ending that tells the kind of file: a.b.pcd.bin -> a.b."""
+    endings = [suffix for suffix in READERS if path.name.lower().endswith(suffix)]
+    return path.name[: -max(map(len, endings))] if endings else path.stem
+
+
+def _stream_count(path: Path, reading: Reading) -> int | None:
+    if not is_bag(path):
+        return None
+    with open_bag(path) as bag:
+        name = bag.point_topic(reading.topic)
+        return sum(topic.count for topic in bag.topics if topic.name == name) or None
+
+
+def _bag_inputs(path: Path, reading: Reading) -> Iterator[Input]:
+    with open_bag(path) as bag:
+        topic = bag.point_topic(reading.topic)
+        for number, message in enumerate(bag.messages(frozenset([topic]))):
+            yield MessageInput(f"{path.stem}/{number:06d}", path, reading, message)
+
+
+def _capture_inputs(path: Path, reading: Reading) -> Iterator[Input]:
+    for number, fields in enumerate(capture_turns(path, reading.metadata)):
+        yield TurnInput(f"{path.stem}/{number:06d}", path, reading, fields)
+
+
+def capture_turns(path: Path, metadata: Path | None = None) -> Iterator[Fields]:
+    """The turns of a capture: Velodyne's by its packets, Ouster's with its metadata. Raises FileError for others."""
+    first = next((p for p in datagrams(path) if len(p.payload) > 1000), None)
+    if first is None:
+        raise FileError(f"{path}: expected packets of a LiDAR, found none")
+    if velodyne.is_velodyne(first.payload):
+        turns = velodyne.turns(datagrams(path))
+    else:
+        turns = ouster.turns(datagrams(path), ouster.read_metadata(metadata or _metadata_beside(path)))
+    found = 0
+    for found, fields in enumerate(turns, 1):  # noqa: B007, counted
+        yield fields
+    if not found:
+        raise FileError(f"{path}: expected whole turns of a Velodyne or of the Ouster that the metadata describes, "
+                        f"found none; the first large packet has {len(first.payload)} bytes")  # fmt: skip
+
+
+def _metadata_beside(path: Path) -> Path:
+    """The only Ouster metadata file in a capture's folder. Raises FileError that asks for it."""
+    found = sorted(p for p in path.parent.glob("*.json") if ouster.is_metadata(p))
+    named = [p for p in found if p.stem.startswith(path.stem) or path.stem.startswith(p.stem)]
+    if len(named or found) == 1:
+        return (named or found)[0]
+    listed = ", ".join(p.name for p in found) or "none"
+    raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one beside the capture, found {listed}")
+
+
+def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
+    if reading.transform is None:
+        return Loaded(scan, scan, dropped)
+    places = dict(scan.extra) | {"point": np.arange(len(scan))}
+    moved = replace(scan, xyz=transformed(scan.xyz, reading.transform), extra=places)
+    return Loaded(moved, scan, dropped)
+
+
+def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) -> Scan:
+    """A filled scan in the frame of its file: measured points bit by bit as given, new ones transformed back."""
+    if transform is None:
+        return filled
+    extra = dict(filled.extra)
+    place, new = extra.pop("point"), extra["new"] > 0
+    xyz = transformed(filled.xyz, np.linalg.inv(transform))
+    xyz[~new] = loaded.given.xyz[place[~new]]
+    return replace(filled, xyz=xyz, extra=extra)

@@ -1,0 +1,74 @@
+"""What the verb `sensor` does: learn a sensor from scans, write it as a `.toml` that every verb takes, say how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
+from lidarsynth.lidar.learning import Learned, learn_sensor
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.verbs.inputs import Input
+
+ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
+
+
+def learn(inputs: Sequence[Input], name: str) -> Learned:
+    """The sensor of at most ENOUGH of the inputs, evenly chosen. Broken ones are left out; raises ValueError for all."""
+    every = max(-(-len(inputs) // ENOUGH), 1)
+    return learn_sensor(_readable(inputs[::every]), name)
+
+
+def from_metadata(path: Path, name: str) -> Sensor | None:
+    """The sensor of an Ouster metadata file, or None where it is something else."""
+    return sensor_of(read_metadata(path), name) if is_metadata(path) else None
+
+
+def _readable(inputs: Sequence[Input]) -> Iterator[Scan]:
+    failed: list[ValueError] = []
+    for item in inputs:
+        try:
+            yield item.read().scan
+        except ValueError as error:
+            failed.append(error)
+    if len(failed) == len(inputs) and failed:
+        raise failed[0]
+
+
+def sensor_toml(sensor: Sensor, comments: Sequence[str] = ()) -> str:
+    """A sensor file as `read_sensor` reads it."""
+    lines = [f"# {comment}" for comment in comments] + [f'name = "{sensor.name}"']
+    numbers = sensor.to_dict()
+    for key in ("width", "min_range", "max_range", "mount"):
+        lines.append(f"{key} = {numbers[key]}")
+    lines.append(f"tilt = [{', '.join(map(str, sensor.tilt))}]  # degrees: nose up, left side up, against the road")
+    lines.append(_listed("elevations", [f"{e:.3f}" for e in sensor.elevations]))
+    if sensor.offsets:
+        lines.append(_listed("offsets", [f"{h:.3f}" for h in sensor.offsets]))
+    if sensor.blocked:
+        lines.append(_listed("blocked", [f"[{row}, {first}, {last}]" for row, first, last in sensor.blocked]))
+    return "\n".join(lines) + "\n"
+
+
+def _listed(key: str, words: list[str]) -> str:
+    rows = [", ".join(words[i : i + 8]) for i in range(0, len(words), 8)]
+    return f"{key} = [\n  " + ",\n  ".join(rows) + ",\n]"
+
+
+def summary(learned: Learned) -> str:
+    """Lines for people: what was found, and how well it fits."""
+    sensor = learned.sensor
+    residuals = np.array([ring.residual for ring in learned.rings])
+    share = float(sensor.blocked_rays().mean())
+    lines = [
+        f"{sensor.name}: {sensor.height} beams from {sensor.elevations[0]:+.2f} to {sensor.elevations[-1]:+.2f} degrees, "
+        f"{sensor.width} columns, {sensor.min_range:g} to {sensor.max_range:g} m",
+        f"  points lie {np.median(residuals):.4f} degrees from their beams (median beam), {residuals.max():.4f} (worst)",
+        f"  {sensor.mount:g} m above the ground, nose {sensor.tilt[0]:+.1f} and left side {sensor.tilt[1]:+.1f} degrees up",
+        f"  blocked by its carrier: {share:.1%} of the rays" if sensor.blocked else "  nothing seen to be blocked",
+        f"  from {learned.scans} scans" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
+    ]
+    return "\n".join(lines)
