@@ -1,4 +1,4 @@
-"""What the verb `sensor` does: learn a sensor from scans, write it as a `.toml` that every verb takes, say how sure it is."""
+"""What the verb `sensor` does: learn a sensor from scans, as a `.toml` that every verb takes, and say how sure it is."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
 def learn(inputs: Sequence[Input], name: str) -> Learned:
-    """The sensor of at most ENOUGH of the inputs, evenly chosen. Broken ones are left out; raises ValueError for all."""
+    """The sensor of at most ENOUGH of the inputs, evenly chosen. Broken ones are left out; else ValueError."""
     every = max(-(-len(inputs) // ENOUGH), 1)
     return learn_sensor(_readable(inputs[::every]), name)
 
@@ -62,12 +62,12 @@ def summary(learned: Learned) -> str:
     """Lines for people: what was found, and how well it fits."""
     sensor = learned.sensor
     residuals = np.array([ring.residual for ring in learned.rings])
-    share = float(sensor.blocked_rays().mean())
+    share, (nose, left) = float(sensor.blocked_rays().mean()), sensor.tilt
+    top, bottom = sensor.elevations[0], sensor.elevations[-1]
     lines = [
-        f"{sensor.name}: {sensor.height} beams from {sensor.elevations[0]:+.2f} to {sensor.elevations[-1]:+.2f} degrees, "
-        f"{sensor.width} columns, {sensor.min_range:g} to {sensor.max_range:g} m",
-        f"  points lie {np.median(residuals):.4f} degrees from their beams (median beam), {residuals.max():.4f} (worst)",
-        f"  {sensor.mount:g} m above the ground, nose {sensor.tilt[0]:+.1f} and left side {sensor.tilt[1]:+.1f} degrees up",
+        f"{sensor.name}: {sensor.height} beams from {top:+.2f} to {bottom:+.2f} degrees, {sensor.width} columns, {sensor.min_range:g} to {sensor.max_range:g} m",
+        f"  points lie {np.median(residuals):.4f} degrees off their beams (median), {residuals.max():.4f} (worst beam)",
+        f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
         f"  blocked by its carrier: {share:.1%} of the rays" if sensor.blocked else "  nothing seen to be blocked",
         f"  from {learned.scans} scans" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
     ]
