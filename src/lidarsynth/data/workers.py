@@ -37,9 +37,13 @@ def in_order(make: Callable[[int], Any], items: Sequence[int], workers: int) -> 
 
 
 def _start(make: Callable[[int], Any]) -> None:
-    """Ctrl-C is the parent's to handle; a parent that was killed takes its workers along."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    watch_parent()
     _make.append(make)
+
+
+def watch_parent() -> None:
+    """In a worker: Ctrl-C is the parent's to handle; a parent that was killed takes its workers along."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

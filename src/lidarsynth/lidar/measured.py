@@ -21,7 +21,9 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     """Every point of the scan bit by bit, and the pixels of `filled` outside `measured` (H, W) bool as new points.
 
     Points come row by row, each row from behind over the left; those above or below the view come last, and only
-    without any there is a `ring`, the row. A scan without reflectance takes that of its pixels.
+    without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
+    the scan stays with its points; new ones have 0 there, the label of their pixel, and the time of the points measured
+    in their direction. `extra["new"]` is 1 for new points.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row = row_of_points(scan, filled.sensor, projection)
@@ -34,5 +36,28 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     xyz = np.concatenate([scan.xyz, new.xyz])
     ring = np.concatenate([np.where(row < 0, filled.sensor.height, row), new.ring])
     order = np.lexsort((-np.arctan2(xyz[:, 1], xyz[:, 0]), ring))
-    both = Scan(xyz, np.concatenate([reflectance, new.reflectance]), ring=None if (row < 0).any() else ring)
+    both = Scan(
+        xyz,
+        np.concatenate([reflectance, new.reflectance]),
+        ring=None if (row < 0).any() else ring,
+        time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
+        label=_labels(scan, new),
+        extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)]) for name, values in scan.extra.items()}
+        | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])},
+    )
     return both[order]
+
+
+def _time_towards(xyz: np.ndarray, scan: Scan) -> np.ndarray:
+    """(N,) the time of the measured point nearest in azimuth to each of `xyz`: a spinning sensor looks there then."""
+    assert scan.time is not None
+    azimuth = np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0])
+    order = np.argsort(azimuth)
+    place = np.searchsorted(azimuth[order], np.arctan2(xyz[:, 1], xyz[:, 0])).clip(0, len(order) - 1)
+    return scan.time[order[place]]
+
+
+def _labels(scan: Scan, new: Scan) -> np.ndarray | None:
+    if scan.label is None:
+        return None
+    return np.concatenate([scan.label, np.zeros(len(new), scan.label.dtype) if new.label is None else new.label])

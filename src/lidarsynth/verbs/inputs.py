@@ -15,7 +15,7 @@ from lidarsynth.data import ouster, velodyne
 from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
 from lidarsynth.data.capture import datagrams, is_capture
 from lidarsynth.data.folder import scan_files
-from lidarsynth.files.fields import Fields, FileError, scan_from_fields
+from lidarsynth.files.fields import Fields, FileError, find, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.scan import Scan
@@ -41,14 +41,15 @@ class Reading:
 class Loaded:
     """A scan that was read.
 
-    scan     in the sensor's frame; where a transform was asked for, `extra["point"]` is each point's place in `given`
-    given    the scan as the file has it
+    scan     in the sensor's frame; of a message, or where a transform was asked for, `extra["point"]` is each point's
+             place in `given`
+    given    the columns of the message, or x y z of the file
     dropped  points without a return, or not finite
     stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
     """
 
     scan: Scan
-    given: Scan
+    given: Fields
     dropped: int
     stamp: int = 0
     frame_id: str = ""
@@ -91,7 +92,9 @@ class MessageInput:
         """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
         try:
             cloud = cloud_of(self.message)
-            loaded = _loaded(*scan_from_fields(cloud.fields, self.reading.intensity), self.reading)
+            places = np.arange(len(next(iter(cloud.fields.values()), ())))
+            scan, dropped = scan_from_fields({**cloud.fields, "point": places}, self.reading.intensity)
+            loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
         return replace(loaded, stamp=cloud.stamp, frame_id=cloud.frame_id, time=cloud.time)
@@ -246,19 +249,54 @@ def _metadata_beside(path: Path) -> Path:
 
 
 def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
+    given = dict(zip("xyz", scan.xyz.T, strict=True))
     if reading.transform is None:
-        return Loaded(scan, scan, dropped)
-    places = dict(scan.extra) | {"point": np.arange(len(scan))}
-    moved = replace(scan, xyz=transformed(scan.xyz, reading.transform), extra=places)
-    return Loaded(moved, scan, dropped)
+        return Loaded(scan, given, dropped)
+    extra = {"point": np.arange(len(scan)), **scan.extra}
+    return Loaded(replace(scan, xyz=transformed(scan.xyz, reading.transform), extra=extra), given, dropped)
 
 
 def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) -> Scan:
     """A filled scan in the frame of its file: measured points bit by bit as given, new ones transformed back."""
     if transform is None:
         return filled
-    extra = dict(filled.extra)
-    place, new = extra.pop("point"), extra["new"] > 0
+    place, old = filled.extra["point"], filled.extra["new"] == 0
     xyz = transformed(filled.xyz, np.linalg.inv(transform))
-    xyz[~new] = loaded.given.xyz[place[~new]]
-    return replace(filled, xyz=xyz, extra=extra)
+    given = np.stack([loaded.given[str(find(loaded.given, axis))] for axis in "xyz"], axis=1)
+    xyz[old] = given[place[old]]
+    return replace(filled, xyz=xyz)
+
+
+def without_places(scan: Scan) -> Scan:
+    """The scan without `extra["point"]`."""
+    return replace(scan, extra={name: values for name, values in scan.extra.items() if name != "point"})
+
+
+def message_fields(filled: Scan, given: Fields) -> Fields:
+    """A filled scan as the columns that its message had, bit by bit for measured points, and `new`.
+
+    New points have their x y z, a reflectance in the message's own scale, the ring number that its row has there, and
+    the time of the points in their direction; other fields are 0.
+    """
+    new = filled.extra["new"] > 0
+    place = np.where(new, 0, filled.extra["point"])
+    fields = {name: column[place] for name, column in given.items()}
+    for column in fields.values():
+        column[new] = 0
+    for i, axis in enumerate("xyz"):
+        fields[str(find(given, axis))][new] = filled.xyz[new, i]
+    old = ~new
+    if (name := find(given, "reflectance")) is not None:
+        lit = old & (filled.reflectance > 0)
+        scale = float(np.median(fields[name][lit] / filled.reflectance[lit])) if lit.any() else 1.0
+        fields[name][new] = (filled.reflectance[new] * scale).astype(fields[name].dtype)
+    if (name := find(given, "ring")) is not None and filled.ring is not None:
+        known = np.zeros(int(filled.ring.max()) + 1, fields[name].dtype)
+        known[filled.ring[old]] = fields[name][old]
+        fields[name][new] = known[filled.ring[new]]
+    if (name := find(given, "time")) is not None:
+        azimuth = np.arctan2(filled.xyz[:, 1], filled.xyz[:, 0])
+        order = np.flatnonzero(old)[np.argsort(azimuth[old])]
+        nearest = np.searchsorted(azimuth[order], azimuth[new]).clip(0, len(order) - 1)
+        fields[name][new] = fields[name][order[nearest]]
+    return fields | {"new": new.astype(np.uint8)}

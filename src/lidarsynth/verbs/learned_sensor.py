@@ -1,4 +1,4 @@
-"""What the verb `sensor` does: learn a sensor from scans, as a `.toml` that every verb takes, and say how sure it is."""
+"""What the verb `sensor` does: learn a sensor from scans, as a `.toml` that every verb takes, and how sure it is."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ def summary(learned: Learned) -> str:
     share, (nose, left) = float(sensor.blocked_rays().mean()), sensor.tilt
     top, bottom = sensor.elevations[0], sensor.elevations[-1]
     lines = [
-        f"{sensor.name}: {sensor.height} beams from {top:+.2f} to {bottom:+.2f} degrees, {sensor.width} columns, {sensor.min_range:g} to {sensor.max_range:g} m",
+        f"{sensor.name}: {sensor.height} beams from {top:+.2f} to {bottom:+.2f} degrees, {sensor.width} columns, "
+        f"{sensor.min_range:g} to {sensor.max_range:g} m",
         f"  points lie {np.median(residuals):.4f} degrees off their beams (median), {residuals.max():.4f} (worst beam)",
         f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
         f"  blocked by its carrier: {share:.1%} of the rays" if sensor.blocked else "  nothing seen to be blocked",

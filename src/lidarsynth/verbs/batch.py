@@ -1,0 +1,185 @@
+"""Many scans through `complete`, `upsample` or `project`: one after the other or in processes, one report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lidarsynth.data.bags import Cloud
+from lidarsynth.data.windows import in_window
+from lidarsynth.files.formats import write
+from lidarsynth.lidar.frame import check_frame
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.metrics.reconstruction import Errors
+from lidarsynth.pictures.portrait import portrait
+from lidarsynth.pictures.render import save_png
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.scan_model import OnStep, ScanModel
+from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
+from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
+
+FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is done with every scan.
+
+    verb       complete, upsample or project
+    model      as `load` takes it; not of project
+    how        of complete and upsample
+    corrupt    recipe to hide a part first, of complete
+    sensor     that made the scans, None = recognised; of upsample and project
+    into       sensor of the result, of upsample
+    projection, width  of project
+    transform  (4, 4) that was applied to the points, to be undone in the result, or None
+    strict     refuse scans that are not in their sensor's frame
+    picture    a .png beside each file
+    """
+
+    verb: str
+    model: str = "default"
+    device: str = "cpu"
+    how: Filling = field(default_factory=Filling)
+    corrupt: str | None = None
+    sensor: str | None = None
+    into: str | None = None
+    projection: str = "auto"
+    width: int | None = None
+    transform: np.ndarray | None = None
+    strict: bool = False
+    picture: bool = True
+
+
+@dataclass(frozen=True)
+class Work:
+    """One scan, the file to write, or None for one that goes into a bag, and whether to look at its frame."""
+
+    item: Input
+    target: Path | None
+    check: bool
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of one scan.
+
+    error     why there is no result, in one line, or None
+    warning   what seems wrong with it, in one line, or None
+    points    measured, and after it; `dropped` were without a return
+    note      what was done, in words
+    errors    of hidden pixels by method, where a corruption was asked for
+    cloud     for a bag
+    """
+
+    name: str
+    source: Path
+    target: Path | None
+    seconds: float
+    error: str | None = None
+    warning: str | None = None
+    dropped: int = 0
+    points: tuple[int, int] = (0, 0)
+    note: str = ""
+    errors: Mapping[str, Errors] = field(default_factory=dict)
+    cloud: Cloud | None = None
+
+
+def run(task: Task, works: Iterable[Work], workers: int = 1, model: ScanModel | None = None,
+        on_step: OnStep = None) -> Iterator[Result]:  # fmt: skip
+    """The results in order; a scan that fails comes as its error.
+
+    workers  processes, each with a model of its own; below 2 the work is done here, with `model` if it is given
+    """
+    yield from in_window(partial(start, task, model if workers < 2 else None, on_step, workers), works, workers)
+
+
+def start(task: Task, model: ScanModel | None, on_step: OnStep, workers: int) -> Callable[[Work], Result]:
+    """What one process does with each scan, its model loaded once."""
+    if workers > 1:
+        import torch
+
+        torch.set_num_threads(1)
+    if task.verb != "project":
+        if model is None:
+            from lidarsynth.weights.load import load
+
+            model = load(task.model, device=task.device)
+        model = model.into(task.into) if task.into else model
+    return partial(_one, task, model, on_step)
+
+
+def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Result:
+    begun = time.perf_counter()
+    try:
+        loaded = work.item.read()
+        warning = _frame_warning(loaded, task, work)
+        done = _made(task, model, work.item.path, loaded, on_step)
+        cloud = None
+        if work.target is None:
+            points = _points(done, loaded, task.transform)
+            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, message_fields(points, loaded.given))
+        else:
+            _store(work.target, done, loaded, task)
+    except (ValueError, FloatingPointError) as error:
+        return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, str(error))
+    count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
+    errors = {} if isinstance(done, RangeImage) else done.errors
+    return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, None, warning, loaded.dropped,
+                  (len(loaded.scan), count), _note(task, done, loaded.scan), errors, cloud)  # fmt: skip
+
+
+def _frame_warning(loaded: Loaded, task: Task, work: Work) -> str | None:
+    if not (work.check or task.strict):
+        return None
+    frame = check_frame(loaded.scan)
+    warning = frame.warning()
+    if warning is not None and frame.faults and task.strict:
+        raise ValueError(f"{work.item.path}: {warning}")
+    return None if warning is None else f"{work.item.path}: {warning}"
+
+
+def _made(task: Task, model: ScanModel | None, path: Path, loaded: Loaded, on_step: OnStep) -> Filled | RangeImage:
+    scan = loaded.scan
+    if task.verb == "project":
+        image = project(scan, named_sensor(scan, path, "--sensor", task.sensor), task.projection, task.width)
+        if not image.mask.any():
+            raise ValueError(f"{path}: expected points within {image.sensor.name}'s view, found none of {len(scan)}")
+        return image
+    assert model is not None
+    if task.verb == "complete":
+        return complete_scan(model, scan, task.corrupt, task.how, on_step)
+    return upsample_scan(model, scan, named_sensor(scan, path, "--from", task.sensor), task.how, on_step)
+
+
+def _note(task: Task, done: Filled | RangeImage, scan: Scan) -> str:
+    if isinstance(done, RangeImage):
+        return f"{len(scan)} points, {done.sensor.name}, {done.mask.mean():.1%} of {done.shape} pixels filled"
+    return f"{len(scan)} points became {len(done.points)}" if task.verb == "upsample" else ""
+
+
+def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | None) -> Scan:
+    if isinstance(done, RangeImage):
+        raise ValueError("expected a file or folder for range images, found a bag, which holds points")
+    if "new" not in done.points.extra:
+        raise ValueError("expected a file or folder with --corrupt, found a bag")
+    return back_in_place(done.points, loaded, transform)
+
+
+def _store(target: Path, done: Filled | RangeImage, loaded: Loaded, task: Task) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    image = done if isinstance(done, RangeImage) else done.image
+    if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
+        write(target, image)
+    elif "new" in done.points.extra:
+        write(target, without_places(back_in_place(done.points, loaded, task.transform)))
+    else:
+        write(target, without_places(done.points))
+    if task.picture:
+        save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
