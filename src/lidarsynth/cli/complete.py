@@ -18,13 +18,13 @@ from lidarsynth.cli.arguments import (
     Steps,
     arg,
 )
-from lidarsynth.cli.scan_files import read_scan, write_filled
-from lidarsynth.cli.terminal import at_least, load_with_bar, say, step_bar
+from lidarsynth.cli.many import PICTURES, Many, work_through
+from lidarsynth.cli.terminal import at_least, say
 
 
 def complete(
-    scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, or one folder of scans.")],
-    out: Annotated[Path, arg(help="file to write, as in upsample, or a folder where there are several scans.")],
+    scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
+    out: Annotated[Path, arg(help="file to write, as in upsample; a folder where there are several scans; or a bag.")],
     corrupt: Recipe = None,
     model: Source = "default",
     method: Method = "auto",
@@ -34,6 +34,7 @@ def complete(
     device: Device = "cpu",
     intensity: Intensity = "auto",
     picture: Picture = True,
+    many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
     """Fill what a scan lacks: every measured point stays, bit by bit, and new ones are added.
 
@@ -41,21 +42,16 @@ def complete(
     of the hidden pixels are printed beside those of interpolation.
     """
     from lidarsynth.systems.filling import Filling
-    from lidarsynth.verbs.completion import complete_scan
+    from lidarsynth.verbs.batch import Task
     from lidarsynth.verbs.description import errors_table, mean_table
-    from lidarsynth.verbs.output_files import targets
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
-    how, loaded, tables = Filling(method, steps, resamples, seed=seed), None, []
-    for path, target in targets(scans, out):
-        scan = read_scan(path, intensity)
-        loaded = loaded or load_with_bar(model, device)
-        with step_bar(path.name, loaded.calls(loaded.resolved(how))) as on_step:
-            filled = complete_scan(loaded, scan, corrupt, how, on_step)
-        write_filled(target, filled, picture)
-        if filled.errors:
-            say(errors_table(path.name, filled.errors))
-            tables.append(filled.errors)
-    if len(tables) > 1:
-        say(mean_table(tables))
+    how = Filling(method, steps, resamples, seed=seed)
+    task = Task("complete", model, device, how, corrupt=corrupt, picture=picture)
+    results = [result for result in work_through(task, scans, out, many, intensity) if result.errors]
+    if len(results) <= PICTURES:
+        for result in results:
+            say(errors_table(result.source.name, result.errors))
+    if len(results) > 1:
+        say(mean_table([result.errors for result in results]))

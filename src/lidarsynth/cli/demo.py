@@ -22,13 +22,13 @@ def demo(
     import numpy as np
 
     street = Path(__file__).parents[1] / "shipped" / "street.npz"
-    project(street, out / "street.npz")
+    project([street], out / "street.npz")
     sparse = read_scan(street, "auto")
     write_and_say(out / "sixteen_beams.pcd", sparse[np.asarray(sparse.ring) % 4 == 0])
     generate(4, out / "generated", model, seed=seed)
     complete([street], out / "beams.ply", "beams:4", model, seed=seed)
     complete([street], out / "sector.ply", "sector:90", model, seed=seed)
-    upsample(out / "sixteen_beams.pcd", out / "dense.ply", model=model, seed=seed)
+    upsample([out / "sixteen_beams.pcd"], out / "dense.ply", model=model, seed=seed)
     info(model)
     made = sorted(path for path in out.rglob("*") if path.is_file())
     say("\n".join([f"\n{len(made)} files in {out}/, look at the pictures:", *(f"  {path}" for path in made)]))

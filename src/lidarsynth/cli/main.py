@@ -13,6 +13,7 @@ from lidarsynth.cli.evaluate import evaluate
 from lidarsynth.cli.generate import generate
 from lidarsynth.cli.info import info
 from lidarsynth.cli.project import project
+from lidarsynth.cli.sensor import sensor
 from lidarsynth.cli.terminal import answer
 from lidarsynth.cli.train import train
 from lidarsynth.cli.upsample import upsample
@@ -23,6 +24,7 @@ VERBS = {
     "complete": complete,
     "upsample": upsample,
     "project": project,
+    "sensor": sensor,
     "data": data,
     "train": train,
     "evaluate": evaluate,

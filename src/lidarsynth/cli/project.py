@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, SensorWord, arg
-from lidarsynth.cli.scan_files import read_scan, write_and_say
-from lidarsynth.cli.terminal import at_least, say
+from lidarsynth.cli.many import Many, work_through
+from lidarsynth.cli.terminal import at_least
 
 
 def project(
-    scan: Annotated[Positional[Path], arg(help="file of the scan.")],
+    scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
     out: Annotated[Path, arg(help=".npz to write; another kind of file gets the points that won a pixel.")],
     sensor: SensorWord = None,
     method: Annotated[
@@ -22,18 +22,11 @@ def project(
     seed: NoSeed = 0,
     intensity: Intensity = "auto",
     picture: Picture = True,
+    many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
     """Draw a scan as a range image: .npz with range, reflectance, mask and sensor, and a picture."""
-    from lidarsynth.lidar import projection
-    from lidarsynth.pictures.portrait import portrait
-    from lidarsynth.verbs.completion import named_sensor
-    from lidarsynth.verbs.output_files import target
+    from lidarsynth.verbs.batch import Task
 
     at_least(4, {"width": width})
-    target(out, scan)
-    points = read_scan(scan, intensity)
-    image = projection.project(points, named_sensor(points, scan, "--sensor", sensor), method, width)
-    if not image.mask.any():
-        raise ValueError(f"{scan}: expected points within {image.sensor.name}'s view, found none of {len(points)}")
-    say(f"{scan}: {len(points)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled")
-    write_and_say(out, image, portrait(image) if picture else None)
+    task = Task("project", sensor=sensor, projection=method, width=width, picture=picture)
+    work_through(task, scans, out, many, intensity)

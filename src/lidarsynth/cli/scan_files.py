@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from lidarsynth.lidar.scan import RangeImage, Scan
-    from lidarsynth.verbs.completion import Filled
 
 
 def read_scan(path: Path, intensity: str) -> Scan:
@@ -32,9 +31,3 @@ def write_and_say(path: Path, scan: Scan | RangeImage, figure: np.ndarray | None
     path.parent.mkdir(parents=True, exist_ok=True)
     write(path, scan)
     say(f"wrote {path}" if figure is None else f"wrote {path} and {save_png(path.with_suffix('.png'), figure)}")
-
-
-def write_filled(path: Path, filled: Filled, picture: bool) -> None:
-    """Write a filled scan: its range image as .npz, its points as any other kind of file."""
-    content = filled.image if path.suffix.lower() == ".npz" else filled.points
-    write_and_say(path, content, filled.figure() if picture else None)

@@ -26,6 +26,11 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
+def warn(text: str) -> None:
+    """A line on stderr about work that goes on."""
+    print(f"lidarsynth: {text}", file=sys.stderr, flush=True)
+
+
 def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
     """Raises ValueError by the option's name unless each number is None or from `least` to 2^62."""
     for name, number in numbers.items():
@@ -39,6 +44,15 @@ def step_bar(title: str, steps: int) -> Iterator[Callable[[], object]]:
     from tqdm import tqdm
 
     with tqdm(total=steps, unit="step", delay=2, desc=title, leave=False) as bar:
+        yield bar.update
+
+
+@contextmanager
+def scan_bar(title: str, count: int | None) -> Iterator[Callable[[], object]]:
+    """A progress bar with total and time left for work over two seconds; gives what to call after every scan."""
+    from tqdm import tqdm
+
+    with tqdm(total=count, unit="scan", delay=2, desc=title, leave=False) as bar:
         yield bar.update
 
 

@@ -11,6 +11,8 @@ from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidarsynth.files import arrays, feather, las, pcd, ply, text
 from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
 from lidarsynth.files.labels import read_labels
@@ -32,6 +34,7 @@ READERS: dict[str, Callable[[bytes], Fields]] = {
     ".asc": text.read_text,
     ".pts": text.read_text,
 }
+BARE = (".bin", ".npy")  # without a place for further fields
 NAMED_ONLY = (".csv", ".txt")  # in a folder they may be anything, such as KITTI's times.txt: read where they are named
 
 WRITERS: dict[str, Callable[[BufferedIOBase, Any], None]] = {  # a Scan; .npz also takes a RangeImage
@@ -96,7 +99,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given.
 
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
-    points. `.bin` and `.npy` hold x y z reflectance only; the others ring, time and label too. The file appears whole
+    points. `.bin` and `.npy` hold x y z reflectance only, and a filled scan's `new` beside them in a `.new` file, a byte a
+    point; the others hold ring, time, label and every further field too. The file appears whole
     or not at all: it is written beside its place under another name, then renamed. Raises FileError.
     """
     path = Path(path)
@@ -104,12 +108,20 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
         raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found .pcd.bin")
     suffix = _suffix(path, WRITERS, "write")
     content = scan.to_scan() if isinstance(scan, RangeImage) and suffix != ".npz" else scan
+    marks = content.extra.get("new") if isinstance(content, Scan) and suffix in BARE else None
+    if path.is_dir():
+        raise FileError(f"{path}: expected the name of a file to write, found a folder")
+    _put(path, lambda file: WRITERS[suffix](file, content))
+    if marks is not None:
+        _put(path.with_suffix(".new"), lambda file: file.write(marks.astype(np.uint8).tobytes()))
+
+
+def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:
+    """Write a file beside its place, then move it there."""
     unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
-        if path.is_dir():
-            raise FileError(f"{path}: expected the name of a file to write, found a folder")
         with open(unfinished, "xb") as file:
-            WRITERS[suffix](file, content)
+            write_to(file)
         os.replace(unfinished, path)
     except OSError as error:
         raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from None

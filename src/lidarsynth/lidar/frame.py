@@ -90,6 +90,8 @@ def _tilt_and_height(scan: Scan, turn: np.ndarray) -> tuple[np.ndarray, float]:
         cones = fit_cones(xyz, ring)
         if cones.residual > FIT or cones.residual > 0.7 * cones.upright:
             break  # cones about z through the origin fit as well
+        if cones.tilt < TILTED / 10 and abs(cones.height) < RAISED / 2:
+            break
         tip, height = _onto_z(cones.axis) @ tip, height + cones.height * float(cones.axis[2])
     return tip, height
 

@@ -131,8 +131,9 @@ def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Re
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, str(error))
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
-    return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, None, warning, loaded.dropped,
-                  (len(loaded.scan), count), _note(task, done, loaded.scan), errors, cloud)  # fmt: skip
+    whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
+    points, note = (len(loaded.scan), count), _note(task, done, loaded.scan)
+    return Result(*whose, None, warning, loaded.dropped, points, note, errors, cloud)
 
 
 def _frame_warning(loaded: Loaded, task: Task, work: Work) -> str | None:

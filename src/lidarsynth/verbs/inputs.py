@@ -17,7 +17,7 @@ from lidarsynth.data.capture import datagrams, is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.files.fields import Fields, FileError, find, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
-from lidarsynth.lidar.frame import transformed
+from lidarsynth.lidar.frame import parse_transform, transformed
 from lidarsynth.lidar.scan import Scan
 
 
@@ -246,6 +246,35 @@ def _metadata_beside(path: Path) -> Path:
         return (named or found)[0]
     listed = ", ".join(p.name for p in found) or "none"
     raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one beside the capture, found {listed}")
+
+
+def read_transform(text: str | None, mount: float | None = None) -> np.ndarray | None:
+    """(4, 4) from x:y:z:roll:pitch:yaw, or a file of 12 or 16 numbers (.txt, .npy), and then down by `mount` metres.
+
+    mount  height of the sensor above the points' z = 0, such as the ground; None with None is no transform at all
+    Raises ValueError for anything that is no rigid motion.
+    """
+    if text is None and mount is None:
+        return None
+    matrix = np.eye(4) if text is None else _matrix_file(Path(text)) if Path(text).is_file() else parse_transform(text)
+    down = np.eye(4)
+    down[2, 3] = -(mount or 0.0)
+    return down @ matrix
+
+
+def _matrix_file(path: Path) -> np.ndarray:
+    try:
+        numbers = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path}: expected 4 x 4 numbers, found: {error}") from None
+    if numbers.size not in (12, 16):
+        raise ValueError(f"{path}: expected 4 x 4 numbers, or the upper 3 x 4, found {numbers.size}")
+    matrix = np.eye(4)
+    matrix.reshape(-1)[: numbers.size] = numbers.reshape(-1)
+    turn = matrix[:3, :3]
+    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0):
+        raise ValueError(f"{path}: expected a rotation and a shift, found a matrix that stretches or mirrors")
+    return matrix
 
 
 def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +13,15 @@ from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
 from lidarsynth.lidar.learning import Learned, learn_sensor
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.verbs.inputs import Input
+from lidarsynth.verbs.inputs import Input, Inputs
 
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
-def learn(inputs: Sequence[Input], name: str) -> Learned:
+def learn(inputs: Inputs, name: str) -> Learned:
     """The sensor of at most ENOUGH of the inputs, evenly chosen. Broken ones are left out; else ValueError."""
-    every = max(-(-len(inputs) // ENOUGH), 1)
-    return learn_sensor(_readable(inputs[::every]), name)
+    every = max(-(-(inputs.count or ENOUGH) // ENOUGH), 1)
+    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every)), name)
 
 
 def from_metadata(path: Path, name: str) -> Sensor | None:
@@ -27,15 +29,25 @@ def from_metadata(path: Path, name: str) -> Sensor | None:
     return sensor_of(read_metadata(path), name) if is_metadata(path) else None
 
 
-def _readable(inputs: Sequence[Input]) -> Iterator[Scan]:
+def _readable(inputs: Iterable[Input]) -> Iterator[Scan]:
     failed: list[ValueError] = []
+    read = 0
     for item in inputs:
         try:
             yield item.read().scan
+            read += 1
         except ValueError as error:
             failed.append(error)
-    if len(failed) == len(inputs) and failed:
+    if failed and not read:
         raise failed[0]
+
+
+def write_toml(path: Path, text: str) -> None:
+    """The text as a file, whole or not at all, in a folder that is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}.part")
+    scratch.write_text(text)
+    os.replace(scratch, path)
 
 
 def sensor_toml(sensor: Sensor, comments: Sequence[str] = ()) -> str:

@@ -3,40 +3,51 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from lidarsynth.data.sources import scan_files
-from lidarsynth.files.formats import READERS, WRITERS
+from lidarsynth.files.formats import WRITERS
+from lidarsynth.verbs.batch import EVERY, FIRST, Work
+from lidarsynth.verbs.inputs import Inputs
 
 
-def targets(paths: list[Path], out: Path) -> list[tuple[Path, Path]]:
-    """Each scan, of `paths` or of the one folder in it, with the file to write: `out` for one file, else out/NAME.ply.
+def works(
+    inputs: Inputs,
+    out: Path,
+    ending: str,
+    shard: tuple[int, int] = (1, 1),
+    skip: bool = False,
+    skipped: list[Path] | None = None,
+) -> Iterator[Work]:
+    """Each scan of this shard with its file: `out` for a single one that names a file, else out/NAME.ending.
 
-    Raises ValueError where `out` cannot be written, is a scan's own file, or two scans would share a file.
+    skip     leave out scans whose file is there already; they are added to `skipped`
+    Raises ValueError where `out` cannot be written, is a scan's own file, or names one file for several scans.
     """
-    if not paths:
-        raise ValueError("expected one scan or more, found none")
-    whole_folder = len(paths) == 1 and paths[0].is_dir() and not _is(READERS, paths[0])
-    scans = scan_files(paths[0]) if whole_folder else paths
-    if len(scans) == 1 and not whole_folder and not out.is_dir() and (out.suffix or out.is_file()):
-        return [(scans[0], target(out, scans[0]))]
-    if _is(WRITERS, out) or out.is_file():
-        raise ValueError(f"{out}: expected the name of a folder for {len(scans)} scans, found that of a file")
-    names = [_stem(path) for path in scans]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"{out}: expected scans of different names, found two named {twice[0]}")
-    return [(path, target(out / f"{name}.ply", path)) for name, path in zip(names, scans, strict=True)]
+    one = inputs.single and not out.is_dir() and bool(out.suffix or out.is_file())
+    if not one and (_is(WRITERS, out) or out.is_file()):
+        raise ValueError(
+            f"{out}: expected the name of a folder for {inputs.count or 'several'} scans, found that of a file"
+        )
+    part, parts = shard
+    for number, item in enumerate(inputs.stream()):
+        if number % parts != part - 1:
+            continue
+        file = target(out if one else out / f"{item.name}.{ending}", item.path)
+        if skip and file.exists():
+            if skipped is not None:
+                skipped.append(file)
+            continue
+        yield Work(item, file, looked_at(number))
+
+
+def looked_at(number: int) -> bool:
+    """Whether the frame of scan `number` is looked at: of the first ones, and every so many."""
+    return number < FIRST or number % EVERY == 0
 
 
 def _is(kinds: Collection[str], path: Path) -> bool:
     return path.name.lower().endswith(tuple(kinds))
-
-
-def _stem(path: Path) -> str:
-    """The name without the ending that tells the kind of file: a.b.pcd.bin -> a.b."""
-    endings = [suffix for suffix in READERS if path.name.lower().endswith(suffix)]
-    return path.name[: -max(map(len, endings))] if endings else path.stem
 
 
 def target(out: Path, source: Path) -> Path:

@@ -1,0 +1,203 @@
+"""What `complete`, `upsample` and `project` share: options for many scans, running them, and what is said of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from lidarsynth.cli.arguments import Format, arg
+from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from lidarsynth.data.bag_writer import BagWriter
+    from lidarsynth.systems.scan_model import ScanModel
+    from lidarsynth.verbs.batch import Result, Task
+    from lidarsynth.verbs.inputs import Inputs
+
+PICTURES, NAMED = 10, 5  # scans that get a picture unasked; failures that are named one by one
+
+
+@dataclass(frozen=True)
+class Many:
+    """Of bags, frames, and many scans."""
+
+    topic: Annotated[str | None, arg(metavar="NAME", help="of a bag; its only one of points if not given.")] = None
+    keep_topics: Annotated[bool, arg(help="copy all other topics of a bag into the new bag.")] = False
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None
+    transform: Annotated[
+        str | None,
+        arg(
+            metavar="T", help="brings points into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers."
+        ),
+    ] = None
+    mount: Annotated[
+        float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0, where that is the ground.")
+    ] = None
+    strict: Annotated[bool, arg(help="refuse points that are not in the sensor's frame, instead of a warning.")] = False
+    format: Annotated[Format | None, arg(help="of files in a folder; default ply, of project npz.")] = None
+    workers: Annotated[int, arg(help="processes.")] = 1
+    skip_existing: Annotated[bool, arg(help="leave out scans whose file is there: goes on where it was.")] = False
+    shard: Annotated[str | None, arg(metavar="I/N", help="only every N-th scan, from the I-th: one of N machines.")] = (
+        None
+    )
+    all_pictures: Annotated[bool, arg(help=f"pictures also of more than {PICTURES} scans.")] = False
+
+
+def work_through(task: Task, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:
+    """Do the task with every scan, say what came of it, and return the results. Raises ValueError where all failed."""
+    from lidarsynth.data.bag_writer import FORMATS
+    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream, read_transform
+
+    if many.workers < 0:
+        raise ValueError(f"expected --workers of at least 0, found {many.workers}")
+    transform = read_transform(many.transform, many.mount)
+    inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform))
+    task = replace(task, transform=transform, strict=many.strict)
+    if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
+        task = replace(task, picture=False)
+    if out.suffix.lower() in FORMATS:
+        return _into_bag(task, inputs, paths, out, many)
+    if many.keep_topics:
+        raise ValueError(f"{out}: expected a .mcap or .bag to keep topics in, found another kind of output")
+    if inputs.single and not any(is_stream(path) for path in paths) and (out.suffix or out.is_file()):
+        return _one(task, inputs, out)
+    return _into_folder(task, inputs, out, many)
+
+
+def _model(task: Task) -> ScanModel | None:
+    """The model, its request checked before any work."""
+    if task.verb == "project":
+        return None
+    model = load_with_bar(task.model, task.device)
+    model.resolved(task.how)
+    return model
+
+
+def _one(task: Task, inputs: Inputs, out: Path) -> list[Result]:
+    from lidarsynth.verbs.batch import run
+    from lidarsynth.verbs.output_files import works
+
+    work = list(works(inputs, out, "ply"))
+    model = _model(task)
+    calls = 1 if model is None else model.calls(model.resolved(task.how))
+    with step_bar(work[0].item.path.name, calls) as on_step:
+        (result,) = run(task, work, model=model, on_step=on_step)
+    if result.error is not None:
+        raise ValueError(result.error if str(result.source) in result.error else f"{result.source}: {result.error}")
+    _tell(result, task.picture)
+    return [result]
+
+
+def _into_folder(task: Task, inputs: Inputs, out: Path, many: Many) -> list[Result]:
+    from lidarsynth.verbs.batch import run
+    from lidarsynth.verbs.batch_report import merge_shards, parse_shard, report_of, report_path, write_report
+    from lidarsynth.verbs.output_files import works
+
+    shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
+    ending = many.format or ("npz" if task.verb == "project" else "ply")
+    stream = works(inputs, out, ending, shard, many.skip_existing, skipped)
+    first = next(stream, None)
+    model = _model(task) if first is not None else None
+    count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
+    results = []
+    with scan_bar(task.verb, count) as on_scan:
+        for result in run(task, _again(first, stream), many.workers, model):
+            results.append(result)
+            on_scan()
+            _tell_of_many(result, task.picture, (count or PICTURES + 1) <= PICTURES, len(results))
+    seconds = time.perf_counter() - begun
+    settings = {"verb": task.verb, "model": task.model, "out": str(out), "format": ending, "workers": many.workers}
+    settings |= {"shard": many.shard} if many.shard else {}
+    out.mkdir(parents=True, exist_ok=True)
+    write_report(report_path(out, shard), report_of(results, len(skipped), seconds, settings))
+    merged = merge_shards(out, shard[1])
+    _summary(results, len(skipped), seconds, merged or report_path(out, shard))
+    return results
+
+
+def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:
+    if first is not None:
+        yield first
+        yield from rest
+
+
+def _into_bag(task: Task, inputs: Inputs, paths: list[Path], out: Path, many: Many) -> list[Result]:
+    from lidarsynth.data.bag_writer import write_bag
+    from lidarsynth.data.bags import is_bag
+    from lidarsynth.verbs.batch import Work, run
+    from lidarsynth.verbs.output_files import looked_at
+
+    if many.shard or many.skip_existing or len(paths) != 1 or not is_bag(paths[0]):
+        raise ValueError(f"{out}: expected one bag to make another of, without --shard and --skip-existing; a folder "
+                         "takes anything")  # fmt: skip
+    if out.exists() and out.samefile(paths[0]):
+        raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
+    model, begun, results = _model(task), time.perf_counter(), []
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with write_bag(out) as writer, scan_bar(task.verb, inputs.count) as on_scan:
+        topic = _copied(paths[0], writer, many)
+        stream = (Work(item, None, looked_at(number)) for number, item in enumerate(inputs.stream()))
+        for result in run(replace(task, picture=False), stream, many.workers, model):
+            if result.cloud is not None:
+                writer.write_cloud(topic, result.cloud)
+            results.append(replace(result, cloud=None))
+            on_scan()
+            _tell_of_many(result, False, False, len(results))
+    _summary(results, 0, time.perf_counter() - begun, out)
+    return results
+
+
+def _copied(path: Path, writer: BagWriter, many: Many) -> str:
+    """The topic of points; other topics are copied where that was asked for."""
+    from lidarsynth.data.bags import open_bag
+
+    with open_bag(path) as bag:
+        topic = bag.point_topic(many.topic)
+        others = frozenset(t.name for t in bag.topics if t.name != topic)
+        if many.keep_topics and others:
+            for message in bag.messages(others):
+                writer.copy(message)
+    return topic
+
+
+def _tell(result: Result, picture: bool) -> None:
+    if result.dropped:
+        kept = result.points[0]
+        say(f"{result.source}: {result.dropped} points without a return or not finite were dropped, {kept} stay")
+    if result.warning:
+        warn(result.warning)
+    if result.note:
+        say(f"{result.source}: {result.note}")
+    if result.target is not None:
+        say(f"wrote {result.target}" + (f" and {result.target.with_suffix('.png')}" if picture else ""))
+
+
+def _tell_of_many(result: Result, picture: bool, each: bool, number: int) -> None:
+    """A line per scan where they are few; of many only warnings and failures, and of those the first few."""
+    if result.error is not None:
+        named = result.error if str(result.source) in result.error else f"{result.source}: {result.error}"
+        warn(named)
+    elif each:
+        _tell(result, picture)
+    elif result.warning and number <= NAMED:
+        warn(result.warning)
+
+
+def _summary(results: list[Result], skipped: int, seconds: float, where: Path) -> None:
+    failed = [result for result in results if result.error is not None]
+    if failed and len(failed) == len(results):
+        first = failed[0]
+        named = str(first.error) if str(first.source) in str(first.error) else f"{first.source}: {first.error}"
+        raise ValueError(
+            named if len(failed) == 1 else f"expected scans, found all {len(failed)} broken; the first: {named}"
+        )
+    done = len(results) - len(failed)
+    text = f"{done} scans in {seconds:.1f} s" + (f", {done / seconds:.1f} a second" if done and seconds > 1 else "")
+    text += f"; {skipped} were there already" if skipped else ""
+    text += f"; {len(failed)} failed: {', '.join(result.name for result in failed[:NAMED])}" if failed else ""
+    text += ", ..." if len(failed) > NAMED else ""
+    say(f"{text}; see {where}")

@@ -1,0 +1,42 @@
+"""The verb `sensor`: a sensor learned from its own scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, arg
+from lidarsynth.cli.terminal import say
+
+
+def sensor(
+    scans: Annotated[
+        Positional[list[Path]],
+        arg(
+            metavar="SCAN...",
+            help="files, folders, globs, bags, captures; or the metadata .json of an Ouster.",
+        ),
+    ],
+    out: Annotated[Path, arg(help=".toml to write, which every --sensor takes.")] = Path("sensor.toml"),
+    topic: Annotated[str | None, arg(metavar="NAME", help="of a bag.")] = None,
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None,
+    seed: NoSeed = 0,
+    intensity: Intensity = "none",
+    picture: Picture = True,
+) -> None:
+    """Learn a sensor from its scans: beams, columns, limits, mount, tilt, and what its carrier blocks."""
+    from lidarsynth.pictures.learned import learned_figure
+    from lidarsynth.pictures.render import save_png
+    from lidarsynth.verbs.inputs import Reading, inputs_of
+    from lidarsynth.verbs.learned_sensor import from_metadata, learn, sensor_toml, summary, write_toml
+
+    if out.suffix != ".toml":
+        raise ValueError(f"{out}: expected a name that ends in .toml, found {out.name[-20:]!r}")
+    if len(scans) == 1 and (known := from_metadata(scans[0], out.stem)) is not None:
+        write_toml(out, sensor_toml(known, [f"from the metadata {scans[0].name}"]))
+        say(f"wrote {out}: {known.height} beams, {known.width} columns")
+        return
+    learned = learn(inputs_of(scans, Reading(intensity, topic, metadata)), out.stem)
+    write_toml(out, sensor_toml(learned.sensor, summary(learned).splitlines()))
+    say(summary(learned))
+    say(f"wrote {out}" + (f" and {save_png(out.with_suffix('.png'), learned_figure(learned))}" if picture else ""))
