@@ -1,4 +1,4 @@
-"""The verb `info`: what a model, a preset, a sensor or a scan file is."""
+"""The verb `info`: what a model, a preset, a sensor, a file or a folder is."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from lidarsynth.cli.terminal import say
 def info(
     what: Annotated[
         Positional[str],
-        arg(help="default, a preset, a release, a model folder, an official .pth, a sensor, or a scan file."),
+        arg(help="a model, preset, release or sensor; or a file or folder: scans, bag, capture, cache, statistics."),
     ] = "default",
     seed: NoSeed = 0,
 ) -> None:
-    """What a model, a preset, a sensor or a scan file is."""
+    """What a model, a preset, a sensor, a file or a folder is."""
     from lidarsynth.verbs.description import describe
 
     say(describe(what))

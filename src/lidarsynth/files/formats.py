@@ -99,8 +99,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given.
 
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
-    points. `.bin` and `.npy` hold x y z reflectance only, and a filled scan's `new` beside them in a `.new` file, a byte a
-    point; the others hold ring, time, label and every further field too. The file appears whole
+    points. `.bin` and `.npy` hold x y z reflectance only, and a filled scan's `new` beside them in a `.new` file, a
+    byte a point; the others hold ring, time, label and every further field too. The file appears whole
     or not at all: it is written beside its place under another name, then renamed. Raises FileError.
     """
     path = Path(path)

@@ -11,41 +11,24 @@ from lidarsynth.experiment.folder import RECORD
 from lidarsynth.experiment.presets import PRESETS
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
-from lidarsynth.files.formats import READERS, read_with_report
-from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.systems.table import build_network, system_of
+from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.weights.load import load_parts, shipped
 
 
 def describe(what: str) -> str:
     """Lines about a scan file, a sensor, a preset, or weights as `load` takes them. Raises ValueError for others."""
     path = Path(what)
-    if path.name.lower().endswith(tuple(READERS)) and not (path.is_dir() and (path / RECORD).exists()):
-        return describe_scan(path)
+    if lines := file_lines(path):
+        return _table(str(path), lines)
     if what in SENSORS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
     if what in PRESETS and what not in shipped() and not path.is_dir():
         experiment = PRESETS[what]()
         return describe_model(experiment, build_network(experiment), "preset, no weights")
     return describe_model(*load_parts(what), source=what)
-
-
-def describe_scan(path: Path) -> str:
-    """Points, range, reflectance, rings and sensor of a scan file."""
-    scan, dropped = read_with_report(path)
-    name, reason = recognise(scan)
-    depth, light = np.linalg.norm(scan.xyz, axis=1), scan.reflectance
-    lines = {
-        "points": f"{len(scan)}" + (f" ({dropped} without a return dropped)" if dropped else ""),
-        "range": f"{depth.min():.2f} to {depth.max():.2f} m, median {np.median(depth):.2f} m",
-        "reflectance": f"{light.min():.2f} to {light.max():.2f}, mean {light.mean():.3f}",
-        "fields": "x y z reflectance"
-        + "".join(f" {f}" for f in ("ring", "time", "label") if getattr(scan, f) is not None),
-        "sensor": f"{name} ({reason})" if name else reason,
-    }
-    return _table(str(path), lines)
 
 
 def describe_sensor(sensor: Sensor) -> str:
