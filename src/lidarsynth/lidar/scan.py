@@ -54,6 +54,26 @@ class Scan:
         return Scan(*chosen, {name: values[index] for name, values in self.extra.items()})  # type: ignore[arg-type]
 
 
+def scan_of(points: np.ndarray) -> Scan:
+    """The scan of an array (N, 3) x y z in metres, or (N, 4) with a reflectance of 0 to 1; other columns are left out.
+
+    Raises ValueError for another shape, or a reflectance in another scale.
+    """
+    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
+        raise ValueError(f"expected points of (N, 3) x y z or (N, 4) x y z reflectance, found {points.shape} of "
+                         f"{points.dtype}")  # fmt: skip
+    xyz = np.ascontiguousarray(points[:, :3], np.float32)
+    if not np.isfinite(xyz).all():
+        raise ValueError("expected finite points, found NaN or infinite ones; leave them out")
+    if points.shape[1] == 3:
+        return Scan(xyz)
+    light = points[:, 3].astype(np.float32)
+    if not (light.min(initial=0) >= 0 and light.max(initial=0) <= 1):
+        raise ValueError(f"expected a reflectance of 0 to 1 in the fourth column, found {light.min():g} to "
+                         f"{light.max():g}; divide it by its scale")  # fmt: skip
+    return Scan(xyz, light)
+
+
 @dataclass(frozen=True)
 class RangeImage:
     """One turn as an equirectangular image; row 0 is the highest beam, column 0 looks backwards (+180 degrees).

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
 from torch import nn
 
+from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.measured import rays_with_points, with_measured
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -50,6 +52,26 @@ class ScanModel(ABC):
         """The same model with its network on another device."""
         self.network.to(device)
         return self
+
+    def save(self, folder: str | Path, half: bool = False) -> Path:
+        """Write `model.safetensors` (float16 if `half`) and `experiment.json`; `load(folder)` gives the model back.
+
+        Raises OSError where the folder cannot be written.
+        """
+        return save(folder, self.experiment, self.network, half)
+
+    def __repr__(self) -> str:
+        """Three lines: what it is, its sensor, its network and where that is."""
+        parameters = list(self.network.parameters())
+        place = parameters[0].device if parameters else "cpu"
+        s, card = self.sensor, self.experiment.card
+        count = sum(p.numel() for p in parameters)
+        learned = f", learned from {card.data}" if card.data else ""
+        return (
+            f"{type(self).__name__} {self.experiment.name}{learned}\n"
+            f"  sensor   {s.name}: {s.height} beams x {s.width} columns, {s.min_range:g} to {s.max_range:g} m\n"
+            f"  network  {self.experiment.model.network}, {count:,} parameters, on {place}"
+        )
 
     def generate(
         self,
@@ -88,7 +110,7 @@ class ScanModel(ABC):
 
     def complete(
         self,
-        scan: Scan | RangeImage,
+        scan: Scan | RangeImage | np.ndarray,
         known: np.ndarray | None = None,
         method: str = "auto",
         steps: int | None = None,
@@ -99,7 +121,7 @@ class ScanModel(ABC):
     ) -> RangeImage:
         """Fill what was not measured; what was comes back exactly.
 
-        scan       points, or an image of this model's sensor
+        scan       points, as a scan or an array (N, 3) x y z or (N, 4) x y z reflectance; or an image of this sensor
         known      (H, W) bool: pixels to keep bit by bit, where an empty pixel means that nothing returned. None =
                    those measured, and of points also rays that only have some beyond the range limits
         method, steps, resamples, sampler  as `Filling` says; which words and defaults, the class of the model says
@@ -109,9 +131,19 @@ class ScanModel(ABC):
         """
         return self.filled(scan, Filling(method, steps, resamples, sampler, seed), known, on_step)
 
+    def complete_all(
+        self,
+        scans: Iterable[Scan | RangeImage | np.ndarray],
+        method: str = "auto",
+        steps: int | None = None,
+        seed: int = 0,
+    ) -> list[RangeImage]:
+        """`complete` of each of several scans, in order."""
+        return [self.complete(scan, method=method, steps=steps, seed=seed) for scan in scans]
+
     def upsample(
         self,
-        scan: Scan,
+        scan: Scan | np.ndarray,
         sensor_in: Sensor | str | None = None,
         method: str = "auto",
         steps: int | None = None,
@@ -130,9 +162,14 @@ class ScanModel(ABC):
         return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed), sensor_in, on_step)
 
     def filled(
-        self, scan: Scan | RangeImage, how: Filling, known: np.ndarray | None = None, on_step: OnStep = None
+        self,
+        scan: Scan | RangeImage | np.ndarray,
+        how: Filling,
+        known: np.ndarray | None = None,
+        on_step: OnStep = None,
     ) -> RangeImage:
         """`complete` of a record."""
+        scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
         if isinstance(scan, Scan) and (model := self.suited_to(scan)) is not self:
             return model.filled(scan, how, known, on_step)
         how, image = self.resolved(how), self.image_of(scan)
@@ -145,9 +182,10 @@ class ScanModel(ABC):
         return replace(filled, completed=with_measured(scan, image.mask, filled, projection))
 
     def upsampled(
-        self, scan: Scan, how: Filling, sensor_in: Sensor | str | None = None, on_step: OnStep = None
+        self, scan: Scan | np.ndarray, how: Filling, sensor_in: Sensor | str | None = None, on_step: OnStep = None
     ) -> RangeImage:
         """`upsample` of a record."""
+        scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
         how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
         sparse, known = sparse_image(scan, sensor_in, self.sensor)
         loose = replace(scan, ring=None)  # its rings are not the model's

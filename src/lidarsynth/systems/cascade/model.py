@@ -37,7 +37,7 @@ STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CascadeModel(ScanModel):
     """A trained cascade with the sensor of its images, which `into` changes at no cost.
 

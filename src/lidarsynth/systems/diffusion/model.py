@@ -28,7 +28,7 @@ SAMPLERS = (*STEPS, "langevin")
 REPAINT_STEPS, REPAINT_RESAMPLES = 32, 10  # R2DM, section IV-C
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LidarModel(ScanModel):
     """A trained denoiser with its sensor.
 

@@ -27,7 +27,7 @@ METHODS = ("auto", "inversion")
 STEPS = 500  # of an inversion, as published
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GanModel(ScanModel):
     """A trained GAN with its sensor: Vanilla GAN, DUSty v1 or DUSty v2. It knows range only: reflectance is 0.
 

@@ -29,7 +29,7 @@ def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImag
     return RangeImage(distance, reflectance.clip(0, 1), distance > 0, image.sensor)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class InterpolationModel(ScanModel):
     """An interpolation with the sensor of its images.
 

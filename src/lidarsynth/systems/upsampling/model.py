@@ -33,7 +33,7 @@ HARDLY = 0.02  # share of a row's pixels; of a beam with fewer known ones nothin
 PIECE = 16_384  # queries at once: what bounds the memory of ILN
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class UpsamplingModel(ScanModel):
     """A trained network with the sensor of its images.
 
