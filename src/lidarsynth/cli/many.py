@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from lidarsynth.cli.arguments import Format, arg
 from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
@@ -87,7 +87,7 @@ def _one(task: Task, inputs: Inputs, out: Path) -> list[Result]:
     with step_bar(work[0].item.path.name, calls) as on_step:
         (result,) = run(task, work, model=model, on_step=on_step)
     if result.error is not None:
-        raise ValueError(result.error if str(result.source) in result.error else f"{result.source}: {result.error}")
+        raise ValueError(_named(result))
     _tell(result, task.picture)
     return [result]
 
@@ -112,6 +112,8 @@ def _into_folder(task: Task, inputs: Inputs, out: Path, many: Many) -> list[Resu
     seconds = time.perf_counter() - begun
     settings = {"verb": task.verb, "model": task.model, "out": str(out), "format": ending, "workers": many.workers}
     settings |= {"shard": many.shard} if many.shard else {}
+    if all(result.error is not None for result in results) and results:
+        _refuse_all(results)
     out.mkdir(parents=True, exist_ok=True)
     write_report(report_path(out, shard), report_of(results, len(skipped), seconds, settings))
     merged = merge_shards(out, shard[1])
@@ -179,8 +181,8 @@ def _tell(result: Result, picture: bool) -> None:
 def _tell_of_many(result: Result, picture: bool, each: bool, number: int) -> None:
     """A line per scan where they are few; of many only warnings and failures, and of those the first few."""
     if result.error is not None:
-        named = result.error if str(result.source) in result.error else f"{result.source}: {result.error}"
-        warn(named)
+        if number > 1:  # the first is kept until it is known whether all fail
+            warn(_named(result))
     elif each:
         _tell(result, picture)
     elif result.warning and number <= NAMED:
@@ -189,15 +191,26 @@ def _tell_of_many(result: Result, picture: bool, each: bool, number: int) -> Non
 
 def _summary(results: list[Result], skipped: int, seconds: float, where: Path) -> None:
     failed = [result for result in results if result.error is not None]
-    if failed and len(failed) == len(results):
-        first = failed[0]
-        named = str(first.error) if str(first.source) in str(first.error) else f"{first.source}: {first.error}"
-        raise ValueError(
-            named if len(failed) == 1 else f"expected scans, found all {len(failed)} broken; the first: {named}"
-        )
+    if results and len(failed) == len(results):
+        _refuse_all(results)
+    if failed and failed[0] is results[0]:
+        warn(_named(failed[0]))
     done = len(results) - len(failed)
     text = f"{done} scans in {seconds:.1f} s" + (f", {done / seconds:.1f} a second" if done and seconds > 1 else "")
     text += f"; {skipped} were there already" if skipped else ""
     text += f"; {len(failed)} failed: {', '.join(result.name for result in failed[:NAMED])}" if failed else ""
     text += ", ..." if len(failed) > NAMED else ""
     say(f"{text}; see {where}")
+
+
+def _named(result: Result) -> str:
+    """A failure with the file that it is of."""
+    text = str(result.error)
+    return text if str(result.source) in text else f"{result.source}: {text}"
+
+
+def _refuse_all(failed: list[Result]) -> NoReturn:
+    first = _named(failed[0])
+    raise ValueError(
+        first if len(failed) == 1 else f"expected scans, found all {len(failed)} broken; the first: {first}"
+    )

@@ -120,7 +120,7 @@ def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Re
     try:
         loaded = work.item.read()
         warning = _frame_warning(loaded, task, work)
-        done = _made(task, model, work.item.path, loaded, on_step)
+        done, note = _made(task, model, work.item.path, loaded.scan, on_step)
         cloud = None
         if work.target is None:
             points = _points(done, loaded, task.transform)
@@ -132,8 +132,7 @@ def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Re
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
     whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
-    points, note = (len(loaded.scan), count), _note(task, done, loaded.scan)
-    return Result(*whose, None, warning, loaded.dropped, points, note, errors, cloud)
+    return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud)
 
 
 def _frame_warning(loaded: Loaded, task: Task, work: Work) -> str | None:
@@ -146,23 +145,21 @@ def _frame_warning(loaded: Loaded, task: Task, work: Work) -> str | None:
     return None if warning is None else f"{work.item.path}: {warning}"
 
 
-def _made(task: Task, model: ScanModel | None, path: Path, loaded: Loaded, on_step: OnStep) -> Filled | RangeImage:
-    scan = loaded.scan
+def _made(
+    task: Task, model: ScanModel | None, path: Path, scan: Scan, on_step: OnStep
+) -> tuple[Filled | RangeImage, str]:
+    """The result, and what was done in words."""
     if task.verb == "project":
         image = project(scan, named_sensor(scan, path, "--sensor", task.sensor), task.projection, task.width)
         if not image.mask.any():
             raise ValueError(f"{path}: expected points within {image.sensor.name}'s view, found none of {len(scan)}")
-        return image
+        return image, f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
     assert model is not None
     if task.verb == "complete":
-        return complete_scan(model, scan, task.corrupt, task.how, on_step)
-    return upsample_scan(model, scan, named_sensor(scan, path, "--from", task.sensor), task.how, on_step)
-
-
-def _note(task: Task, done: Filled | RangeImage, scan: Scan) -> str:
-    if isinstance(done, RangeImage):
-        return f"{len(scan)} points, {done.sensor.name}, {done.mask.mean():.1%} of {done.shape} pixels filled"
-    return f"{len(scan)} points became {len(done.points)}" if task.verb == "upsample" else ""
+        return complete_scan(model, scan, task.corrupt, task.how, on_step), ""
+    sensor = named_sensor(scan, path, "--from", task.sensor)
+    filled = upsample_scan(model, scan, sensor, task.how, on_step)
+    return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
 
 
 def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | None) -> Scan:

@@ -20,7 +20,7 @@ from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.verbs.inputs import capture_turns
+from lidarsynth.verbs.inputs import capture_turns, has_scans
 
 Lines = dict[str, str]
 LOOKED_AT = 400  # packets of a capture that are counted
@@ -35,6 +35,8 @@ def file_lines(path: Path) -> Lines | None:
     if model or not path.exists() or path.suffix.lower() in MODELS:
         return None
     if path.is_dir():
+        if not (is_bag(path) or (path / INDEX).exists() or has_scans(path)):
+            return None
         return _bag(path) if is_bag(path) else _cache(path) if (path / INDEX).exists() else _folder(path)
     if path.name.lower().endswith(tuple(READERS)):
         return scan_lines(*read_with_report(path))

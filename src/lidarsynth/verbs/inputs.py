@@ -167,7 +167,7 @@ def _expanded(path: Path) -> list[Path]:
         return [p for p in found if _is_scan(p) or is_stream(p)]
     if path.is_dir() and not is_bag(path) and not _is_scan(path):
         bags = sorted(p for p in path.iterdir() if is_stream(p))
-        return bags if bags and not _any_scan(path) else scan_files(path)
+        return bags if bags and not has_scans(path) else scan_files(path)
     return [path]
 
 
@@ -175,7 +175,8 @@ def _is_scan(path: Path) -> bool:
     return path.name.lower().endswith(tuple(READERS))
 
 
-def _any_scan(folder: Path) -> bool:
+def has_scans(folder: Path) -> bool:
+    """Whether a folder holds a scan file, at any depth."""
     try:
         return bool(scan_files(folder))
     except ValueError:

@@ -24,7 +24,8 @@ def works(
     skip     leave out scans whose file is there already; they are added to `skipped`
     Raises ValueError where `out` cannot be written, is a scan's own file, or names one file for several scans.
     """
-    one = inputs.single and not out.is_dir() and bool(out.suffix or out.is_file())
+    named = bool(out.suffix or out.is_file())
+    one = inputs.single and named and (_is(WRITERS, out) or not out.is_dir())
     if not one and (_is(WRITERS, out) or out.is_file()):
         raise ValueError(
             f"{out}: expected the name of a folder for {inputs.count or 'several'} scans, found that of a file"
