@@ -85,13 +85,16 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
     taken. Raises FileError for a model that is not in MODELS.
     """
     parts: list[Fields] = []
-    last, begun, swept = TURN, 0, 0
+    last: int | None = None
+    begun = swept = 0
     for packet in packets:
         if not is_velodyne(packet.payload):
             continue
         points, azimuth = decode(packet.payload, packet.time)
         for first, end in _runs(azimuth):
-            if int(azimuth[first]) < last - TURN // 2:  # passed 0
+            if last is None:
+                begun = int(azimuth[first])
+            elif int(azimuth[first]) < last - TURN // 2:  # passed 0
                 if swept > TURN // 2:
                     yield _joined(parts)
                 parts, begun = [], int(azimuth[first])

@@ -1,0 +1,156 @@
+"""Bags written by their libraries' own writers, in other layouts than ours, read as they are and come back whole."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_scan import full_scan
+
+from lidarsynth.data.bag_writer import write_bag
+from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag, typestore
+from lidarsynth.files.fields import FileError, scan_from_fields
+from lidarsynth.verbs.batch import Task, Work, run
+from lidarsynth.verbs.inputs import inputs_of
+
+pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
+STRING = "std_msgs/msg/String"
+
+
+def table(seed: int, big: bool) -> np.ndarray:
+    scan, order = full_scan(), ">" if big else "<"
+    kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("t", "u4"), ("tag", "u1")]
+    dtype = np.dtype({"names": [n for n, _ in kinds], "formats": [order + k for _, k in kinds],
+                      "offsets": [0, 4, 8, 16, 20, 24, 28], "itemsize": 48})  # fmt: skip
+    points = np.zeros(len(scan), dtype)
+    for i, axis in enumerate("xyz"):
+        points[axis] = scan.xyz[:, i] + seed
+    points["intensity"] = scan.reflectance * 255
+    points["ring"] = np.arange(len(scan)) % 16
+    points["t"] = np.arange(len(scan)) * 1000
+    points["tag"] = 7
+    return points
+
+
+def message(store, points: np.ndarray, number: int, big: bool, first: bool):
+    t = store.types
+    stamp = t["builtin_interfaces/msg/Time"](100 + number, 7)
+    header = t["std_msgs/msg/Header"](*([number] if first else []), stamp, "lidar")
+    number_of = {"f4": 7, "u2": 4, "u4": 6, "u1": 2}
+    places = points.dtype.fields
+    fields = [
+        t["sensor_msgs/msg/PointField"](n, places[n][1], number_of[places[n][0].str[1:]], 1) for n in points.dtype.names
+    ]
+    data = np.frombuffer(points.tobytes(), np.uint8)
+    return t[POINTS](header, 1, len(points), fields, big, 48, len(data), data, True)
+
+
+def ros1(folder: Path) -> Path:
+    from rosbags.rosbag1 import Writer
+
+    store = typestore("ros1")
+    with Writer(folder / "drive.bag") as writer:
+        points = writer.add_connection("/points", POINTS, typestore=store)
+        note = writer.add_connection("/note", STRING, typestore=store)
+        for i in range(3):
+            data = store.serialize_ros1(message(store, table(i, True), i, True, True), POINTS)
+            writer.write(points, (100 + i) * 10**9, data)
+            writer.write(note, (100 + i) * 10**9 + 1, store.serialize_ros1(store.types[STRING](f"n{i}"), STRING))
+    return folder / "drive.bag"
+
+
+def ros2(folder: Path, plugin: str) -> Path:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store = typestore("cdr")
+    with Writer(folder / plugin, version=9, storage_plugin=StoragePlugin[plugin]) as writer:
+        points = writer.add_connection("/points", POINTS, typestore=store)
+        note = writer.add_connection("/note", STRING, typestore=store)
+        for i in range(3):
+            data = store.serialize_cdr(message(store, table(i, False), i, False, False), POINTS)
+            writer.write(points, (100 + i) * 10**9, data)
+            writer.write(note, (100 + i) * 10**9 + 1, store.serialize_cdr(store.types[STRING](f"n{i}"), STRING))
+    return folder / plugin
+
+
+KINDS: dict[str, Callable[[Path], Path]] = {
+    "ros1": ros1,
+    "sqlite3": lambda folder: ros2(folder, "SQLITE3"),
+    "db3 alone": lambda folder: next(ros2(folder, "SQLITE3").glob("*.db3")),
+    "mcap folder": lambda folder: ros2(folder, "MCAP"),
+    "bare mcap": lambda folder: next(ros2(folder, "MCAP").glob("*.mcap")),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_bag_streams_its_clouds(kind: str, tmp_path: Path):
+    path = KINDS[kind](tmp_path)
+    assert is_bag(path)
+    with open_bag(path) as bag:
+        assert {t.name: (t.kind, t.count) for t in bag.topics} == {"/points": (POINTS, 3), "/note": (STRING, 3)}
+        assert bag.seconds == pytest.approx(2, abs=1e-3)
+        clouds = list(bag.clouds(bag.point_topic()))
+    for i, cloud in enumerate(clouds):
+        assert isinstance(cloud, Cloud)
+        assert (cloud.stamp, cloud.frame_id, cloud.time) == ((100 + i) * 10**9 + 7, "lidar", (100 + i) * 10**9)
+        for name, column in cloud.fields.items():
+            np.testing.assert_array_equal(column, table(i, False)[name])
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_what_is_written_comes_back_and_other_topics_too(suffix: str, tmp_path: Path):
+    with open_bag(ros1(tmp_path)) as bag, write_bag(tmp_path / f"new{suffix}") as writer:
+        for cloud in bag.clouds("/points"):
+            assert isinstance(cloud, Cloud)
+            writer.write_cloud("/dense", cloud)
+        for other in bag.messages(frozenset(["/note"])):
+            writer.copy(other)
+    with open_bag(tmp_path / f"new{suffix}") as bag, open_bag(tmp_path / "drive.bag") as old:
+        assert {t.name: t.count for t in bag.topics} == {"/dense": 3, "/note": 3}
+        for new, cloud in zip(bag.clouds("/dense"), old.clouds("/points"), strict=True):
+            assert isinstance(new, Cloud) and isinstance(cloud, Cloud)
+            assert (new.stamp, new.frame_id, new.time) == (cloud.stamp, cloud.frame_id, cloud.time)
+            for name, column in cloud.fields.items():
+                np.testing.assert_array_equal(new.fields[name], column)
+        assert [m.data for m in bag.messages(frozenset(["/note"]))] == [
+            m.data for m in old.messages(frozenset(["/note"]))
+        ]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["drive.bag", f"new{suffix}"])
+
+
+def test_a_topic_is_chosen_or_all_are_listed(tmp_path: Path):
+    with open_bag(ros1(tmp_path)) as bag:
+        assert bag.point_topic() == bag.point_topic("/points") == "/points"
+        with pytest.raises(ValueError, match="named /note, found /points"):
+            bag.point_topic("/note")
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3"])
+def test_what_is_no_bag_is_one_line(name: str, tmp_path: Path):
+    (tmp_path / name).write_bytes(b"not a bag at all" * 10)
+    with pytest.raises(FileError, match=f"{name}: expected a bag"), open_bag(tmp_path / name):
+        pass
+    whole = ros1(tmp_path).read_bytes()
+    (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileError, match=r"cut.bag: expected a bag"), open_bag(tmp_path / "cut.bag") as bag:
+        list(bag.clouds("/points"))
+
+
+def test_a_bag_completed_keeps_every_measured_bit(tmp_path: Path):
+    """Through the verb's own work: fields of the message as they were, new points marked, in the message's scales."""
+    path = ros1(tmp_path)
+    works = (Work(item, None, False) for item in inputs_of([path]).stream())
+    results = list(run(Task("complete", model="bilinear", picture=False), works))
+    assert [r.error for r in results] == [None] * 3
+    with open_bag(path) as bag:
+        for result, cloud in zip(results, bag.clouds("/points"), strict=True):
+            assert result.cloud is not None and isinstance(cloud, Cloud)
+            old = result.cloud.fields["new"] == 0
+            kept = [result.cloud.fields[n][old] for n in cloud.fields]
+            assert result.cloud.stamp == cloud.stamp and result.cloud.fields.keys() - cloud.fields.keys() == {"new"}
+            order, given = np.lexsort(kept), list(cloud.fields.values())
+            finite = scan_from_fields(cloud.fields)[1] == 0
+            if finite:
+                for mine, theirs in zip(kept, given, strict=True):
+                    np.testing.assert_array_equal(mine[order], theirs[np.lexsort(given)])

@@ -1,0 +1,165 @@
+"""Many scans: which are read, what is written, skipped, failed and told; in parts and in processes."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_frame import street
+from test_recognise import turn
+
+from lidarsynth.cli.main import main
+from lidarsynth.data.windows import in_window
+from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.frame import parse_transform, transformed
+from lidarsynth.lidar.scan import Scan, scan_of
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.verbs.batch_report import merge_shards, parse_shard
+from lidarsynth.verbs.inputs import inputs_of
+from lidarsynth.weights.load import load
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    """Five scans in two drives whose names repeat, one of them broken."""
+    scan = turn(SENSORS["vlp-16"])
+    for drive, count in (("d1", 3), ("d2", 2)):
+        (tmp_path / "in" / drive).mkdir(parents=True)
+        for i in range(count):
+            write(tmp_path / "in" / drive / f"{i:03d}.pcd", scan)
+    (tmp_path / "in" / "d1" / "001.pcd").write_bytes(b"no points")
+    (tmp_path / "in" / "times.txt").write_text("0.1\n0.2\n")
+    return tmp_path / "in"
+
+
+def told(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text())
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+WORDS = ("--no-picture", "--sensor", "vlp-16")
+
+
+def test_one_broken_file_is_named_and_counted(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    main(["project", str(scans), "--out", str(tmp_path / "o"), *WORDS])
+    said = capsys.readouterr()
+    assert "4 scans in" in said.out and "1 failed: d1/001" in said.out
+    assert "d1/001.pcd: expected a PCD header" in said.err and said.err.count("expected") == 1
+    assert names(tmp_path / "o") == ["d1/000.npz", "d1/002.npz", "d2/000.npz", "d2/001.npz", "report.json"]
+    report = told(tmp_path / "o")
+    assert (report["done"], report["failed"], report["skipped"]) == (4, 1, 0)
+    assert [row["name"] for row in report["scans"] if "error" in row] == ["d1/001"]
+    assert all(row["seconds"] > 0 for row in report["scans"])
+
+
+def test_what_is_there_is_skipped(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = ["--out", str(tmp_path / "o"), *WORDS]
+    main(["project", str(scans / "d2"), *out])
+    first = {name: (tmp_path / "o" / name).stat().st_mtime_ns for name in ("000.npz", "001.npz")}
+    (tmp_path / "o" / "001.npz").unlink()
+    main(["project", str(scans / "d2"), *out, "--skip-existing"])
+    assert "1 scans in" in capsys.readouterr().out and told(tmp_path / "o")["skipped"] == 1
+    assert (tmp_path / "o" / "000.npz").stat().st_mtime_ns == first["000.npz"]
+    main(["project", str(scans / "d2"), *out, "--skip-existing"])
+    assert told(tmp_path / "o")["skipped"] == 2
+
+
+def test_shards_are_the_whole(scans: Path, tmp_path: Path):
+    for part in (2, 1):
+        main(["project", str(scans), "--out", str(tmp_path / "parts"), *WORDS, "--shard", f"{part}/2"])
+        assert (tmp_path / "parts" / "report.json").exists() == (part == 1)
+    main(["project", str(scans), "--out", str(tmp_path / "whole"), *WORDS])
+    arrays = [name for name in names(tmp_path / "whole") if name.endswith(".npz")]
+    assert [name for name in names(tmp_path / "parts") if name.endswith(".npz")] == arrays
+    for name in arrays:
+        one, other = (np.load(tmp_path / folder / name) for folder in ("parts", "whole"))
+        np.testing.assert_array_equal(one["range"], other["range"])
+    merged, whole = told(tmp_path / "parts"), told(tmp_path / "whole")
+    assert merged["settings"]["shards"] == 2
+    assert [(r["name"], r.get("points")) for r in merged["scans"]] == [
+        (r["name"], r.get("points")) for r in whole["scans"]
+    ]
+    assert merge_shards(tmp_path / "whole", 2) is None
+    assert parse_shard(None) == (1, 1)
+    for wrong in ("3", "0/2", "3/2", "a/b"):
+        with pytest.raises(ValueError, match="I/N"):
+            parse_shard(wrong)
+
+
+def test_globs_folders_and_files_are_alike(scans: Path):
+    count = [inputs_of(paths).count for paths in ([scans], [scans / "d1", scans / "d2"], [scans / "*" / "*.pcd"])]
+    assert count == [5, 5, 5]
+    items = list(inputs_of([scans]).stream())
+    assert [item.name for item in items] == ["d1/000", "d1/001", "d1/002", "d2/000", "d2/001"]
+    assert inputs_of([scans / "d1" / "000.pcd"]).single and not inputs_of([scans / "d2"]).single
+    with pytest.raises(ValueError, match="found none"):
+        inputs_of([scans / "*.bin"])
+    with pytest.raises(ValueError, match="two named"):
+        inputs_of([scans / "d1" / "000.pcd", scans / "d1" / "000.pcd"])
+
+
+def test_all_broken_is_a_refusal_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "in").mkdir()
+    for name in ("a.pcd", "b.pcd"):
+        (tmp_path / "in" / name).write_bytes(b"no points")
+    with pytest.raises(SystemExit, match="2"):
+        main(["project", str(tmp_path / "in"), "--out", str(tmp_path / "o"), *WORDS])
+    assert "found all 2 broken; the first: " in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_points_of_another_frame_come_back_where_they_were(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """With --mount the scan is filled in the sensor's frame; the file keeps its own, measured points bit by bit."""
+    scan = street("hdl-64e-kitti")
+    raised = Scan(transformed(scan.xyz, parse_transform("0:0:1.73:0:0:0")), scan.reflectance, ring=scan.ring,
+                  extra={"ambient": np.arange(len(scan))})  # fmt: skip
+    write(tmp_path / "raised.ply", raised)
+    words = ["complete", str(tmp_path / "raised.ply"), "--model", "bilinear", "--no-picture", "--out"]
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, str(tmp_path / "a.ply"), "--strict"])
+    assert "m above the origin" in (error := capsys.readouterr().err) and "--transform 0:0:-1." in error
+    main([*words, str(tmp_path / "a.ply")])
+    assert "above the origin" in capsys.readouterr().err
+    main([*words, str(tmp_path / "b.ply"), "--mount", "1.73", "--strict"])
+    assert capsys.readouterr().err == ""
+    filled = read(tmp_path / "b.ply")
+    old = filled.extra["new"] == 0
+    order = np.argsort(filled.extra["ambient"][old])
+    np.testing.assert_array_equal(filled.xyz[old][order], raised.xyz)
+    assert (~old).sum() > 500 and np.all(filled.extra["ambient"][~old] == 0)
+    ground = filled.xyz[~old][:, 2]
+    assert abs(np.median(ground[ground < 1])) < 0.3, "new points lie on the file's ground, not 1.73 m below it"
+
+
+def test_processes_answer_in_order():
+    make = partial(partial, pow, 2)
+    assert list(in_window(make, iter(range(20)), 2)) == [2**i for i in range(20)]
+    assert list(in_window(make, iter(range(5)), 0)) == [2**i for i in range(5)]
+
+
+def test_arrays_are_scans():
+    scan = turn(SENSORS["hdl-64e-kitti"])
+    model = load("bilinear")
+    table = np.column_stack([scan.xyz, np.full(len(scan), 0.5)])
+    image = model.complete(table.astype(np.float32))
+    expected = model.complete(Scan(scan.xyz, np.full(len(scan), 0.5, np.float32)))
+    np.testing.assert_array_equal(image.range, expected.range)
+    assert len(model.complete_all([table, scan])) == 2
+    assert Scan(scan.xyz).reflectance.sum() == 0 and len(scan_of(scan.xyz).reflectance) == len(scan)
+    for wrong, words in ((table * 300, "0 to 1 in the fourth"), (table[0], "(N, 3)"), (table * np.nan, "finite")):
+        with pytest.raises(ValueError, match=words.replace("(", r"\(").replace(")", r"\)")):
+            model.complete(wrong)
+
+
+def test_a_model_says_what_it_is_and_saves_itself(tmp_path: Path):
+    model = load("default")
+    assert isinstance(model, ScanModel)
+    lines = repr(model).splitlines()
+    assert len(lines) == 3 and "64 beams x 1024" in lines[1] and "parameters, on cpu" in lines[2]
+    again = load(model.save(tmp_path / "m"))
+    assert repr(again).splitlines()[1:] == lines[1:]

@@ -1,0 +1,168 @@
+"""Captures: packets built here by the published layouts decode to the points they were built from; one real capture."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarsynth.data import ouster, velodyne
+from lidarsynth.data.capture import Datagram, datagrams
+from lidarsynth.files.fields import FileError
+from lidarsynth.lidar.recognition import recognise
+from lidarsynth.verbs.inputs import Reading, inputs_of
+
+OUSTER_SDK = (3203.2061, 20918.6877, 7149.6797)  # metres, sums of x, y, z
+
+
+def udp(payload: bytes, port: int, offset: int = 0, more: bool = False, total: int = 0) -> bytes:
+    """An Ethernet frame with an IPv4 packet, whole or a fragment of a UDP packet."""
+    head = b"" if offset else struct.pack(">HHHH", 9, port, 8 + (total or len(payload)), 0)
+    body = head + payload
+    flags = (0x2000 if more else 0) | (offset // 8)
+    ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(body), 77, flags, 64, 17, 0, b"\x0a\0\0\1", b"\x0a\0\0\2")
+    return b"\0" * 12 + b"\x08\0" + ip + body
+
+
+def pcap(frames: list[bytes], order: str = "<", nano: bool = False) -> bytes:
+    magic = 0xA1B23C4D if nano else 0xA1B2C3D4
+    parts = [struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, 1)]
+    parts += [struct.pack(order + "IIII", 5, 6, len(f), len(f)) + f for f in frames]
+    return b"".join(parts)
+
+
+def pcapng(frames: list[bytes]) -> bytes:
+    def block(kind: int, body: bytes) -> bytes:
+        body += b"\0" * (-len(body) % 4)
+        return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
+
+    parts = [block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)), block(1, struct.pack("<HHI", 1, 0, 0))]
+    parts += [block(6, struct.pack("<IIIII", 0, 0, 5_000_006, len(f), len(f)) + f) for f in frames]
+    return b"".join(parts)
+
+
+@pytest.mark.parametrize("kind", ["<", ">", "nano", "next generation"])
+def test_payloads_of_a_capture(kind: str, tmp_path: Path):
+    frames = [udp(b"first", 2368), b"\0" * 30, udp(b"x" * 16, 7, more=True, total=24), udp(b"y" * 8, 7, offset=24)]
+    path = tmp_path / "c.pcap"
+    path.write_bytes(pcapng(frames) if kind[0] == "n" and kind != "nano" else
+                     pcap(frames, "<" if kind == "nano" else kind, kind == "nano"))  # fmt: skip
+    found = list(datagrams(path))
+    assert [(d.port, d.payload) for d in found] == [(2368, b"first"), (7, b"x" * 16 + b"y" * 8)]
+    assert found[0].time == (5_000_000_006 if kind == "nano" else 5_000_006_000)
+    path.write_bytes(path.read_bytes()[:-9])
+    assert len(list(datagrams(path))) == 1, "a record cut short ends the capture"
+
+
+def test_what_is_no_capture_is_one_line(tmp_path: Path):
+    (tmp_path / "c.pcap").write_bytes(b"hello, hello")
+    with pytest.raises(FileError, match=r"c.pcap: expected a capture"):
+        list(datagrams(tmp_path / "c.pcap"))
+
+
+def velodyne_packet(product: int, azimuth: int, step: int, distance: int, dual: bool = False) -> bytes:
+    """A packet whose returns lie at one distance; `azimuth` of block 0 and `step` between blocks in 0.01 degrees."""
+    blocks = []
+    for block in range(12):
+        turn = (azimuth + step * (block // 2 if dual else block)) % 36000
+        returns = b"".join(struct.pack("<HB", distance, laser) for laser in range(32))
+        blocks.append(struct.pack("<HH", 0xEEFF, turn) + returns)
+    return b"".join(blocks) + struct.pack("<IBB", 0, 0x39 if dual else 0x37, product)
+
+
+@pytest.mark.parametrize("product", velodyne.MODELS)
+def test_velodyne_returns_lie_on_their_beams(product: int):
+    model = velodyne.MODELS[product]
+    points, _ = velodyne.decode(velodyne_packet(product, 9000, 40, 5000))
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(float)
+    xyz[:, 2] -= np.tile(np.resize(model.heights or (0.0,), 32), 12)
+    np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), 5000 * model.unit, rtol=1e-6)
+    elevation = np.degrees(np.arcsin(xyz[:, 2] / (5000 * model.unit)))
+    np.testing.assert_allclose(elevation[:32], np.resize(model.elevations, 32), atol=1e-3)
+    order = np.argsort(-np.array(model.elevations))
+    np.testing.assert_array_equal(points["ring"][: model.lasers][order], np.arange(model.lasers))
+    # Azimuth 90 degrees is to the right, so that y is negative; it grows clockwise within the packet.
+    azimuth = np.degrees(np.arctan2(-xyz[:, 1], xyz[:, 0]))
+    spread = max(model.azimuths, default=0) - min(model.azimuths, default=0)
+    assert np.all((azimuth > 89.9 - spread) & (azimuth < 95 + spread))
+
+
+def test_velodyne_firing_times():
+    """VLP-16: 55.296 (2 b + floor(j/16)) + 2.304 (j mod 16) us; HDL-32E: 46.080 b + 1.152 j us."""
+    block, place = np.meshgrid(np.arange(12), np.arange(32), indexing="ij")
+    puck = velodyne.firing_time(velodyne.MODELS[0x22], block, place, False)
+    np.testing.assert_allclose(puck, 55.296 * (2 * block + place // 16) + 2.304 * (place % 16))
+    hdl = velodyne.firing_time(velodyne.MODELS[0x21], block, place, False)
+    np.testing.assert_allclose(hdl, 46.080 * block + 1.152 * place)
+    dual = velodyne.firing_time(velodyne.MODELS[0x22], block, place, True)
+    np.testing.assert_allclose(dual, 55.296 * (2 * (block // 2) + place // 16) + 2.304 * (place % 16))
+
+
+def test_velodyne_turns_are_cut_at_azimuth_0():
+    step = 40
+    packets = [Datagram(0, 2368, velodyne_packet(0x22, 30000 + i * 12 * step, step, 5000)) for i in range(190)]
+    found = list(velodyne.turns(packets))  # 30000 to 36000, then a little over two turns
+    assert len(found) == 2
+    for turn in found:
+        assert len(turn["x"]) == 36000 // step * 32
+        assert np.all(np.diff(np.unwrap(np.arctan2(-turn["y"][::32], turn["x"][::32]))) > 0)
+    with pytest.raises(FileError, match="product byte 0xa1"):
+        velodyne.decode(velodyne_packet(0xA1, 0, 40, 5000))
+    both = velodyne.decode(velodyne_packet(0x22, 0, 40, 5000, dual=True))[0]
+    assert len(both["x"]) == 6 * 32, "of two returns the last one"
+
+
+@pytest.mark.parametrize("name", ouster.PROFILES)
+def test_ouster_packets_hold_what_was_put_in(name: str):
+    rng, height, columns = np.random.default_rng(0), 16, 64
+    altitudes, azimuths = np.linspace(15, -15, height), np.tile([3.0, 1, -1, -3], 4)
+    matrix = np.diag([-1.0, -1, 1, 1])
+    metadata = ouster.Metadata("o", tuple(altitudes), tuple(azimuths), columns, 16, 0.015, matrix, name)
+    profile = ouster.PROFILES[name]
+    kind, mask, unit = profile.range
+    distance = (rng.integers(200, min(mask, 20000), (height, columns)) * (rng.random((height, columns)) < 0.9)).astype(
+        int
+    )
+    light = rng.integers(0, 255, (height, columns))
+    packets = []
+    for start in range(0, columns, 16):
+        payload = bytearray(profile.header)
+        payload[2:4] = struct.pack("<H", 3) if profile.header else b""
+        for column in range(start, start + 16):
+            head = struct.pack("<QHH", column * 1000, column, 3 if not profile.header else 1)
+            payload += head.ljust(profile.column[0], b"\0")
+            for row in range(height):
+                pixel = bytearray(profile.pixel)
+                size = np.dtype(kind).itemsize
+                pixel[:size] = int(distance[row, column]).to_bytes(size, "little")
+                pixel[profile.fields["reflectivity"][0]] = int(light[row, column])
+                payload += pixel
+            payload += b"\xff" * profile.column[1]
+        packets.append(Datagram(0, 7502, bytes(payload) + bytes(profile.footer)))
+    (turn,) = ouster.turns(packets, metadata)
+    hit = distance > 0
+    np.testing.assert_array_equal(turn["reflectivity"], light[hit])
+    np.testing.assert_array_equal(turn["ring"], np.nonzero(hit)[0])
+    np.testing.assert_allclose(turn["time"], np.nonzero(hit)[1] * 1e-6)
+    # Beside the axis by the beam's origin, as far as was measured: |p - n (cos e, sin e, 0)| = r - n.
+    encoder = (2 * np.pi * (1 - np.arange(columns) / columns))[np.nonzero(hit)[1]]
+    xyz = np.stack([-turn["x"], -turn["y"], turn["z"]], axis=1)
+    beam = xyz - 0.015 * np.stack([np.cos(encoder), np.sin(encoder), 0 * encoder], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(beam, axis=1), distance[hit] * unit - 0.015, atol=1e-5)
+    np.testing.assert_allclose(np.degrees(np.arcsin(beam[:, 2] / (distance[hit] * unit - 0.015))),
+                               altitudes[np.nonzero(hit)[0]], atol=1e-3)  # fmt: skip
+    turned = np.mod(np.arctan2(beam[:, 1], beam[:, 0]) - encoder, 2 * np.pi)
+    np.testing.assert_allclose(np.cos(turned), np.cos(np.radians(azimuths[np.nonzero(hit)[0]])), atol=1e-6)
+
+
+def test_a_real_ouster_capture(shared: Path):
+    """Sums over all points as `ouster-sdk` 1.0.1 computes them (XYZLut without extrinsics) from the same capture."""
+    path = shared / "scans" / "other" / "OS-1-64_1024x10_fw20.pcap"
+    (item,) = inputs_of([path], Reading()).stream()
+    loaded = item.read()
+    assert len(loaded.scan) == 16749 and loaded.scan.ring is not None
+    np.testing.assert_allclose(loaded.scan.xyz.astype(float).sum(axis=0), OUSTER_SDK, rtol=1e-5)
+    assert loaded.scan.extra["intensity"].max() == 1241 and loaded.scan.ring.max() == 63
+    assert recognise(loaded.scan)[0] == "os1-64"
+    sensor = ouster.sensor_of(ouster.read_metadata(path.with_name("OS-1-64_sensor_config_reduced.json")))
+    assert (sensor.height, sensor.width, sensor.elevations[0]) == (64, 1024, 16.46)

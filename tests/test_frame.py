@@ -1,0 +1,144 @@
+"""A scan that was moved, tilted or written in other axes is found out; nobody's correct scan is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarsynth.files.formats import read
+from lidarsynth.lidar.cones import fit_cones, fit_ring
+from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed
+from lidarsynth.lidar.ground import plane, road_axis
+from lidarsynth.lidar.motion import straighten
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.verbs.inputs import read_transform
+
+MOVES = {
+    "raised": ("0:0:1.73:0:0:0", "m above the origin"),
+    "tilted": ("0:0:0:0:5:0", "tilted by 5."),
+    "both": ("0:0:1.73:4:0:0", "tilted by 4."),
+    "upside down": ("0:0:0:180:0:0", "upside down"),
+}
+
+
+def street(name: str, rings: bool = True) -> Scan:
+    """A road between walls that are not straight, as a sensor sees it without noise."""
+    sensor = SENSORS[name].resized(width=512)
+    rays = sensor.directions()
+    rng = np.random.default_rng(0)
+    wall = np.repeat(rng.uniform(5, 25, 64), 8)[None] / np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-6)
+    with np.errstate(divide="ignore"):
+        distance = np.minimum(np.where(rays[..., 2] < 0, -1.7 / rays[..., 2], np.inf), wall)
+    mask = (distance < 60) & (distance > 2) & (rng.random(distance.shape) < 0.9)
+    ring = np.broadcast_to(np.arange(sensor.height)[:, None], mask.shape)
+    xyz = sensor.points(distance.astype(np.float32))
+    return Scan(xyz[mask], ring=ring[mask] if rings else None)
+
+
+def moved(scan: Scan, matrix: np.ndarray) -> Scan:
+    return Scan(transformed(scan.xyz, matrix), scan.reflectance, ring=scan.ring)
+
+
+@pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e", "pandar64", "vlp-16"])
+def test_a_scan_in_its_frame_has_no_fault(name: str):
+    assert check_frame(street(name)).warning() is None
+    assert check_frame(street(name, rings=False)).warning() is None
+
+
+@pytest.mark.parametrize("name", ["hdl-64e-kitti", "pandar64"])
+@pytest.mark.parametrize("move", MOVES)
+def test_a_moved_scan_is_found_out_and_its_transform_undoes_it(name: str, move: str):
+    matrix, (pose, words) = parse_transform(MOVES[move][0]), MOVES[move]
+    assert pose_of(matrix) == pytest.approx([float(word) for word in pose.split(":")], abs=1e-5)
+    frame = check_frame(moved(street(name), matrix))
+    assert words in str(frame.warning())
+    left = frame.transform @ matrix
+    assert np.degrees(np.arccos(np.clip(left[2, 2], -1, 1))) < 0.4
+    assert abs(left[2, 3]) < 0.25
+    assert check_frame(moved(street(name), left)).warning() is None
+
+
+@pytest.mark.parametrize("axis", [axis for axis in AXES if axis not in ("+z", "-z")])
+def test_other_axes_are_named(axis: str):
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(AXES[axis][0]).T  # ours -> the file's
+    frame = check_frame(moved(street("hdl-64e-kitti"), matrix))
+    assert AXES[axis][1] in str(frame.warning())
+    np.testing.assert_allclose((frame.transform @ matrix)[:3, :3], np.eye(3), atol=1e-2)
+
+
+def test_a_turn_by_90_degrees_is_only_a_hint():
+    rng = np.random.default_rng(0)
+    ground = np.stack([rng.uniform(-40, 40, 20000), rng.uniform(-5, 5, 20000), np.full(20000, -1.7)], axis=1)
+    assert road_axis(ground) > 0.3 and road_axis(ground[:, [1, 0, 2]]) < -0.3
+    frame = check_frame(Scan(ground[:, [1, 0, 2]].astype(np.float32)))
+    assert frame.faults == () and "as if turned by 90 degrees" in str(frame.warning())
+
+
+def test_cones_have_their_axis_height_and_elevations():
+    sensor = SENSORS["pandar64"]
+    scan = street(sensor.name)
+    assert scan.ring is not None
+    matrix = parse_transform("0:0:0.5:1:2:0")
+    cones = fit_cones(transformed(scan.xyz, matrix), scan.ring)
+    np.testing.assert_allclose(cones.axis, matrix[:3, 2], atol=2e-3)
+    assert cones.height == pytest.approx(0.5, abs=0.01) and cones.residual < 0.1 < cones.upright
+    for row in (20, 60):
+        ring = fit_ring(scan.xyz[scan.ring == row])
+        assert ring.elevation == pytest.approx(sensor.elevations[row], abs=1e-3)
+        assert ring.height == pytest.approx(0, abs=1e-3)
+
+
+def test_the_ground_has_its_height_and_tilt():
+    around = np.random.default_rng(0).uniform(-20, 20, (5000, 2))
+    ground = np.column_stack([around, np.full(len(around), -1.7)]).astype(np.float32)
+    tilted = transformed(ground, parse_transform("0:0:0:2:-3:0"))  # the nose goes up: pitch about y is negative
+    height, pitch, roll = plane(tilted) or (0, 0, 0)
+    assert height == pytest.approx(1.7, abs=0.02)
+    # What rose in the points is the ground ahead, so the sensor looks down: opposite signs.
+    assert (pitch, roll) == (pytest.approx(-3, abs=0.1), pytest.approx(-2, abs=0.1))
+
+
+def test_a_motion_is_taken_out_of_the_rings():
+    scan = street("hdl-32e")
+    assert scan.ring is not None
+    tau = np.mod(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) / (2 * np.pi), 1) - 0.5
+    bent = (scan.xyz + tau[:, None] * [1.5, 0.3, 0]).astype(np.float32)
+    straight = straighten(bent, scan.ring)
+    assert np.abs(straight - scan.xyz).max() < 0.1 < np.abs(bent - scan.xyz).max()
+    np.testing.assert_array_equal(straighten(scan.xyz, scan.ring), scan.xyz)
+
+
+def test_transforms_from_files(tmp_path: Path):
+    matrix = parse_transform("1:2:3:10:20:30")
+    np.savetxt(tmp_path / "t.txt", matrix[:3])
+    np.testing.assert_allclose(read_transform(str(tmp_path / "t.txt")), matrix)
+    np.testing.assert_allclose(read_transform("1:2:3:10:20:30", mount=0.5), parse_transform("1:2:2.5:10:20:30"))
+    assert read_transform(None) is None
+    np.savetxt(tmp_path / "t.txt", 2 * matrix)
+    with pytest.raises(ValueError, match="stretches or mirrors"):
+        read_transform(str(tmp_path / "t.txt"))
+    with pytest.raises(ValueError, match="found '1:2'"):
+        read_transform("1:2")
+
+
+@pytest.mark.parametrize("name", ["test/kitti360_000000.bin", "test/odometry_000964.bin", "test/odometry08_000000.bin",
+                                  "other/nuscenes_hdl32e.pcd.bin", "other/pandaset_pandar64_0001.pcd",
+                                  "other/sensorscalibration_top.pcd", "other/fast_gicp_251370668.pcd",
+                                  "semantic/seq00_0.npz"])  # fmt: skip
+def test_no_correct_real_scan_is_refused(name: str, shared: Path):
+    frame = check_frame(read(shared / "scans" / name))
+    assert frame.faults == (), frame.warning()
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_a_moved_real_scan_is_found_out(move: str, shared: Path):
+    scan = read(shared / "scans" / "test" / "semantickitti_x.bin")
+    assert MOVES[move][1].split(".")[0] in str(check_frame(moved(scan, parse_transform(MOVES[move][0]))).warning())
+
+
+def test_a_sweep_in_the_vehicles_frame_is_raised(shared: Path):
+    pytest.importorskip("pyarrow", reason="pyarrow comes with the extra `data`")
+    frame = check_frame(read(shared / "scans" / "other" / "argoverse2_2xvlp32c.feather"))
+    assert "1.56 m above the origin" in str(frame.warning())

@@ -1,0 +1,95 @@
+"""A sensor learned from its scans is the sensor that made them, ideal or real."""
+
+import lzma
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_recognise import turn
+
+from lidarsynth.cli.main import main
+from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.learning import blocked_runs, learn_sensor
+from lidarsynth.lidar.recognition import rings_by_elevation
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS, read_sensor
+from lidarsynth.verbs.learned_sensor import sensor_toml
+
+
+def unpacked(path: Path) -> Scan:
+    """N (int32), x y z as differences of int32 millimetres, planar, then reflectance in hundredths."""
+    raw = lzma.decompress(path.read_bytes())
+    n = int(np.frombuffer(raw, "<i4", 1)[0])
+    steps = np.frombuffer(raw, "<i4", 3 * n, 4).reshape(3, n)
+    return Scan((np.cumsum(steps, axis=1, dtype=np.int32) / 1000.0).T.astype(np.float32))
+
+
+@pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e", "vlp-16"])
+def test_an_ideal_sensor_is_learned(name: str):
+    known = SENSORS[name]
+    found = learn_sensor([turn(known)], "own").sensor
+    assert found.height == known.height and found.width == 512
+    np.testing.assert_allclose(found.elevations, known.elevations, atol=0.005)
+    np.testing.assert_allclose(found.offsets or 0.0, known.offsets or 0.0, atol=0.01)
+    assert found.mount == pytest.approx(1.7, abs=0.2)
+    assert np.abs(found.tilt).max() < 0.2
+
+
+def test_beams_are_found_without_rings():
+    scan = turn(SENSORS["hdl-32e"], rings=False)
+    mixed = scan[np.random.default_rng(0).permutation(len(scan))]
+    ring = rings_by_elevation(mixed.xyz)
+    assert ring is not None and ring.max() == 31
+    found = learn_sensor([mixed], "own").sensor
+    np.testing.assert_allclose(found.elevations, SENSORS["hdl-32e"].elevations, atol=0.02)
+    cloud = np.random.default_rng(0).normal(0, 10, (5000, 3)).astype(np.float32)
+    with pytest.raises(ValueError, match="none in 1"):
+        learn_sensor([Scan(cloud)], "own")
+
+
+def test_blocked_rays_are_runs_that_may_wrap():
+    returned = np.full((4, 1000), 0.8)
+    returned[1, 10:30] = returned[2, 990:] = returned[2, :4] = 0
+    returned[0] = 0  # only sky
+    returned[3, 50] = 0  # chance
+    assert blocked_runs(returned, 9) == ((1, 10, 29), (2, 990, 3))
+    assert blocked_runs(returned, 2) == (), "too few scans to tell"
+
+
+def test_the_file_is_read_back_as_the_sensor(tmp_path: Path):
+    known = SENSORS["hdl-64e-kitti"].rows(range(0, 64, 2), width=300)
+    (tmp_path / "own.toml").write_text(sensor_toml(known, ["two", "comments"]))
+    found = read_sensor(tmp_path / "own.toml")
+    assert found.to_dict() == known.to_dict()
+
+
+def test_the_verb_writes_a_sensor_and_its_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for i in range(2):
+        write(tmp_path / f"{i}.pcd", turn(SENSORS["vlp-16"]))
+    main(["sensor", str(tmp_path), "--out", str(tmp_path / "own.toml")])
+    assert "own: 16 beams from +15.00 to -15.00 degrees, 512 columns" in capsys.readouterr().out
+    assert read_sensor(tmp_path / "own.toml").height == 16
+    assert (tmp_path / "own.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("name", "sensor"),
+    [("sensorscalibration_top.pcd", "pandar64"), ("fast_gicp_251370668.pcd", "hdl-32e")],
+)
+def test_real_sensors_within_a_twentieth_of_a_degree(name: str, sensor: str, shared: Path):
+    found = np.array(learn_sensor([read(shared / "scans" / "other" / name)], "own").sensor.elevations)
+    known = np.array(SENSORS[sensor].elevations)
+    assert len(found) > 0.9 * len(known)
+    assert np.abs(found[:, None] - known).min(axis=1).max() < 0.05
+
+
+def test_kittis_sensor_from_real_scans(shared: Path, tmp_path: Path):
+    """Raw scans: beams within 0.05 degrees of the fit to 110 scans, and their origins 0.2 and 0.12 m up."""
+    packed = sorted((shared / "scans" / "train").glob("objtest_*.scan.xz"))[:2]
+    if not packed:
+        pytest.skip("packed scans are not here")
+    scans = [unpacked(path) for path in packed]
+    found, known = learn_sensor(scans, "own").sensor, SENSORS["hdl-64e-kitti"]
+    np.testing.assert_allclose(found.elevations, known.elevations, atol=0.05)
+    np.testing.assert_allclose(found.offsets, known.offsets, atol=0.01)
+    assert 2050 < found.width < 2250

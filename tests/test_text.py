@@ -1,0 +1,59 @@
+"""Points as text: named columns, guessed columns, and what is neither."""
+
+import numpy as np
+import pytest
+
+from lidarsynth.files.fields import FileError
+from lidarsynth.files.formats import read
+from lidarsynth.files.text import read_text
+
+ROWS = "1 2 3 0.5\n4 5 6 0.25\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y,z,intensity\n1,2,3,0.5\n4,5,6,0.25\n",
+        "\ufeffX;Y;Z;Intensity\n1;2;3;0.5\n4;5;6;0.25\n",
+        '"Points:0","Points:1","Points:2","intensity"\n1,2,3,0.5\n4,5,6,0.25\n',
+        "//X Y Z Scalar_Intensity\n" + ROWS,
+        "# made by hand\n# x y z intensity\n" + ROWS,
+        "2\n" + ROWS,
+        ROWS,
+        "intensity\tz\ty\tx\n0.5\t3\t2\t1\n0.25\t6\t5\t4\n",
+    ],
+)
+def test_every_way_of_writing_the_same_points(text: str, tmp_path):
+    (tmp_path / "p.csv").write_text(text)
+    scan = read(tmp_path / "p.csv")
+    np.testing.assert_array_equal(scan.xyz, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(scan.reflectance, np.float32([0.5, 0.25]))
+
+
+def test_unnamed_columns_are_told_by_their_numbers():
+    assert list(read_text(b"1 2 3 255 0 9\n1 2 3 1 2 3\n")) == ["x", "y", "z"]  # colours
+    assert list(read_text(b"1 2 3 0.5 7\n1 2 3 0.5 8\n")) == ["x", "y", "z", "intensity", "ring"]
+    leica = read_text(b"2\n1 2 3 -2048 1 2 3\n1 2 3 2047 1 2 3\n")
+    np.testing.assert_array_equal(leica["intensity"], [0, 1])
+
+
+def test_an_empty_cell_is_a_lost_point(tmp_path):
+    (tmp_path / "p.xyz").write_text("x,y,z,intensity\n1,,3,1\n1,2,3,1\n")
+    assert len(read(tmp_path / "p.xyz")) == 1
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"hello", "names them, found 'hello'"),
+        (b"a,b,c\n1,2,3", "names them"),
+        (b"1 2 3\n1 2", "3 numbers a line, found 2"),
+        (b"x y z i\n1 2 3\n", "a number for each of x, y, z, i"),
+        (b"1 2 3\n1 2 b\n", "expected numbers, found"),
+        (b"\xff\xfe\x00", "as text"),
+        (b"# nothing\n", "found none"),
+    ],
+)
+def test_what_is_no_text_of_points_is_one_line(data: bytes, words: str):
+    with pytest.raises(FileError, match=words):
+        read_text(data)
