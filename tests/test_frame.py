@@ -104,9 +104,10 @@ def test_a_motion_is_taken_out_of_the_rings():
     scan = street("hdl-32e")
     assert scan.ring is not None
     tau = np.mod(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) / (2 * np.pi), 1) - 0.5
-    bent = (scan.xyz + tau[:, None] * [1.5, 0.3, 0]).astype(np.float32)
+    bent = (scan.xyz + tau[:, None] * [0.8, 0.2, 0]).astype(np.float32)
     straight = straighten(bent, scan.ring)
-    assert np.abs(straight - scan.xyz).max() < 0.1 < np.abs(bent - scan.xyz).max()
+    off, before = (np.abs(xyz - scan.xyz).max(axis=1) for xyz in (straight, bent))
+    assert np.quantile(off, 0.99) < 0.02 < 0.3 < np.quantile(before, 0.99), "all but points on the turn's seam"
     np.testing.assert_array_equal(straighten(scan.xyz, scan.ring), scan.xyz)
 
 

@@ -33,6 +33,11 @@ class Cones:
         """Degrees between the axis and z."""
         return float(np.degrees(np.arccos(np.clip(self.axis[2], -1, 1))))
 
+    def apart(self, deviations: float) -> bool:
+        """Whether tilt or height differ from none by more than so many standard errors."""
+        tilt = np.hypot(*self.axis[:2]) / max(float(np.max(self.error[:2])), 1e-12)
+        return bool(max(tilt, abs(self.height) / max(float(self.error[2]), 1e-12)) > deviations)
+
 
 def fit_cones(xyz: np.ndarray, ring: np.ndarray, seed: int = 0) -> Cones:
     """The cones of points (N, 3) metres by their rings (N,): common axis and origin, each ring its own elevation.

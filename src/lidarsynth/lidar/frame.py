@@ -18,6 +18,7 @@ from lidarsynth.lidar.scan import Scan
 RAISED = 0.6  # metres; beams of an HDL-64E leave up to 0.2 m above its origin
 TILTED = 2.0  # degrees; no real scan at hand exceeds 0.3
 FIT = 2.0  # degrees: cones that fit worse are none
+SURE = 6.0  # standard errors
 CLEAR = 0.7  # degrees: cones that fit better leave no doubt of the axis
 UPSIDE = 1.5  # times more level ground above than below
 ACROSS = -0.2  # `road_axis` of a road that runs along y; of 133 real scans the lowest is -0.11
@@ -88,7 +89,7 @@ def _tilt_and_height(scan: Scan, turn: np.ndarray) -> tuple[np.ndarray, float]:
         if (ring := rings_of(scan, xyz)) is None:
             break
         cones = fit_cones(xyz, ring)
-        if cones.residual > FIT or cones.residual > 0.7 * cones.upright:
+        if cones.residual > FIT or not cones.apart(SURE):
             break  # cones about z through the origin fit as well
         if cones.tilt < TILTED / 10 and abs(cones.height) < RAISED / 2:
             break

@@ -47,9 +47,9 @@ def _at_rest(xyz: np.ndarray, ring: np.ndarray) -> float:
 
 
 def _fit(xyz: np.ndarray, ring: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, float]:
-    """((2, 3) p and u in metres, robust residual of z / rho): three Gauss-Newton steps of robust least squares."""
+    """((2, 3) p and u in metres, robust residual of z / rho): five Gauss-Newton steps of robust least squares."""
     path, scale = np.zeros((2, 3)), 1.0
-    for _ in range(3):
+    for _ in range(5):
         x, y, z = (xyz.astype(np.float64) - path[0] - turn[:, None] * path[1]).T
         rho = np.hypot(x, y)
         value = z / rho
