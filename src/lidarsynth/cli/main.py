@@ -14,6 +14,7 @@ from lidarsynth.cli.generate import generate
 from lidarsynth.cli.info import info
 from lidarsynth.cli.project import project
 from lidarsynth.cli.sensor import sensor
+from lidarsynth.cli.streets import streets
 from lidarsynth.cli.terminal import answer
 from lidarsynth.cli.train import train
 from lidarsynth.cli.upsample import upsample
@@ -26,6 +27,7 @@ VERBS = {
     "project": project,
     "sensor": sensor,
     "data": data,
+    "streets": streets,
     "train": train,
     "evaluate": evaluate,
     "benchmark": benchmark,

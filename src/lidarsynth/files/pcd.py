@@ -191,7 +191,11 @@ DECODERS: dict[str, Callable[[bytes, Header], list[np.ndarray]]] = {
 
 def write_pcd(file: BufferedIOBase, scan: Scan) -> None:
     """The scan as a binary PCD 0.7: x y z intensity (reflectance 0-1), and ring, timestamp, label where known."""
-    table = scan_table(scan)
+    write_table(file, scan_table(scan))
+
+
+def write_table(file: BufferedIOBase, table: np.ndarray) -> None:
+    """A structured array (N,) as a binary PCD 0.7, its fields under their own names."""
     kinds = [(table.dtype[name].kind.upper(), table.dtype[name].itemsize) for name in table.dtype.names or ()]
     n = len(table)
     header = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 Range = tuple[float, float]
 
@@ -77,3 +77,32 @@ AREAS: dict[str, Area] = {
         bank=0.03),
 }
 # fmt: on
+
+
+@dataclass(frozen=True)
+class Density:
+    """How much of what there is, as factors of what the kind of street has; 1 leaves a world as it is."""
+
+    traffic: float = 1.0  # moving vehicles and cyclists
+    parking: float = 1.0  # parked vehicles
+    pedestrians: float = 1.0
+    vegetation: float = 1.0  # trees, bushes, thickets
+
+    def of(self, area: Area) -> Area:
+        """The kind of street with these factors. Raises ValueError for a factor below 0."""
+        if self == TODAY:
+            return area
+        for name, factor in vars(self).items():
+            if not 0 <= factor <= 100:
+                raise ValueError(f"expected {name} as a factor of 0 to 100, found {factor}")
+        times = {"traffic": ("traffic",), "pedestrians": ("people",), "vegetation": ("trees", "garden", "thicket")}
+        new = {f: _scaled(getattr(area, f), getattr(self, word)) for word, fields in times.items() for f in fields}
+        low, high = _scaled(area.parked, self.parking)
+        return replace(area, **new, parked=(min(low, 1.0), min(high, 1.0)))
+
+
+def _scaled(bounds: Range, factor: float) -> Range:
+    return bounds[0] * factor, bounds[1] * factor
+
+
+TODAY = Density()

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.streets.areas import AREAS
+from lidarsynth.streets.areas import AREAS, TODAY, Area, Density
 from lidarsynth.streets.ground import KERB, Road
-from lidarsynth.streets.world import Lot, World, assemble, draw_ground, draw_poses
+from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, Lot, World, assemble, draw_ground, draw_poses
 
 Array = np.ndarray
 
 
-def build(rng: np.random.Generator) -> World:
-    """One world. The same generator state gives the same world."""
+def draw_area(rng: np.random.Generator) -> Area:
+    """One kind of surroundings, as often as its weight says."""
     weights = np.array([a.weight for a in AREAS.values()])
-    area = list(AREAS.values())[rng.choice(len(AREAS), p=weights / weights.sum())]
+    return list(AREAS.values())[rng.choice(len(AREAS), p=weights / weights.sum())]
+
+
+def build(rng: np.random.Generator, density: Density = TODAY) -> World:
+    """One world. The same generator state gives the same world."""
+    area = density.of(draw_area(rng))
     ground = draw_ground(rng, area)
     poses, places = draw_poses(rng, ground)
     lot = Lot(rng, ground, area)
@@ -22,8 +27,11 @@ def build(rng: np.random.Generator) -> World:
     return assemble(lot, poses)
 
 
-def fill(lot: Lot, places: Array) -> None:
-    """Everything of one world. places (16, 2): (s, d) of the poses on the main road, kept free."""
+def fill(lot: Lot, places: Array, lane: Array | None = None) -> None:
+    """Everything of one world. places (16, 2): (s, d) of the poses on the main road, kept free.
+
+    lane  (P, 2): (s, d) kept free of parked vehicles, if others
+    """
     closings(lot)
     for number, road in enumerate(lot.ground.roads):
         for side in (-1, 1):
@@ -33,7 +41,7 @@ def fill(lot: Lot, places: Array) -> None:
             backdrop(lot, road, side)
             car_park(lot, road, side)
             if number == 0:
-                parked(lot, road, side, places)
+                parked(lot, road, side, places if lane is None else lane)
                 moving(lot, road, side, places)
 
 
@@ -177,6 +185,7 @@ def closings(lot: Lot) -> None:
             if end == 0:
                 continue
             place = np.sign(end) * rng.uniform(*((82, 125) if number == 0 else (30, 80)))
+            place += np.sign(end) * (abs(end) - REACH[0]) if number == 0 else 0.0
             if rng.random() < lot.area.closed:
                 length = rng.uniform(18, 40)
                 s = np.array([place if end > 0 else place - 12.0])
@@ -229,11 +238,11 @@ def kerbside(lot: Lot, road: Road, side: int, main: bool) -> None:
             yaw = yaw + np.where(side < 0, np.pi, 0) + rng.normal(0, 0.25, count)
         elif kind != "bin":
             yaw = yaw + rng.uniform(0, 6.28, count)
-        lot.put(kind, x, y, yaw, up=up, clear=0.15)
+        lot.put(kind, x, y, yaw, up=up, clear=0.15, pace=WALK if kind == "person" else STILL)
     if main:
         count = rng.poisson(1.5)
         x, y, yaw = road.at(_along(lot, road, count), rng.uniform(-road.half, road.half, count))
-        lot.put("person", x, y, rng.uniform(0, 6.28, count), clear=None)
+        lot.put("person", x, y, rng.uniform(0, 6.28, count), clear=None, pace=WALK)
 
 
 def parked(lot: Lot, road: Road, side: int, places: Array) -> None:
@@ -270,10 +279,12 @@ def moving(lot: Lot, road: Road, side: int, places: Array) -> None:
         free &= (np.abs(s - place[0]) > 7.5) | (np.abs(d - place[1]) > 2.3)
     for road_side in lot.ground.roads[1:]:  # poses turn at crossings
         free &= np.hypot(*(np.array(road.at(s, d)[:2]) - [[road_side.x], [road_side.y]])) > 7
-    _vehicles(lot, road, s[free], d[free], np.full(int(free.sum()), np.pi if side > 0 else 0.0), 0.0, two_wheels=0.12)
+    _vehicles(lot, road, s[free], d[free], np.full(int(free.sum()), np.pi if side > 0 else 0.0), 0.0, 0.12, TRAFFIC)
 
 
-def _vehicles(lot: Lot, road: Road, s: Array, d: Array, turn: Array, up: float, two_wheels: float = 0.0) -> None:
+def _vehicles(
+    lot: Lot, road: Road, s: Array, d: Array, turn: Array, up: float, two_wheels: float = 0.0, pace: int = STILL
+) -> None:
     rng = lot.rng
     draw = rng.random(len(s))
     x, y, yaw = road.at(s, d)
@@ -284,5 +295,5 @@ def _vehicles(lot: Lot, road: Road, s: Array, d: Array, turn: Array, up: float, 
     for kind, high in limits.items():
         chosen = (draw > low) & (draw <= high)
         if chosen.any():
-            lot.put(kind, x[chosen], y[chosen], yaw[chosen], up=up, clear=None, size=(0.96, 1.04))
+            lot.put(kind, x[chosen], y[chosen], yaw[chosen], up=up, clear=None, size=(0.96, 1.04), pace=pace)
         low = high

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
+
+Hits = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class AnyCaster(Protocol):
+    """Whatever answers where rays first meet something; `Caster.cast` says how."""
+
+    def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
+        """The triangle's number, the distance and |cos| of incidence of each ray."""
+        ...
 
 
 class Caster:
@@ -22,11 +34,12 @@ class Caster:
         self.normal = normal.astype(np.float32)
         self.level = np.einsum("ij,ij->i", self.normal, corners[:, 0])
 
-    def cast(self, origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
         """Where each ray first meets the scene.
 
         origins, rays (N, 3) float32, rays of length 1. Returns, each (N,): the triangle's number, int32, -1 for none;
         the distance, float32 metres, infinite for none; and |cos| of the angle between ray and normal, float32.
+        times (N,) seconds: not used, nothing moves here.
         """
         face = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(rays), query="INTERSECT")
         normal = self.normal[face]

@@ -9,7 +9,7 @@ import numpy as np
 from lidarsynth.streets import facades
 from lidarsynth.streets.hdl64e import Lasers
 from lidarsynth.streets.materials import NUMBER, TABLE
-from lidarsynth.streets.raycast import Caster
+from lidarsynth.streets.raycast import AnyCaster
 from lidarsynth.streets.world import FRONT, GROUND, SLAB, World
 
 # Reflectance reported for a signal: nothing when dim, then steep, flat about 0.3, so that the shares of all reported
@@ -94,37 +94,46 @@ OPTICS = Optics()
 
 @dataclass(frozen=True)
 class Returns:
-    """What N beams brought back: distance (N,) float32 m along the ray, 0 for none; reflectance and label (N,)."""
+    """What N beams brought back: distance (N,) float32 m along the ray, 0 for none; reflectance and label (N,).
+
+    face, first (N,) int32: the triangle of the return, whether it was noticed or not, and the one that the beam met
+    first, which may be a pane before it; -1 for none.
+    """
 
     distance: np.ndarray
     reflectance: np.ndarray
     label: np.ndarray
+    face: np.ndarray
+    first: np.ndarray
 
 
 def sense(
     world: World,
-    caster: Caster,
+    caster: AnyCaster,
     origins: np.ndarray,
     rays: np.ndarray,
     lasers: Lasers,
     rng: np.random.Generator,
     max_range: float,
     eye: Optics = OPTICS,
+    times: np.ndarray | None = None,
 ) -> Returns:
     """Sends N rays and reports their returns.
 
-    origins, rays (N, 3) float32 world frame. The number of random draws depends on N only, so a ray that just misses
-    on another machine changes no other ray.
+    origins, rays (N, 3) float32 world frame; times (N,) seconds, where something moves. The number of
+    random draws depends on N only, so a ray that just misses on another machine changes no other ray.
     """
     count = len(rays)
     chance = rng.random((2, count), dtype=np.float32)
     noise = rng.standard_normal((3, count), dtype=np.float32)
-    face, distance, cosine = caster.cast(origins, rays)
+    face, distance, cosine = caster.cast(origins, rays, times)
+    first = face.copy()
     material, label, tint, depth = _surface(world, face, origins, rays, distance)
     steady = _steady(face, lasers.number)
     through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
     if through.any():
-        far = _behind(world, caster, origins[through], rays[through], distance[through])
+        when = None if times is None else times[through]
+        far = _behind(world, caster, origins[through], rays[through], distance[through], when)
         for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
             mine[through] = theirs
     optics = TABLE[material]
@@ -145,7 +154,8 @@ def sense(
     reflectance = REPORTED[np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.int32)]
     reflectance = eye.reported(reflectance)
     zero = np.float32(0)
-    return Returns(np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
+    reported = (np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
+    return Returns(*reported, face, first)
 
 
 def _signal(optics: np.ndarray, tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers):
@@ -187,10 +197,17 @@ def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarr
     return material, label, tint, depth
 
 
-def _behind(world: World, caster: Caster, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
+def _behind(
+    world: World,
+    caster: AnyCaster,
+    origins: np.ndarray,
+    rays: np.ndarray,
+    distance: np.ndarray,
+    times: np.ndarray | None,
+) -> tuple:
     """The hits behind glass, as `_surface` and the caster give them; a second pane ends the beam."""
     step = distance + np.float32(0.05)
     start = origins + rays * step[:, None]
-    face, more, cosine = caster.cast(start, rays)
+    face, more, cosine = caster.cast(start, rays, times)
     material, label, tint, depth = _surface(world, face, start, rays, more)
     return face, step + more, cosine, material, label, tint, depth

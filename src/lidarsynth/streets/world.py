@@ -15,6 +15,8 @@ from lidarsynth.streets.objects import library
 GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
 REACH = (150.0, 90.0)  # half size of the world in metres, x and y
 POSES = 16  # scans taken in one world
+STILL, TRAFFIC, WALK = 0, 1, 2  # how a thing moves once time passes
+THINGS = np.dtype([("kind", "U16"), ("variant", "i2"), ("row", "f8", 8), ("pace", "u1")])  # row as in `Lot`
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,8 @@ class World:
 
     corners (T, 3, 3) float32 m; kind (T,) uint8 of GROUND, SLAB, THING, FRONT; material, label (T,) uint8;
     tint (T,) float32, the object's brightness in spreads of its material; front (T,) int16, row of `fronts` or -1;
-    fronts (F, 12) float32, see `facades.py`; ground; poses (16, 6) float64: x, y, z, yaw, pitch, roll of the vehicle.
+    fronts (F, 12) float32, see `facades.py`; ground; poses (16, 6) float64: x, y, z, yaw, pitch, roll of the vehicle;
+    thing (T,) int32, row of `things` or -1; things (K,) of THINGS, what stands where.
     """
 
     corners: np.ndarray
@@ -35,11 +38,14 @@ class World:
     fronts: np.ndarray
     ground: Ground
     poses: np.ndarray
+    thing: np.ndarray
+    things: np.ndarray
 
 
 @dataclass
 class Lot:
-    """Collects what is placed: rows of (x, y, z, yaw, length, width, height scales, tint) per kind and variant."""
+    """Collects what is placed: rows of (x, y, z, yaw, length, width, height scales, tint, pace) per kind and
+    variant."""
 
     rng: np.random.Generator
     ground: Ground
@@ -56,6 +62,7 @@ class Lot:
         up: float = 0.0,
         clear: float | None = 0.3,
         size: tuple[float, float] = (0.9, 1.1),
+        pace: int = STILL,
     ) -> None:
         """Things of one kind at (N,) places, variants drawn at random; dropped within `clear` m of a carriageway."""
         count = len(x)
@@ -63,7 +70,7 @@ class Lot:
         pick = self.rng.integers(0, len(variants), count)
         scale = self.rng.uniform(*size, (count, 3))
         tint = np.clip(self.rng.normal(size=count), -1.5, 2.2)
-        rows = np.column_stack([x, y, self.ground.height(x, y) + up, yaw, scale, tint])
+        rows = np.column_stack([x, y, self.ground.height(x, y) + up, yaw, scale, tint, np.full(count, pace)])
         if clear is not None:
             keep = self.ground.carriageway(x, y) > clear
             rows, pick = rows[keep], pick[keep]
@@ -78,12 +85,14 @@ class Lot:
         variant = first[0] % len(library()[kind])
         ones = np.ones(int(keep.sum()))
         x, y, yaw = x[keep], y[keep], yaw[keep]
-        rows = np.column_stack([x, y, self.ground.height(x, y), yaw, ones, ones, ones * first[1], ones * first[2]])
+        rows = np.column_stack([x, y, self.ground.height(x, y), yaw, ones, ones, ones * first[1], ones * first[2],
+                                0 * ones])  # fmt: skip
         self.things.setdefault((kind, variant), []).append(rows)
 
 
-def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
-    """Roads and terrain of one world."""
+def draw_ground(rng: np.random.Generator, area: Area, length: float = 2 * REACH[0]) -> Ground:
+    """Roads and terrain of one world, whose main road is `length` metres long."""
+    half_length = length / 2
     lane = rng.uniform(*area.half)
     parking = (2.1 * (rng.random() < area.parking[0]), 2.1 * (rng.random() < area.parking[1]))
     half = lane + max(parking)
@@ -93,9 +102,10 @@ def draw_ground(rng: np.random.Generator, area: Area) -> Ground:
     lanes = "dashed" if draw < area.lanes[0] else "solid" if draw < sum(area.lanes) else "none"
     rails = bool(rng.random() < area.rails) and lane > 3.5
     walk = rng.uniform(*area.walk)
-    roads = [Road(0, 0, 0, half, walk, parking, wave, -150, 150, lanes, rails)]
-    places = rng.permutation(np.arange(-100, 101, 40.0))
-    for k in range(rng.integers(area.crossings[0], area.crossings[1] + 1)):
+    roads = [Road(0, 0, 0, half, walk, parking, wave, -half_length, half_length, lanes, rails)]
+    places = rng.permutation(np.arange(50 - half_length, half_length - 49, 40.0))
+    crossings = rng.integers(area.crossings[0], area.crossings[1] + 1)
+    for k in range(round(crossings * half_length / REACH[0])):
         place = places[k] + rng.uniform(-14, 14)
         x, y, yaw = roads[0].at(np.asarray(place), np.asarray(0.0))
         one_sided = rng.choice(np.array([(-90, 90), (-90, 0), (0, 90)]))
@@ -148,7 +158,7 @@ def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndar
 
 def assemble(lot: Lot, poses: np.ndarray) -> World:
     """One soup of the ground, the sidewalks, the walls and the things."""
-    bare = ground_mesh(lot.ground, REACH, 4.0)
+    bare = ground_mesh(lot.ground, (lot.ground.roads[0].stop, REACH[1]), 4.0)
     slab, kerb = slab_mesh(lot.ground)
     columns = [_soup(bare, GROUND, "road", "road"), _soup(slab, SLAB, "sidewalk", "sidewalk")]
     columns[1]["material"][kerb] = NUMBER["kerb"]
@@ -159,9 +169,12 @@ def assemble(lot: Lot, poses: np.ndarray) -> World:
         soup["tint"] = np.repeat(rows[:, 11], len(corners) // len(rows)).astype(np.float32)
         fronts = np.concatenate([fronts, rows])
         columns.append(soup)
-    columns += [_instances(kind, variant, np.concatenate(rows)) for (kind, variant), rows in lot.things.items()]
+    placed = {key: np.concatenate(rows) for key, rows in lot.things.items()}
+    first = np.cumsum([0, *map(len, placed.values())])
+    columns += [_instances(*key, rows, start) for (key, rows), start in zip(placed.items(), first, strict=False)]
     joined = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
-    return World(**joined, fronts=fronts, ground=lot.ground, poses=poses)
+    things = [(kind, variant, row[:8], row[8]) for (kind, variant), rows in placed.items() for row in rows]
+    return World(**joined, fronts=fronts, ground=lot.ground, poses=poses, things=np.array(things, THINGS))
 
 
 def visible(world: World, sensor: Sensor) -> World:
@@ -176,7 +189,9 @@ def visible(world: World, sensor: Sensor) -> World:
         shown |= (away < sensor.max_range + 5) & (spot[high, 2] - z - sensor.mount - 0.8 < steep * away)
     seen = np.ones(len(spot), bool)
     seen[high] = shown
-    table = {key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front")}
+    table = {
+        key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front", "thing")
+    }
     return replace(world, **table)
 
 
@@ -189,11 +204,12 @@ def _soup(corners: np.ndarray, kind: int, material: str, label: str) -> dict[str
         "label": np.full(count, LABEL[label], np.uint8),
         "tint": np.zeros(count, np.float32),
         "front": np.full(count, -1, np.int16),
+        "thing": np.full(count, -1, np.int32),
     }
 
 
-def _instances(kind: str, variant: int, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Copies of one library mesh, scaled, turned and shifted by rows (N, 8)."""
+def _instances(kind: str, variant: int, rows: np.ndarray, first: int) -> dict[str, np.ndarray]:
+    """Copies of one library mesh, scaled, turned and shifted by rows (N, 9), which are things `first` and on."""
     shape = library()[kind][variant]
     rows = rows.astype(np.float32)
     c, s, zero = np.cos(rows[:, 3]), np.sin(rows[:, 3]), np.zeros(len(rows), np.float32)
@@ -207,4 +223,5 @@ def _instances(kind: str, variant: int, rows: np.ndarray) -> dict[str, np.ndarra
         "label": np.tile(shape.label, count),
         "tint": np.repeat(rows[:, 7], len(shape)),
         "front": np.full(count * len(shape), -1, np.int16),
+        "thing": np.repeat(np.arange(first, first + count, dtype=np.int32), len(shape)),
     }

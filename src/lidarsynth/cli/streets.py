@@ -1,0 +1,54 @@
+"""The verb `streets`: labelled synthetic data sets in layouts that others' tools read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from lidarsynth.cli.arguments import arg
+from lidarsynth.cli.terminal import counted, say
+
+
+def streets(
+    out: Annotated[Path, arg(help="folder of the data set.")],
+    count: Annotated[int, arg(aliases=["-n"], help="how many scans, or drives with --frames.")] = 100,
+    sensor: Annotated[
+        str, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file.")
+    ] = "hdl-64e-kitti",
+    format: Annotated[
+        Literal["semantickitti", "kitti", "nuscenes", "pcd"], arg(help="layout that others' tools read.")
+    ] = "semantickitti",
+    seed: Annotated[int, arg(help="scan i of a seed depends on nothing else.")] = 0,
+    frames: Annotated[int, arg(help="of each drive; 0 = scans of places, where everything stands still.")] = 0,
+    rate: Annotated[float, arg(help="turns per second.")] = 10.0,
+    speed: Annotated[
+        float | None, arg(metavar="KM/H", help="the car would like to drive; default: as the street has it.")
+    ] = None,
+    deskewed: Annotated[bool, arg(help="take the car's own motion within a turn out of the points.")] = False,
+    traffic: Annotated[float, arg(help="moving vehicles and cyclists: 1 = as usual, 2 = twice, 0 = none.")] = 1.0,
+    parking: Annotated[float, arg(help="parked vehicles, likewise.")] = 1.0,
+    pedestrians: Annotated[float, arg(help="likewise.")] = 1.0,
+    vegetation: Annotated[float, arg(help="trees and bushes, likewise.")] = 1.0,
+    rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
+    fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
+    workers: Annotated[int | None, arg(metavar="INT", help="processes, one per processor core if not given.")] = None,
+    picture: Annotated[bool, arg(help="write overview.png, four frames with their boxes.")] = True,
+) -> None:
+    """Labelled scans of synthetic streets: classes, instances, 3-D boxes, poses; stopped, the same command goes on."""
+    from lidarsynth.data.street_sets import overview, write_streets
+    from lidarsynth.lidar.sensor import get_sensor
+    from lidarsynth.pictures.render import save_png
+    from lidarsynth.streets.areas import Density
+    from lidarsynth.streets.frame import LabelledStreets, Options
+    from lidarsynth.streets.weather import Weather
+
+    density, weather = Density(traffic, parking, pedestrians, vegetation), Weather(rain, fog)
+    options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, density, weather)
+    made = LabelledStreets(seed, count, get_sensor(sensor), options)
+    workers = os.cpu_count() or 1 if workers is None else workers
+    for _ in counted((done, len(made)) for done in write_streets(out, made, format, workers)):
+        pass
+    say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}")
+    if picture:
+        say(f"wrote {save_png(out / 'overview.png', overview(made))}")

@@ -1,0 +1,151 @@
+"""Writing labelled streets as a data set that others' tools read; stopped at any moment, the same call goes on.
+
+A frame is there when its JSON is, which is written last; every file appears whole or not at all. `streets.json` says
+what the set was made with, and the tables of the layout are written when all frames are there.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from lidarsynth.data.index import whole
+from lidarsynth.data.layouts.kitti import KITTI
+from lidarsynth.data.layouts.layout import Layout
+from lidarsynth.data.layouts.nuscenes import NUSCENES
+from lidarsynth.data.layouts.pcd import PCD
+from lidarsynth.data.layouts.semantickitti import SEMANTICKITTI
+from lidarsynth.data.workers import in_order
+from lidarsynth.pictures.figure import panel
+from lidarsynth.streets.drawing import bev_with_boxes, strips
+from lidarsynth.streets.frame import LabelledStreets
+
+LAYOUTS: dict[str, Layout] = {
+    "semantickitti": SEMANTICKITTI,
+    "kitti": KITTI,
+    "nuscenes": NUSCENES,
+    "pcd": PCD,
+}
+RECORD = "streets.json"
+CHUNK = 16  # frames that one process makes in a row, at most; they share their world
+
+
+def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: int = 0) -> Iterator[int]:
+    """Store all frames and yield how many are there, then the tables.
+
+    layout   a word of LAYOUTS
+    workers  processes; with fewer than two this one works itself
+    Raises ValueError where the folder holds another set or something else, OSError of one line when the disk is full.
+    """
+    _claim(folder, _settings(streets, layout))
+    _sweep(folder)
+    task = _Task(folder, streets, layout)
+    chunks = task.chunks()
+    done = len(streets) - sum(map(len, chunks))
+    yield done
+    written = in_order(task.store, range(len(chunks)), workers)
+    try:
+        for count in written:
+            done += count
+            yield done
+    finally:
+        written.close()
+        _sweep(folder)  # a killed worker's
+    for path, content in LAYOUTS[layout].tables(streets, folder):
+        _put(folder / path, content)
+
+
+class _Task:
+    """What a worker has to know to make any chunk."""
+
+    def __init__(self, folder: Path, streets: LabelledStreets, layout: str):
+        self.folder, self.streets, self.layout = folder, streets, layout
+        self._runs: list[list[int]] = []
+
+    def chunks(self) -> list[list[int]]:
+        """Frames that are not there, in runs of one world."""
+        record, runs = LAYOUTS[self.layout].record, []
+        for index in range(len(self.streets)):
+            if (self.folder / record(self.streets, index)).exists():
+                continue
+            group = (self.streets.place(index)[0], index // CHUNK)
+            if not runs or runs[-1][0] != group:
+                runs.append((group, []))
+            runs[-1][1].append(index)
+        self._runs = [run for _, run in runs]
+        return self._runs
+
+    def store(self, chunk: int) -> int:
+        """Make the frames of a chunk; returns their number."""
+        layout = LAYOUTS[self.layout]
+        for index in self._runs[chunk]:
+            frame = self.streets[index]
+            for path, content in layout.files(self.streets, index, frame):
+                _put(self.folder / path, content)
+            _put(self.folder / layout.record(self.streets, index), json.dumps(frame.record()).encode())
+        return len(self._runs[chunk])
+
+
+def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
+    return {
+        "layout": layout,
+        "seed": streets.seed,
+        "sensor": streets.sensor.to_dict(),
+        "options": asdict(streets.options),
+    }
+
+
+def _claim(folder: Path, settings: dict[str, Any]) -> None:
+    """Begin a folder, or go on with one that was begun with the same settings; the number of scans may grow."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: expected a folder to write to, found a file")
+    settings, path = json.loads(json.dumps(settings)), folder / RECORD
+    if path.exists():
+        try:
+            found = json.loads(path.read_text())
+        except ValueError as error:
+            raise ValueError(f"{path}: expected the settings of labelled streets in JSON, found {error}") from None
+        if found != settings:
+            differ = [k for k in settings if not isinstance(found, dict) or found.get(k) != settings[k]]
+            asked, was = ({k: of.get(k) for k in differ} if isinstance(of, dict) else of for of in (settings, found))
+            raise ValueError(f"{folder}: expected a folder of streets made with {asked!s:.200}, found {was!s:.200}; "
+                             "use another --out")  # fmt: skip
+        return
+    if folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+        raise ValueError(f"{folder}: expected an empty folder, or one with {RECORD}; use another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    _put(path, (json.dumps(settings, indent=1) + "\n").encode())
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what killed calls left unfinished."""
+    for stale in folder.rglob(".*.part"):
+        with suppress(OSError):
+            stale.unlink()
+
+
+def _put(path: Path, content: bytes | BinaryIO) -> None:
+    """The file, whole or not at all. Raises OSError of one line."""
+    source = BytesIO(content) if isinstance(content, bytes) else content
+    size = source.seek(0, 2)
+    source.seek(0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path, size) as scratch, open(scratch, "wb") as file:
+        shutil.copyfileobj(source, file)
+
+
+def overview(streets: LabelledStreets) -> np.ndarray:
+    """(H, W, 3) uint8: up to four frames of the set from above with their boxes, and one as strips."""
+    chosen = sorted({len(streets) * k // 4 for k in range(4)})
+    frames = [streets[index] for index in chosen]
+    views = [(f"frame {index}", bev_with_boxes(frame)) for index, frame in zip(chosen, frames, strict=True)]
+    rows = [views[:2], views[2:], [("range and class of the first", strips(frames[0], streets.sensor))]]
+    return panel([row for row in rows if row])

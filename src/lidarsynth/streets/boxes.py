@@ -1,0 +1,145 @@
+"""The 3-D box of every road user around the sensor, with how many points it got and how much of it is hidden."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets import hdl64e
+from lidarsynth.streets.drive import Moment
+from lidarsynth.streets.moving import Bodies
+from lidarsynth.streets.turn import Turn, attitudes, world_rays
+from lidarsynth.streets.world import World
+
+MOVES = 0.2  # m/s from which a thing counts as moving
+
+
+@dataclass(frozen=True)
+class Box:
+    """One road user, in the sensor frame at the scan's stamp unless said otherwise.
+
+    kind        a word of actors.KINDS; instance: its number in this world, 1 and up, the same in all scans of it
+    centre      (3,) m, of the box; size: length, width, height in m; yaw: rad, of its front, counter-clockwise from x
+    velocity    (3,) m/s over ground
+    place, heading, world_velocity: centre, yaw and velocity in the world's frame
+    points      how many returns are labelled with it; occlusion: share of its first hits that others hide, 0 to 1
+    """
+
+    kind: str
+    instance: int
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+    velocity: tuple[float, float, float]
+    place: tuple[float, float, float]
+    heading: float
+    world_velocity: tuple[float, float, float]
+    points: int
+    occlusion: float
+
+    @property
+    def moves(self) -> bool:
+        """Faster than MOVES."""
+        return float(np.linalg.norm(self.velocity)) > MOVES
+
+    def corners(self) -> np.ndarray:
+        """(8, 3) m in the sensor frame: the lower face counter-clockwise from the front left, then the upper."""
+        length, width, height = self.size
+        unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) / 2 * (length, width)
+        flat = unit @ np.array([[np.cos(self.yaw), np.sin(self.yaw)], [-np.sin(self.yaw), np.cos(self.yaw)]])
+        levels = [np.column_stack([flat, np.full(4, z)]) for z in (-height / 2, height / 2)]
+        return np.concatenate(levels) + self.centre
+
+    def record(self) -> dict[str, Any]:
+        """Plain numbers, as the JSON files hold them."""
+        rounded = {
+            key: [round(v, 4) for v in value] if isinstance(value, tuple) else value
+            for key, value in vars(self).items()
+        }
+        return rounded | {key: round(getattr(self, key), 5) for key in ("yaw", "heading", "occlusion")}
+
+
+def boxes_of(
+    world: World,
+    bodies: Bodies,
+    moment: Moment,
+    sensor: Sensor,
+    turn: Turn,
+    numbers: np.ndarray,
+    poses: np.ndarray,
+    late: np.ndarray | None,
+    to_world: np.ndarray,
+) -> list[Box]:
+    """Boxes of all actors whose middle is within the sensor's range.
+
+    numbers   (H, W) instance of each return, 0 for none
+    poses     (1 or W, 6) of the carrier by column; late (W,) s after the stamp, None where nothing moves
+    to_world  (4, 4) sensor to world at the stamp
+    """
+    actors = bodies.actors
+    middles = moment.place + _about(actors.middle, moment.yaw)
+    here = (middles - to_world[:3, 3]) @ to_world[:3, :3]
+    near = np.flatnonzero(moment.present & (np.linalg.norm(here, axis=1) < sensor.max_range))
+    points = np.bincount(numbers.ravel(), minlength=len(actors) + 1)
+    first = np.where(turn.first >= 0, world.thing[turn.first], -1)
+    hits = np.bincount(first.ravel() + 1, minlength=len(world.things) + 1)
+    found, frames = [], attitudes(sensor, poses)
+    for actor in near:
+        alone = _hits_alone(bodies, actor, moment, sensor, turn, frames, late, here[actor])
+        front = np.array([np.cos(moment.yaw[actor]), np.sin(moment.yaw[actor]), 0]) @ to_world[:3, :3]
+        shown = hits[actors.thing[actor] + 1] / alone if alone else 0.0
+        found.append(Box(
+            str(actors.kind[actor]), int(actor) + 1, _three(here[actor]), _three(actors.size[actor]),
+            float(np.arctan2(front[1], front[0])), _three(moment.velocity[actor] @ to_world[:3, :3]),
+            _three(middles[actor]), float(np.arctan2(np.sin(moment.yaw[actor]), np.cos(moment.yaw[actor]))),
+            _three(moment.velocity[actor]), int(points[actor + 1]), float(np.clip(1 - shown, 0, 1)),
+        ))  # fmt: skip
+    return found
+
+
+def _three(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _about(vectors: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """(A, 3) vectors turned about z by yaw (A,)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.column_stack(
+        [c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]]
+    )
+
+
+def _hits_alone(
+    bodies: Bodies,
+    actor: int,
+    moment: Moment,
+    sensor: Sensor,
+    turn: Turn,
+    frames: tuple[np.ndarray, np.ndarray],
+    late: np.ndarray | None,
+    here: np.ndarray,
+) -> int:
+    """How many beams would meet the actor if nothing else were there."""
+    columns = _columns(sensor, here, bodies.reach[actor] + 0.1 * np.linalg.norm(moment.velocity[actor]))
+    seen = ~hdl64e.hidden(sensor)[:, columns]
+    turns, places = frames
+    mine = frames if len(turns) == 1 else (turns[columns], places[columns])
+    origins, rays = world_rays(sensor, turn.rays[:, columns], seen, mine)
+    column = np.broadcast_to(columns, seen.shape)[seen]
+    after = np.zeros(len(rays)) if late is None else late[column]
+    place = moment.place[actor] + after[:, None] * moment.velocity[actor]
+    yaw = moment.yaw[actor] + after * moment.spin[actor]
+    return int((bodies.alone(actor, place, yaw, origins, rays)[0] >= 0).sum())
+
+
+def _columns(sensor: Sensor, here: np.ndarray, radius: float) -> np.ndarray:
+    """Columns of the image in which something of that radius (m) at `here` (sensor frame) may be."""
+    away = np.hypot(here[0], here[1])
+    half = np.pi if away <= radius else np.arcsin(radius / away) + 4 * np.pi / sensor.width
+    middle = (np.pi - np.arctan2(here[1], here[0])) * sensor.width / (2 * np.pi)
+    spread = min(half * sensor.width / (2 * np.pi), sensor.width / 2 - 1)
+    return np.unique(np.arange(int(middle - spread), int(middle + spread) + 2) % sensor.width)

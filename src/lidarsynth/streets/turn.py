@@ -1,0 +1,148 @@
+"""One turn of a sensor through a world: from the carrier's poses to every beam's return."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets import hdl64e
+from lidarsynth.streets.raycast import AnyCaster
+from lidarsynth.streets.sensor_model import Optics, sense
+from lidarsynth.streets.world import World
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What the H x W beams of one turn brought back, rows from the highest beam, columns from behind clockwise.
+
+    rays, points (H, W, 3) float32: the beams' directions and where they ended, metres, in the sensor frame of the
+    moment each was sent, (0, 0, 0) for none; distance (H, W) float32 m along the ray, 0 for none; reflectance, label
+    (H, W); face, first (H, W) int32: the triangle of the return and the one met first, maybe a pane, -1 for none.
+    """
+
+    rays: np.ndarray
+    points: np.ndarray
+    distance: np.ndarray
+    reflectance: np.ndarray
+    label: np.ndarray
+    face: np.ndarray
+    first: np.ndarray
+
+
+def shoot(
+    world: World,
+    caster: AnyCaster,
+    sensor: Sensor,
+    optics: Optics,
+    rng: np.random.Generator,
+    poses: np.ndarray,
+    times: np.ndarray | None = None,
+) -> Turn:
+    """Sends every beam of a turn that nothing on the carrier blocks.
+
+    poses (1, 6) or, for a carrier that moves, (W, 6): x, y, z, yaw, pitch, roll of the vehicle for each column
+    times (W,) seconds at which the columns are measured, for casters of things that move; None where nothing does
+    """
+    rays = _jittered(sensor, rng)
+    seen = ~hdl64e.hidden(sensor)
+    origins, directions = world_rays(sensor, rays, seen, attitudes(sensor, poses))
+    lasers = hdl64e.lasers(sensor, optics.loss, optics.dip, optics.shift)
+    when = None if times is None else np.broadcast_to(times, seen.shape)[seen]
+    found = sense(world, caster, origins, directions, lasers, rng, sensor.max_range, optics, when)
+    kept = found.distance >= sensor.min_range
+    whole = []
+    for values in (found.distance, found.reflectance, found.label):
+        whole.append(np.zeros(seen.shape, values.dtype))
+        whole[-1][seen] = np.where(kept, values, 0)
+    for faces in (found.face, found.first):
+        whole.append(np.full(seen.shape, -1, np.int32))
+        whole[-1][seen] = faces
+    return Turn(rays, local_points(rays, whole[0], sensor), *whole)
+
+
+def world_rays(
+    sensor: Sensor, rays: np.ndarray, seen: np.ndarray, frames: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions (N, 3) float32 in the world frame of the rays (H, W, 3) that are `seen` (H, W) bool.
+
+    frames  of `attitudes`, one for all columns or one for each
+    """
+    start = np.zeros((sensor.height, 3), np.float32)
+    start[:, 2] = sensor.mount
+    if sensor.offsets:
+        start[:, 2] += np.asarray(sensor.offsets, np.float32)
+    turns, places = frames
+    if len(turns) == 1:
+        turn, place = turns[0], places[0]
+        origins = np.repeat(start @ turn.T + place, seen.sum(axis=1), axis=0)
+        return origins, rays.reshape(-1, 3)[seen.reshape(-1)] @ turn.T
+    origins = np.einsum("hj,wij->hwi", start, turns) + places
+    return origins[seen], np.einsum("hwj,wij->hwi", rays, turns)[seen]
+
+
+def local_points(rays: np.ndarray, distance: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """(H, W, 3) float32 points in the sensor frame, zero where nothing returned."""
+    points = rays * distance[..., None]
+    if sensor.offsets:
+        points[..., 2] += np.where(distance > 0, np.asarray(sensor.offsets, np.float32)[:, None], 0)
+    return points
+
+
+@lru_cache(maxsize=4)
+def _directions(sensor: Sensor) -> np.ndarray:
+    return sensor.directions()
+
+
+def _jittered(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """(H, W, 3) float32 rays: the sensor's, turned by a third of a column at most, each ring with its own phase."""
+    phase = rng.random((sensor.height, 1), np.float32) / 2 - 0.25
+    shake = rng.random((sensor.height, sensor.width), np.float32)
+    angle = (phase + 0.16 * shake - 0.08) * np.float32(2 * np.pi / sensor.width)
+    rays = _directions(sensor)
+    x = rays[..., 0] - angle * rays[..., 1]
+    y = rays[..., 1] + angle * rays[..., 0]
+    return np.stack([x, y, rays[..., 2]], axis=-1)  # small angles: the length stays 1 within 1e-6
+
+
+def attitudes(sensor: Sensor, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (N, 3, 3) of the sensor and places (N, 3) of its vehicle, float32, from the vehicle's poses (N, 6)."""
+    pairs = _pose(np.moveaxis(poses, -1, 0)) if len(poses) > 1 else [part[None] for part in _pose(poses[0])]
+    turns, places = pairs
+    if any(sensor.tilt):
+        turns = turns @ _pose(np.array([0, 0, 0, 0, *np.radians(sensor.tilt)]))[0]
+    return turns, places
+
+
+def sensor_pose(sensor: Sensor, pose: np.ndarray) -> np.ndarray:
+    """(4, 4) float64 matrix from the sensor frame to the world, of a vehicle's pose x, y, z, yaw, pitch, roll."""
+    x, y, z, yaw, pitch, roll = pose
+    tilt = _turn(0.0, *np.radians(sensor.tilt)) if any(sensor.tilt) else np.eye(3)
+    matrix = np.eye(4)
+    matrix[:3, :3] = _turn(yaw, pitch, roll) @ tilt
+    matrix[:3, 3] = np.array([x, y, z]) + matrix[:3, 2] * sensor.mount
+    return matrix
+
+
+def _pose(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and place (3,) float32 of a pose (6,), or of N from (6, N): x, y, z, yaw, pitch, roll."""
+    x, y, z, yaw, pitch, roll = pose
+    return _turn(yaw, pitch, roll).astype(np.float32), np.stack([x, y, z], axis=-1).astype(np.float32)
+
+
+def _turn(yaw: np.ndarray | float, pitch: np.ndarray | float, roll: np.ndarray | float) -> np.ndarray:
+    """(..., 3, 3) rotation by roll (left side up), then pitch (nose up), then yaw, in radians."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    cp, sp, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    one, zero = c * 0 + 1, c * 0
+    about_z = _matrix([[c, -s, zero], [s, c, zero], [zero, zero, one]])
+    about_y = _matrix([[cp, zero, -sp], [zero, one, zero], [sp, zero, cp]])
+    about_x = _matrix([[one, zero, zero], [zero, cr, -sr], [zero, sr, cr]])
+    return about_z @ about_y @ about_x
+
+
+def _matrix(rows: list) -> np.ndarray:
+    """(..., 3, 3) from three rows of three numbers or arrays (...)."""
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
