@@ -88,9 +88,10 @@ def boxes_of(
     hits = np.bincount(first.ravel() + 1, minlength=len(world.things) + 1)
     found, frames = [], attitudes(sensor, poses)
     for actor in near:
-        alone = _hits_alone(bodies, actor, moment, sensor, turn, frames, late, here[actor])
+        met = hits[actors.thing[actor] + 1]
+        alone = _hits_alone(bodies, actor, moment, sensor, turn, frames, late, here[actor]) if met else 0
         front = np.array([np.cos(moment.yaw[actor]), np.sin(moment.yaw[actor]), 0]) @ to_world[:3, :3]
-        shown = hits[actors.thing[actor] + 1] / alone if alone else 0.0
+        shown = met / alone if alone else 0.0
         found.append(Box(
             str(actors.kind[actor]), int(actor) + 1, _three(here[actor]), _three(actors.size[actor]),
             float(np.arctan2(front[1], front[0])), _three(moment.velocity[actor] @ to_world[:3, :3]),
@@ -108,9 +109,8 @@ def _three(values: np.ndarray) -> tuple[float, float, float]:
 def _about(vectors: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """(A, 3) vectors turned about z by yaw (A,)."""
     c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack(
-        [c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]]
-    )
+    x, y, z = vectors.T
+    return np.column_stack([c * x - s * y, s * x + c * y, z])
 
 
 def _hits_alone(
@@ -124,8 +124,10 @@ def _hits_alone(
     here: np.ndarray,
 ) -> int:
     """How many beams would meet the actor if nothing else were there."""
-    columns = _columns(sensor, here, bodies.reach[actor] + 0.1 * np.linalg.norm(moment.velocity[actor]))
-    seen = ~hdl64e.hidden(sensor)[:, columns]
+    slack = 0.0 if late is None else 1.0 + 0.06 * float(np.linalg.norm(moment.velocity[actor]))
+    columns = _columns(sensor, here, bodies.reach[actor] + slack)
+    rows = _rows(sensor, here, bodies.reach[actor] + slack)
+    seen = ~hdl64e.hidden(sensor)[:, columns] & rows[:, None]
     turns, places = frames
     mine = frames if len(turns) == 1 else (turns[columns], places[columns])
     origins, rays = world_rays(sensor, turn.rays[:, columns], seen, mine)
@@ -143,3 +145,10 @@ def _columns(sensor: Sensor, here: np.ndarray, radius: float) -> np.ndarray:
     middle = (np.pi - np.arctan2(here[1], here[0])) * sensor.width / (2 * np.pi)
     spread = min(half * sensor.width / (2 * np.pi), sensor.width / 2 - 1)
     return np.unique(np.arange(int(middle - spread), int(middle + spread) + 2) % sensor.width)
+
+
+def _rows(sensor: Sensor, here: np.ndarray, radius: float) -> np.ndarray:
+    """(H,) bool: beams that may meet something of that radius (m) at `here` (sensor frame)."""
+    away = np.linalg.norm(here)
+    half = np.pi if away <= radius else np.arcsin(radius / away) + 0.03
+    return np.abs(np.radians(sensor.elevations) - np.arcsin(here[2] / max(away, 1e-6))) < half

@@ -1,0 +1,86 @@
+"""Labelled streets: how fast they are made, and what odometry makes of a drive.
+
+python benchmarks/streets.py                          frames per second of processor time, by sensor, boxes included
+python benchmarks/streets.py --odometry               KISS-ICP (pip install kiss-icp) on drives, against their poses
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+
+
+def speed(name: str, frames: int, count: int) -> str:
+    """One line: frames per second of processor time; worlds included, the first (which loads things) left out."""
+    reader = LabelledStreets(1, count, SENSORS[name], Options(frames=frames))
+    LabelledStreets(0, 1, SENSORS[name], Options(frames=frames))[0]
+    start = time.process_time()
+    points = [len(reader[index].scan) for index in range(len(reader))]
+    rate = len(points) / (time.process_time() - start)
+    what = f"drive of {frames}" if frames else f"{count} places"
+    return f"{name}, {what}: {rate:.1f} frames per second and core, {np.mean(points):.0f} points each"
+
+
+def estimated(frames: list[Frame], timed: bool) -> np.ndarray:
+    """(N, 4, 4) poses of KISS-ICP with its defaults; timed: it is told when each point was measured."""
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    config = load_config(None)
+    config.data.deskew, config.registration.max_num_threads = timed, 1
+    odometry = KissICP(config)
+    poses = []
+    for frame in frames:
+        assert frame.scan.time is not None
+        stamps = frame.scan.time / 0.1 if timed else np.zeros(0)
+        odometry.register_frame(frame.scan.xyz.astype(np.float64), stamps.astype(np.float64))
+        poses.append(odometry.last_pose.copy())
+    return np.stack(poses)
+
+
+def errors(truth: np.ndarray, found: np.ndarray) -> str:
+    """Drift over the whole drive in percent and degrees, root mean square of the position, of aligned first poses."""
+    truth, found = np.linalg.inv(truth[0]) @ truth, np.linalg.inv(found[0]) @ found
+    gap = np.linalg.norm(truth[:, :3, 3] - found[:, :3, 3], axis=1)
+    length = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    turn = truth[-1, :3, :3].T @ found[-1, :3, :3]
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    return f"{length:.0f} m | {100 * gap[-1] / length:.2f} | {angle:.2f} | {np.sqrt((gap**2).mean()):.3f}"
+
+
+def odometry(seeds: int, frames: int, name: str) -> None:
+    """A row per drive and way of reading it."""
+    print("| drive | points | length | drift, % | turn, degrees | RMSE, m |\n|---|---|---|---|---|---|")
+    for seed in range(seeds):
+        for deskewed in (False, True):
+            reader = LabelledStreets(seed, 1, SENSORS[name], Options(frames=frames, deskewed=deskewed))
+            made = [reader[k] for k in range(frames)]
+            truth = np.stack([frame.to_world for frame in made])
+            for timed in (False,) if deskewed else (True, False):
+                what = "deskewed" if deskewed else "as measured, times given" if timed else "as measured, no times"
+                found = estimated(made, timed)
+                print(f"| {seed} | {what} | {errors(truth, found)} |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--odometry", action="store_true")
+    parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--drives", type=int, default=2)
+    parser.add_argument("--sensor", default="hdl-64e-kitti")
+    args = parser.parse_args()
+    if args.odometry:
+        odometry(args.drives, args.frames, args.sensor)
+    else:
+        for name in ("hdl-64e-kitti", "os1-64", "vlp-16"):
+            print(speed(name, 0, 32))
+            print(speed(name, 32, 1))
+
+
+if __name__ == "__main__":
+    main()
