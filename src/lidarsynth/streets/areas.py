@@ -38,6 +38,9 @@ class Area:
     closed: float = 0.5  # how far houses close the view: share of road ends, and density of those behind
     rails: float = 0.0  # share of streets with a tram
     bank: float = 0.0  # standard deviation of the slope beside the road
+    kerb_bushes: float = 0.6  # per 100 m and side
+    on_road: float = 1.5  # pedestrians on the main road
+    woods: float = 1.0  # size of those that close a view
 
 
 # fmt: off
@@ -97,8 +100,9 @@ class Density:
                 raise ValueError(f"expected {name} as a factor of 0 to 100, found {factor}")
         times = {"traffic": ("traffic",), "pedestrians": ("people",), "vegetation": ("trees", "garden", "thicket")}
         new = {f: _scaled(getattr(area, f), getattr(self, word)) for word, fields in times.items() for f in fields}
-        low, high = _scaled(area.parked, self.parking)
-        return replace(area, **new, parked=(min(low, 1.0), min(high, 1.0)))
+        new["parked"] = tuple(min(share, 1.0) for share in _scaled(area.parked, self.parking))
+        green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
+        return replace(area, **new, **green, on_road=area.on_road * self.pedestrians)
 
 
 def _scaled(bounds: Range, factor: float) -> Range:

@@ -191,7 +191,7 @@ def closings(lot: Lot) -> None:
                 s = np.array([place if end > 0 else place - 12.0])
                 _houses(lot, road, 1, s, np.array([12.0]), np.array([-length / 2]), np.array([length]), across=True)
             elif rng.random() < 0.7:
-                count = rng.integers(4, 12)
+                count = round(rng.integers(4, 12) * lot.area.woods)
                 x, y, _ = road.at(place + rng.normal(0, 6, count), rng.normal(0, 14, count))
                 lot.put("thicket", x, y, rng.uniform(0, 6.28, count), clear=None, size=(0.8, 1.5))
 
@@ -230,7 +230,7 @@ def kerbside(lot: Lot, road: Road, side: int, main: bool) -> None:
     for kind, rate, near, far in (
         ("lamp", area.lamps, 0.4, 0.7), ("sign", area.signs, 0.4, 0.9), ("bollard", area.signs * 0.7, 0.3, 0.5),
         ("bin", 1.2, strip * 0.6, strip), ("person", rng.uniform(*area.people), 0.4, strip),
-        ("bicycle", rng.uniform(*area.bicycles), strip * 0.6, strip), ("bush", 0.6, strip, strip + 1.5),
+        ("bicycle", rng.uniform(*area.bicycles), strip * 0.6, strip), ("bush", area.kerb_bushes, strip, strip + 1.5),
     ):  # fmt: skip
         count = _count(lot, rate, road)
         x, y, yaw = road.at(_along(lot, road, count), side * (road.half + rng.uniform(near, max(far, near), count)))
@@ -240,7 +240,7 @@ def kerbside(lot: Lot, road: Road, side: int, main: bool) -> None:
             yaw = yaw + rng.uniform(0, 6.28, count)
         lot.put(kind, x, y, yaw, up=up, clear=0.15, pace=WALK if kind == "person" else STILL)
     if main:
-        count = rng.poisson(1.5)
+        count = rng.poisson(area.on_road)
         x, y, yaw = road.at(_along(lot, road, count), rng.uniform(-road.half, road.half, count))
         lot.put("person", x, y, rng.uniform(0, 6.28, count), clear=None, pace=WALK)
 

@@ -1,0 +1,212 @@
+"""Data sets of labelled streets: read back by the published formats, stopped and gone on with, refused where others lie."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarsynth.cli.main import main
+from lidarsynth.data.layouts.calibration import AXES, PROJECTION, camera_poses, sensor_poses
+from lidarsynth.data.layouts.kitti import label_line
+from lidarsynth.data.layouts.nuscenes_tables import quaternion
+from lidarsynth.data.nuscenes import nuscenes
+from lidarsynth.data.street_sets import LAYOUTS, write_streets
+from lidarsynth.files.formats import read
+from lidarsynth.files.labels import read_labels
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.streets.boxes import Box
+from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+
+pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+
+SENSOR = SENSORS["vlp-16"].resized(width=256)
+DRIVE = Options(frames=7, deskewed=True)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    reader = LabelledStreets(0, 1, SENSOR, DRIVE)
+    return [reader[k] for k in range(7)]
+
+
+def written(folder: Path, layout: str, options: Options = DRIVE, count: int = 1) -> Path:
+    counts = list(write_streets(folder, LabelledStreets(0, count, SENSOR, options), layout))
+    assert counts[-1] == count * max(options.frames, 1)
+    return folder
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_semantickitti_reads_back(tmp_path: Path, frames: list[Frame]):
+    sequence = written(tmp_path / "set", "semantickitti") / "sequences" / "00"
+    frame = frames[3]
+    points = np.fromfile(sequence / "velodyne" / "000003.bin", "<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(points[:, :3], frame.scan.xyz)
+    raw = np.fromfile(sequence / "labels" / "000003.label", "<u4")
+    np.testing.assert_array_equal(raw, frame.raw)
+    np.testing.assert_array_equal(read_labels(sequence / "labels" / "000003.label", len(points)), frame.scan.label)
+    times = np.fromfile(sequence / "point_times" / "000003.bin", "<f4")
+    np.testing.assert_array_equal(times, frame.scan.time)
+    assert len((sequence / "times.txt").read_text().split()) == 7
+
+
+def test_poses_are_those_of_the_drive(tmp_path: Path, frames: list[Frame]):
+    """As semantic-kitti-api has it: pose in the sensor's frame = Tr^-1 P Tr."""
+    sequence = written(tmp_path / "set", "semantickitti") / "sequences" / "00"
+    calibration = {line.split(":")[0]: line.split()[1:] for line in (sequence / "calib.txt").read_text().splitlines()}
+    tr = np.eye(4)
+    tr[:3] = np.array(calibration["Tr"], float).reshape(3, 4)
+    poses = np.loadtxt(sequence / "poses.txt").reshape(-1, 3, 4)
+    whole = np.tile(np.eye(4), (7, 1, 1))
+    whole[:, :3] = poses
+    truth = np.linalg.inv(frames[0].to_world) @ np.stack([frame.to_world for frame in frames])
+    np.testing.assert_allclose(np.linalg.inv(tr) @ whole @ tr, truth, atol=2e-5)
+    np.testing.assert_allclose(sensor_poses(camera_poses(truth)), truth, atol=1e-12)
+
+
+def test_places_are_split_by_world(tmp_path: Path):
+    folder = written(tmp_path / "set", "semantickitti", Options(), 18)
+    assert len(list((folder / "sequences" / "00" / "velodyne").iterdir())) == 16
+    assert len(list((folder / "sequences" / "01" / "velodyne").iterdir())) == 2
+
+
+def box_of(line: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """OpenPCDet's way from a line of label_2 to a box in the sensor frame: centre, size, yaw."""
+    numbers = np.array(line.split()[1:], float)
+    height, width, length = numbers[7:10]
+    bottom = np.linalg.inv(AXES) @ [*numbers[10:13], 1]
+    centre = bottom[:3] + [0, 0, height / 2]
+    return centre, np.array([length, width, height]), -(numbers[13] + np.pi / 2)
+
+
+def test_kitti_labels_are_the_boxes():
+    zero = (0.0, 0.0, 0.0)
+    box = Box("car", 1, (14.0, 3.0, -0.9), (4.2, 1.8, 1.5), 0.3, zero, zero, 0.0, zero, 90, 0.3)
+    line = label_line(box)
+    assert line is not None and line.split()[:3] == ["Car", "0.00", "1"]
+    centre, size, yaw = box_of(line)
+    np.testing.assert_allclose(centre, box.centre, atol=0.011)
+    np.testing.assert_allclose(size, box.size, atol=0.011)
+    assert np.cos(yaw - box.yaw) > 0.999
+    pixels = (np.c_[box.corners(), np.ones(8)] @ AXES.T) @ np.c_[PROJECTION[:, :3], np.zeros(3)].T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    found = np.array(line.split()[4:8], float)
+    np.testing.assert_allclose(found, [*pixels.min(axis=0), *pixels.max(axis=0)], atol=0.01)
+    behind = Box("car", 1, (-14.0, 3.0, -0.9), (4.2, 1.8, 1.5), 0.3, zero, zero, 0.0, zero, 90, 0.3)
+    assert label_line(behind) is None
+
+
+def test_kitti_has_what_openpcdet_opens(tmp_path: Path):
+    folder = written(tmp_path / "set", "kitti")
+    lines = (folder / "training" / "calib" / "000002.txt").read_text().splitlines()
+    names = ["P0", "P1", "P2", "P3", "R0_rect", "Tr_velo_to_cam", "Tr_imu_to_velo"]
+    assert [line.split(":")[0] for line in lines if line] == names
+    assert [len(line.split()) for line in lines if line] == [13, 13, 13, 13, 10, 13, 13]
+    assert (folder / "ImageSets" / "train.txt").read_text().split() == [f"{k:06d}" for k in range(7)]
+    assert {path.name for path in (folder / "training").iterdir()} == {
+        "velodyne",
+        "label_2",
+        "calib",
+        "image_2",
+        "boxes",
+    }
+    for line in (folder / "training" / "label_2" / "000002.txt").read_text().splitlines():
+        assert len(line.split()) == 15
+
+
+def test_nuscenes_reads_back(tmp_path: Path, frames: list[Frame]):
+    folder = written(tmp_path / "set", "nuscenes")
+    reader = nuscenes(folder)
+    assert len(reader) == 2  # key frames: 0 and 5 of seven at 10 Hz
+    for scan, frame in zip((reader[0], reader[1]), (frames[0], frames[5]), strict=True):
+        np.testing.assert_allclose(scan.xyz, frame.scan.xyz, atol=1e-5)
+        np.testing.assert_array_equal(scan.ring, frame.scan.ring)
+        assert scan.label is not None and (scan.label == frame.scan.label).mean() > 0.5
+    tables = {path.stem: json.loads(path.read_text()) for path in (folder / "v1.0-trainval").glob("*.json")}
+    assert len(tables["sample_data"]) == 7 and len(tables["lidarseg"]) == 2
+    tokens = {row["token"] for row in tables["sample_annotation"]}
+    for row in tables["instance"]:
+        assert {row["first_annotation_token"], row["last_annotation_token"]} <= tokens
+    samples = {row["token"]: row for row in tables["sample"]}
+    for row in tables["sample_annotation"]:
+        assert row["sample_token"] in samples and row["num_lidar_pts"] > 0
+
+
+def test_nuscenes_boxes_are_where_the_points_are(tmp_path: Path, frames: list[Frame]):
+    """From LIDAR_TOP's own frame through calibration and ego pose to the global frame, as the devkit goes."""
+    folder = written(tmp_path / "set", "nuscenes")
+    tables = {path.stem: json.loads(path.read_text()) for path in (folder / "v1.0-trainval").glob("*.json")}
+    points = np.fromfile(folder / tables["sample_data"][0]["filename"], "<f4").reshape(-1, 5)[:, :3]
+    for row in (tables["calibrated_sensor"][0], tables["ego_pose"][0]):
+        points = points @ rotation(row["rotation"]).T + row["translation"]
+    truth = frames[0].scan.xyz @ frames[0].to_world[:3, :3].T + frames[0].to_world[:3, 3]
+    np.testing.assert_allclose(points, truth, atol=1e-3)
+
+
+def rotation(q: list[float]) -> np.ndarray:
+    """(3, 3) of a unit quaternion w, x, y, z."""
+    w, x, y, z = q
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def test_quaternions_invert():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        q = rng.normal(size=4)
+        q = q / np.linalg.norm(q) * np.sign(q[0])
+        np.testing.assert_allclose(quaternion(rotation(q.tolist())), q, atol=1e-12)
+
+
+def test_pcd_reads_back(tmp_path: Path, frames: list[Frame]):
+    folder = written(tmp_path / "set", "pcd")
+    scan = read(folder / "000004.pcd")
+    np.testing.assert_array_equal(scan.xyz, frames[4].scan.xyz)
+    np.testing.assert_array_equal(scan.label, frames[4].scan.label)
+    np.testing.assert_array_equal(scan.ring, frames[4].scan.ring)
+    boxes = json.loads((folder / "000004.json").read_text())["boxes"]
+    assert [box["instance"] for box in boxes] == [box.instance for box in frames[4].boxes]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_stopped_set_goes_on_to_the_same_files(tmp_path: Path, layout: str):
+    whole = content(written(tmp_path / "whole", layout))
+    folder = tmp_path / "stopped"
+    streets = LabelledStreets(0, 1, SENSOR, DRIVE)
+    writing = write_streets(folder, streets, layout)
+    next(writing)
+    writing.close()
+    frames = written(folder, layout)
+    for index in (1, 4):  # killed between the files of a frame, and in the middle of one
+        record = folder / LAYOUTS[layout].record(streets, index)
+        record.unlink()
+        (record.parent / f".{record.stem}.123.part").write_bytes(b"{")
+    written(folder, layout)
+    assert content(frames) == whole
+
+
+def test_other_settings_and_other_folders_are_refused(tmp_path: Path):
+    written(tmp_path / "set", "pcd", Options(), 1)
+    with pytest.raises(ValueError, match="made with .*'seed': 5.*found .*'seed': 0"):
+        list(write_streets(tmp_path / "set", LabelledStreets(5, 1, SENSOR), "pcd"))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    with pytest.raises(ValueError, match="expected an empty folder"):
+        list(write_streets(tmp_path / "mine", LabelledStreets(0, 1, SENSOR), "pcd"))
+
+
+def test_the_verb_writes_says_and_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    sensor = tmp_path / "own.toml"
+    sensor.write_text("beams = 8\ntop = 5.0\nbottom = -20.0\nwidth = 128\n")
+    words = ["streets", "--out", str(tmp_path / "set"), "--sensor", str(sensor), "--format", "pcd", "--workers", "1"]
+    main([*words, "-n", "1"])
+    main([*words, "-n", "2"])
+    assert "has 2 labelled scans of own in the layout of pcd" in capsys.readouterr().out
+    assert (tmp_path / "set" / "000001.pcd").exists() and (tmp_path / "set" / "overview.png").stat().st_size > 1000
+    with pytest.raises(SystemExit) as refused:
+        main([*words, "-n", "2", "--rain", "-3"])
+    assert refused.value.code == 2
+    assert "expected rain of 0 to 200 mm/h" in capsys.readouterr().err

@@ -1,0 +1,229 @@
+"""Labelled streets: labels, instances and boxes fit the points; drives move as they say; weather follows its formulas."""
+
+import numpy as np
+import pytest
+
+from lidarsynth.files.labels import CLASS_OF_RAW
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.streets.areas import Density
+from lidarsynth.streets.boxes import Box
+from lidarsynth.streets.drive import draw_drive
+from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
+from lidarsynth.streets.weather import (
+    Weather,
+    _drop_table,
+    fog_echo,
+    fog_extinction,
+    rain_extinction,
+    strongest_drop,
+)
+
+pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+
+SMALL = SENSORS["hdl-32e"].resized(width=512)
+
+
+@pytest.fixture(scope="module")
+def still() -> list[Frame]:
+    reader = LabelledStreets(0, 48, SMALL)
+    return [reader[index] for index in (4, 5, 40)]
+
+
+@pytest.fixture(scope="module")
+def driven() -> list[Frame]:
+    reader = LabelledStreets(1, 1, SMALL, Options(frames=30, deskewed=True, density=Density(traffic=4)))
+    return [reader[index] for index in (0, 1, 2, 29)]
+
+
+def inside(box: Box, xyz: np.ndarray, slack: float) -> np.ndarray:
+    """(N,) bool: points within the box grown by `slack` metres."""
+    c, s = np.cos(box.yaw), np.sin(box.yaw)
+    local = (xyz - box.centre) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return np.all(np.abs(local) <= np.array(box.size) / 2 + slack, axis=1)
+
+
+def test_places_are_those_of_the_streets():
+    """The labels come on top: the points of scan i of a seed are what they always were."""
+    frame = LabelledStreets(3, 4)[1]
+    scan = SyntheticStreets(3, 4)[1]
+    np.testing.assert_array_equal(frame.scan.xyz, scan.xyz)
+    np.testing.assert_array_equal(frame.scan.label, scan.label)
+    assert frame.scan.time is not None and 0 <= frame.scan.time.min() and frame.scan.time.max() <= 0.1
+
+
+def test_a_frame_depends_on_nothing_else():
+    options = Options(frames=30, deskewed=True, weather=Weather(rain=20))
+    reader = LabelledStreets(2, 3, SMALL, options)
+    reader[7], reader[31]
+    fresh = LabelledStreets(2, 2, SMALL, options)
+    np.testing.assert_array_equal(reader[40].scan.xyz, fresh[40].scan.xyz)
+    assert reader[40].record() == fresh[40].record()
+
+
+def test_labels_and_training_classes_agree(still: list[Frame], driven: list[Frame]):
+    for frame in still + driven:
+        np.testing.assert_array_equal(CLASS_OF_RAW[frame.raw & 0xFFFF], frame.scan.label)
+
+
+def test_points_of_an_instance_are_in_its_box(still: list[Frame], driven: list[Frame]):
+    """Within range noise, and for movers what they travel in half a turn."""
+    checked = 0
+    for frame in still + driven:
+        instance = frame.raw >> 16
+        assert set(np.unique(instance)) - {0} <= {box.instance for box in frame.boxes}
+        for box in frame.boxes:
+            mine = instance == box.instance
+            assert mine.sum() == box.points
+            slack = 0.12 + 0.06 * np.linalg.norm(box.velocity)
+            assert inside(box, frame.scan.xyz[mine], slack).all(), box
+            checked += int(mine.sum())
+    assert checked > 500
+
+
+def test_boxes_hold_little_else(still: list[Frame]):
+    """What returns from within a car's box is that car, its ground, or what leans against it."""
+    for frame in still:
+        for box in frame.boxes:
+            if box.kind == "car" and box.points > 100:
+                there = inside(box, frame.scan.xyz, -0.1)
+                assert ((frame.raw >> 16)[there] == box.instance).mean() > 0.8
+
+
+def test_occlusion_is_a_share(still: list[Frame]):
+    boxes = [box for frame in still for box in frame.boxes]
+    assert all(0 <= box.occlusion <= 1 for box in boxes)
+    assert any(box.occlusion < 0.05 for box in boxes) and any(box.occlusion > 0.95 for box in boxes)
+    assert all(box.occlusion < 1 for box in boxes if box.points)
+
+
+def test_boxes_move_with_their_velocity(driven: list[Frame]):
+    """Place after a turn = place + velocity * time, for everyone in both frames."""
+    before, after = ({box.instance: box for box in frame.boxes} for frame in driven[1:3])
+    moved = 0
+    for number in before.keys() & after.keys():
+        a, b = before[number], after[number]
+        mean = (np.array(a.world_velocity) + b.world_velocity) / 2
+        np.testing.assert_allclose(np.array(b.place) - a.place, mean * 0.1, atol=0.05)
+        assert a.size == b.size and a.kind == b.kind
+        moved += a.moves
+    assert moved >= 3
+
+
+def test_what_stands_is_at_one_place_through_a_drive(driven: list[Frame]):
+    """Poses and deskewed points are of one world: parked boxes, and their points in it, do not wander."""
+    first, last = driven[0], driven[-1]
+    there = {box.instance: box for box in first.boxes if not box.moves}
+    same = [box for box in last.boxes if box.instance in there and not box.moves]
+    assert len(same) > 2
+    for box in same:
+        np.testing.assert_allclose(box.place, there[box.instance].place, atol=1e-6)
+        world = last.to_world @ [*box.centre, 1]
+        np.testing.assert_allclose(world[:3], box.place, atol=1e-6)
+
+
+def test_a_moving_turn_smears_and_deskewing_undoes_it():
+    options = Options(frames=3, speed=12.0)
+    raw = LabelledStreets(4, 1, SMALL, options)[1]
+    flat = LabelledStreets(4, 1, SMALL, Options(frames=3, speed=12.0, deskewed=True))[1]
+    np.testing.assert_array_equal(raw.raw, flat.raw)
+    apart = np.linalg.norm(raw.scan.xyz - flat.scan.xyz, axis=1)
+    assert raw.scan.time is not None
+    late = np.abs(raw.scan.time - 0.05)
+    speed = np.median(apart[late > 0.02] / late[late > 0.02])
+    assert 5 < speed < 13  # m/s: the car's, as it sets off behind others
+    assert apart[late < 0.001].max() < 0.1
+
+
+def test_drivers_keep_their_distance():
+    """Ten vehicles of wishes of 5 to 15 m/s behind one of 4: nobody meets the one in front, all end at its speed."""
+    place = np.arange(10) * 14.0
+    wished = np.linspace(15, 4, 10)
+    track = follow(place, np.full(10, 4.5), wished, 120)
+    assert np.diff(track, axis=1).min() > 4.5
+    np.testing.assert_allclose((track[-1] - track[-21]) / (20 * STEP), 4.0, atol=0.1)
+
+
+def test_driver_model_rests_where_its_equation_says():
+    """Equilibrium gap (s0 + v T) / sqrt(1 - (v / v0)^4) (Treiber et al. 2000, eq. 3)."""
+    speed, wished = np.array([8.0]), np.array([12.0])
+    gap = (GAP + speed * 1.2) / np.sqrt(1 - (speed / wished) ** 4)
+    np.testing.assert_allclose(acceleration(speed, wished, gap, np.zeros(1)), 0, atol=1e-12)
+    assert acceleration(wished, wished, np.array([np.inf]), np.zeros(1)) == 0
+
+
+def test_the_carrier_stays_on_its_road_and_meets_nobody():
+    drive = draw_drive(5, 0, 12.0, Density(traffic=3))
+    times = np.arange(0, 12, 0.25)
+    poses = drive.poses(times)
+    _, d = drive.world.ground.roads[0].coordinates(poses[:, 0], poses[:, 1])
+    assert np.abs(d - drive.lane).max() < 0.2
+    ahead = np.diff(poses[:, :2], axis=0)
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    moving = np.linalg.norm(ahead, axis=1) > 0.3
+    np.testing.assert_allclose(np.cos(heading - poses[:-1, 3])[moving], 1, atol=0.01)
+    for time, pose in zip(times, poses, strict=True):
+        now = drive.moment(time)
+        gap = np.linalg.norm(now.place[now.present, :2] - pose[:2], axis=1)
+        vehicles = np.isin(drive.actors.kind[now.present], ["car", "van", "truck", "bus"])
+        assert gap[vehicles].min(initial=99) > 1.5
+
+
+def test_density_does_what_it_says():
+    base = LabelledStreets(6, 1, SMALL)._worlds[0][0]
+    bare = LabelledStreets(6, 1, SMALL, Options(density=Density(0, 0, 0, 0)))._worlds[0][0]
+    kinds = set(bare.things["kind"])
+    assert not kinds & {"person", "tree", "bush", "thicket"}
+    assert len(bare.things) < len(base.things)
+    with pytest.raises(ValueError, match="expected traffic as a factor"):
+        Density(traffic=-1).of(None)  # type: ignore[arg-type]
+
+
+def test_rain_extinction_is_the_integral():
+    """pi/4 1e-6 integral of D^2 2 N(D) dD with Marshall-Palmer drops, by quadrature."""
+    size = np.linspace(0, 30, 300_001)
+    rate = 25.0
+    drops = 8000 * np.exp(-4.1 * rate**-0.21 * size)
+    whole = np.pi / 4 * 1e-6 * np.trapezoid(2 * size**2 * drops, size)
+    np.testing.assert_allclose(rain_extinction(rate), whole, rtol=1e-4)
+
+
+def test_strongest_drop_follows_its_counts():
+    """P(strongest < p) = exp(-count(p))."""
+    powers, count, _, _ = _drop_table(30.0, 1.0)
+    echo, place = strongest_drop(30.0, 1.0, np.random.default_rng(0), (200, 200))
+    for k in (60, 100, 140):
+        assert abs((echo < powers[k]).mean() - np.exp(-count[k])) < 0.02
+    assert place[echo > 0].min() >= 1.0 and np.median(place[echo > 1e-4]) < 10
+
+
+def test_fog_echo_grows_to_its_peak():
+    alpha = fog_extinction(50.0)
+    assert alpha == pytest.approx(0.06, rel=0.01)
+    peak, place = fog_echo(alpha, np.array([1.0, 5.0, 20.0, 100.0]))
+    assert np.all(np.diff(peak) >= 0) and peak[2] == peak[3]
+    assert 1 < place[3] < 8
+
+
+def test_weather_takes_far_returns_and_adds_near_ones():
+    counts = []
+    for weather in (Weather(), Weather(rain=10), Weather(rain=80), Weather(fog=80), Weather(fog=20)):
+        frame = LabelledStreets(0, 1, SMALL, Options(weather=weather))[0]
+        distance = np.linalg.norm(frame.scan.xyz, axis=1)
+        counts.append([(distance > 25).sum(), ((frame.raw & 0xFFFF) == 1).sum()])
+        assert np.all((frame.scan.reflectance >= 0) & (frame.scan.reflectance <= 1))
+    far, scattered = np.array(counts).T
+    assert far[0] > far[1] > far[2] and far[0] > far[3] > far[4]
+    assert scattered[0] == 0 and scattered[2] > scattered[1] > 0 and scattered[4] > scattered[3] > 0
+
+
+def test_wrong_options_are_named():
+    with pytest.raises(ValueError, match="expected a rate|expected frames"):
+        Options(rate=0)
+    with pytest.raises(ValueError, match="expected rain of 0 to 200"):
+        Weather(rain=-1)
+    with pytest.raises(ValueError, match="expected a drive of at most"):
+        draw_drive(0, 0, 3600, speed=30.0)
+    with pytest.raises(IndexError, match=r"0\.\.3, got 4"):
+        LabelledStreets(0, 4, Sensor("line", (-10.0,), 64))[4]
