@@ -1,0 +1,117 @@
+"""Why a network of synthetic streets misreads real scans, and what helps: the sensor's height, tilt and response vary.
+
+python benchmarks/street_classes.py --scans 360 --minutes 15 --judge FOLDER...
+
+Goes on training the network of street-1 on streets whose sensor stands a few centimetres higher or lower, tilts by half
+a degree, and answers a little brighter or darker, each scan its own; classes differ in brightness from scan to scan.
+No real scan is learned from. Judged on folders of labelled scans, as `benchmarks/street.py --classes` reads them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from street import SENSOR, WORD, labelled
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.metrics.reconstruction import class_iou
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.streets.reader import SyntheticStreets, Worlds
+from lidarsynth.streets.sensor_model import Optics
+from lidarsynth.systems.segmentation.training import Batch, CrossEntropy, confusion
+from lidarsynth.weights.load import load_parts
+
+PER_WORLD, BATCH, COLUMNS = 6, 4, 512
+
+
+def varied(seed: int, count: int) -> Iterator[RangeImage]:
+    """Scans of which each has a sensor and materials of its own."""
+    worlds = Worlds(seed, replace(SENSOR, mount=2.0, elevations=(4.0, *SENSOR.elevations[1:])))
+    rng = np.random.default_rng((seed, 99))
+    for k in range(count):
+        tilt = (float(rng.normal(0, 0.6)), float(rng.normal(0, 0.5)))
+        sensor = replace(SENSOR, mount=float(rng.normal(1.76, 0.07)), tilt=tilt)
+        optics = Optics(gamma=float(rng.uniform(0.65, 1.2)), scale=float(rng.uniform(0.8, 1.25)),
+                        strength=float(rng.uniform(-0.02, 0.05)))  # fmt: skip
+        reader = SyntheticStreets(seed, 1 << 30, sensor, optics=optics, worlds=worlds)
+        image = reader.image(16 * (k // PER_WORLD) + int(rng.integers(16)))
+        assert image.label is not None
+        bright = rng.uniform(0.75, 1.4, 20)[image.label]
+        yield replace(image, reflectance=np.clip(image.reflectance * bright, 0, 0.99).astype(np.float32))
+
+
+def batches(images: list[RangeImage], weights: torch.Tensor, seed: int) -> Iterator[Batch]:
+    """Endless batches of cuts, mirrored and thinned at random."""
+    rng = np.random.default_rng(seed)
+    while True:
+        pixels, labels = [], []
+        for image in (images[k] for k in rng.integers(len(images), size=BATCH)):
+            assert image.label is not None
+            columns = (rng.integers(image.shape[1]) + np.arange(COLUMNS)) % image.shape[1]
+            xyz = image.points()[:, columns]
+            parts = [np.linalg.norm(xyz, axis=-1), *np.moveaxis(xyz, -1, 0), image.reflectance[:, columns]]
+            stack, label = np.stack(parts).astype(np.float32), image.label[:, columns]
+            gone = (rng.random(label.shape) < 0.1 * rng.random()) | (rng.random((64, 1)) < 0.2 * rng.random())
+            stack, label = np.where(gone, 0, stack), np.where(gone, 0, label)
+            if rng.random() < 0.5:
+                stack, label = stack[:, :, ::-1].copy(), label[:, ::-1].copy()
+                stack[2] *= -1
+            pixels.append(stack)
+            labels.append(label)
+        yield Batch(torch.from_numpy(np.stack(pixels)), torch.from_numpy(np.stack(labels)), weights)
+
+
+def judged(network: RangeNet, folders: list[Path]) -> str:
+    """mIoU of the classes there, road IoU and pixels right of each folder."""
+    lines = []
+    for folder in folders:
+        counts = confusion(network, labelled(folder))
+        iou, there = class_iou(counts, (0,)), counts.sum(1)[1:] > 0
+        right = np.trace(counts[1:, 1:]) / counts[1:].sum()
+        lines.append(f"{folder.name}: mIoU {iou[1:][there].mean():.3f}, road {iou[9]:.3f}, pixels right {right:.3f}")
+    return "; ".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scans", type=int, default=360)
+    parser.add_argument("--minutes", type=float, default=15)
+    parser.add_argument("--judge", type=Path, nargs="+", default=[])
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    network = load_parts(WORD)[1]
+    assert isinstance(network, RangeNet)
+    print("before:", judged(network, args.judge), flush=True)
+    images = list(varied(31, args.scans))
+    labels = np.stack([image.label for image in images if image.label is not None])
+    shares = np.bincount(labels.ravel(), minlength=20)[1:] / max((labels > 0).sum(), 1)
+    weights = torch.tensor([0.0, *(1 / np.log(1.02 + shares))], dtype=torch.float32)
+    objective, start, step = CrossEntropy(network), time.monotonic(), 0
+    optimizer = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=1e-4)
+    for batch in batches(images, weights, 0):
+        part = (time.monotonic() - start) / (60 * args.minutes)
+        if part >= 1:
+            break
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-3 * min(1, (step + 1) / 20) * (0.5 + 0.5 * np.cos(np.pi * part))
+        network.train()
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = objective(batch)["cross_entropy"].mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        step += 1
+        if step % 100 == 0:
+            print(step, f"{loss.item():.3f}", flush=True)
+    network.eval()
+    print(f"after {step} steps:", judged(network, args.judge), flush=True)
+
+
+if __name__ == "__main__":
+    main()

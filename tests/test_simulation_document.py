@@ -1,0 +1,41 @@
+"""docs/simulation.md as a new user walks it: one scan of a small sensor, drives of two frames, one process."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from test_readme import REPO_ROOT, blocks, commands, smaller
+
+from lidarsynth.cli.main import main
+
+pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+
+DOC = REPO_ROOT / "docs" / "simulation.md"
+SHOWN = blocks(DOC.read_text())
+
+
+def small(words: list[str]) -> list[str]:
+    line = shlex.join(smaller(words))
+    line = re.sub(r"--frames \d+", "--frames 2", re.sub(r"--sensor \S+", "", line))
+    return [*shlex.split(line), "--sensor", "own.toml", "--workers", "1"]
+
+
+def test_the_walk_through_walks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.chdir(tmp_path)
+    (toml,) = ("\n".join(block.lines) for block in SHOWN if block.language == "toml")
+    (tmp_path / "own.toml").write_text(toml.replace("width = 900", "width = 128"))
+    for words in (c for b in SHOWN if b.language == "bash" and b.run for c in commands(b)):
+        main(small(words)[1:])  # a refusal is a SystemExit
+        assert "labelled scans of own" in capsys.readouterr().out
+    for name in ("places", "detection", "drives", "scenes", "wet", "fog"):
+        assert (tmp_path / name / "overview.png").exists() and (tmp_path / name / "streets.json").exists(), name
+    assert (tmp_path / "drives/sequences/00/poses.txt").read_text().count("\n") == 2
+    tracks = json.loads((tmp_path / "drives/sequences/00/tracks.json").read_text())
+    assert all(set(track["frames"]) <= {"0", "1"} for track in tracks.values())
+    assert (tmp_path / "scenes/v1.0-trainval/sample_annotation.json").exists()
+    (python,) = ("\n".join(block.lines) for block in SHOWN if block.language == "python")
+    names: dict = {}
+    exec(compile(python, str(DOC), "exec"), names)
+    assert len(names["frame"].scan) > 5000
