@@ -1,9 +1,10 @@
 """Why a network of synthetic streets misreads real scans, and what helps: the sensor's height, tilt and response vary.
 
+python benchmarks/street_classes.py --why FOLDER          real scans with one thing made as the streets have it
 python benchmarks/street_classes.py --scans 360 --minutes 15 --judge FOLDER...
 
-Goes on training the network of street-1 on streets whose sensor stands a few centimetres higher or lower, tilts by half
-a degree, and answers a little brighter or darker, each scan its own; classes differ in brightness from scan to scan.
+The second goes on training the network of street-1 on streets whose sensor stands a few centimetres higher or lower,
+tilts by half a degree, and answers a little brighter or darker, each scan its own; classes differ in brightness from scan to scan.
 No real scan is learned from. Judged on folders of labelled scans, as `benchmarks/street.py --classes` reads them.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,25 +69,68 @@ def batches(images: list[RangeImage], weights: torch.Tensor, seed: int) -> Itera
 
 
 def judged(network: RangeNet, folders: list[Path]) -> str:
-    """mIoU of the classes there, road IoU and pixels right of each folder."""
-    lines = []
-    for folder in folders:
-        counts = confusion(network, labelled(folder))
-        iou, there = class_iou(counts, (0,)), counts.sum(1)[1:] > 0
-        right = np.trace(counts[1:, 1:]) / counts[1:].sum()
-        lines.append(f"{folder.name}: mIoU {iou[1:][there].mean():.3f}, road {iou[9]:.3f}, pixels right {right:.3f}")
-    return "; ".join(lines)
+    """mIoU of the classes there, IoU of road and vegetation, and pixels right of each folder."""
+    return "; ".join(f"{folder.name}: {scores(network, labelled(folder))}" for folder in folders)
+
+
+def scores(network: RangeNet, images: Sequence[RangeImage]) -> str:
+    """Cells of a table row."""
+    counts = confusion(network, images)
+    iou, there = class_iou(counts, (0,)), counts.sum(1)[1:] > 0
+    right = np.trace(counts[1:, 1:]) / counts[1:].sum()
+    return f"{iou[1:][there].mean():.3f} | {iou[9]:.3f} | {iou[11]:.3f} | {iou[13]:.3f} | {iou[15]:.3f} | {right:.3f}"
+
+
+def why(network: RangeNet, folder: Path) -> Iterator[str]:
+    """Rows: the real scans as they are, then with one thing made as the streets have it."""
+    real = labelled(folder)
+    streets = [SyntheticStreets(12, 1 << 40, SENSOR, apart=True).image(k) for k in range(1024, 1032)]
+    classes = np.arange(20)
+    medians = [np.array([_median(images, k) for k in classes]) for images in (real, streets)]
+    yield "| real scans | mIoU | road | sidewalk | building | vegetation | pixels right |"
+    yield "|---|---|---|---|---|---|---|"
+    yield f"| as they are | {scores(network, real)} |"
+    for shift in (-0.2, -0.1, 0.1):
+        yield f"| {shift:+.1f} m higher | {scores(network, [_raised(image, shift) for image in real])} |"
+    every = [np.quantile(np.concatenate([i.reflectance[i.mask] for i in of]), np.linspace(0, 1, 101))
+             for of in (real, streets)]  # fmt: skip
+    spaced = every[0] + 1e-6 * np.arange(101)
+    alike = [_answering(image, np.interp(image.reflectance, spaced, every[1])) for image in real]
+    yield f"| reflectance with the streets' quantiles | {scores(network, alike)} |"
+    both = [_raised(image, -0.1) for image in alike]
+    yield f"| that, and -0.1 m | {scores(network, both)} |"
+    ratio = np.where((medians[0] > 0.02) & (medians[1] > 0.02), medians[1] / np.maximum(medians[0], 0.02), 1)
+    fitted = [_answering(image, image.reflectance * ratio[image.label]) for image in real]
+    yield f"| reflectance with the streets' median of each class | {scores(network, fitted)} |"
+
+
+def _median(images: Sequence[RangeImage], label: int) -> float:
+    values = np.concatenate([image.reflectance[image.mask & (image.label == label)] for image in images])
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _raised(image: RangeImage, height: float) -> RangeImage:
+    return replace(image, xyz=(image.points() + np.array([0, 0, height])).astype(np.float32))
+
+
+def _answering(image: RangeImage, reflectance: np.ndarray) -> RangeImage:
+    return replace(image, reflectance=np.where(image.mask, np.clip(reflectance, 0, 1), 0).astype(np.float32))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=360)
     parser.add_argument("--minutes", type=float, default=15)
+    parser.add_argument("--why", type=Path, help="folder of labelled scans")
     parser.add_argument("--judge", type=Path, nargs="+", default=[])
     args = parser.parse_args()
     torch.set_num_threads(1)
     network = load_parts(WORD)[1]
     assert isinstance(network, RangeNet)
+    if args.why:
+        for row in why(network, args.why):
+            print(row, flush=True)
+        return
     print("before:", judged(network, args.judge), flush=True)
     images = list(varied(31, args.scans))
     labels = np.stack([image.label for image in images if image.label is not None])

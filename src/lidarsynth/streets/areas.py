@@ -100,7 +100,8 @@ class Density:
                 raise ValueError(f"expected {name} as a factor of 0 to 100, found {factor}")
         times = {"traffic": ("traffic",), "pedestrians": ("people",), "vegetation": ("trees", "garden", "thicket")}
         new = {f: _scaled(getattr(area, f), getattr(self, word)) for word, fields in times.items() for f in fields}
-        new["parked"] = tuple(min(share, 1.0) for share in _scaled(area.parked, self.parking))
+        low, high = _scaled(area.parked, self.parking)
+        new["parked"] = (min(low, 1.0), min(high, 1.0))
         green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
         return replace(area, **new, **green, on_road=area.on_road * self.pedestrians)
 

@@ -87,7 +87,7 @@ def boxes_of(
     first = np.where(turn.first >= 0, world.thing[turn.first], -1)
     hits = np.bincount(first.ravel() + 1, minlength=len(world.things) + 1)
     found, frames = [], attitudes(sensor, poses)
-    for actor in near:
+    for actor in near.tolist():
         met = hits[actors.thing[actor] + 1]
         alone = _hits_alone(bodies, actor, moment, sensor, turn, frames, late, here[actor]) if met else 0
         front = np.array([np.cos(moment.yaw[actor]), np.sin(moment.yaw[actor]), 0]) @ to_world[:3, :3]

@@ -55,7 +55,7 @@ class MovingCaster:
         face, distance, cosine = self.fixed.cast(origins, rays)
         late = np.zeros(len(rays)) if times is None else times - self.stamp
         now = self.moment
-        for actor in self.movers:
+        for actor in self.movers.tolist():
             middle = now.place[actor] + [0, 0, self.bodies.actors.middle[actor, 2]]
             slack = np.linalg.norm(now.velocity[actor]) * 0.06
             near = meets(origins, rays, middle, self.bodies.reach[actor] + slack)
