@@ -84,8 +84,8 @@ def main() -> None:
         odometry(args.drives, args.frames, args.sensor)
     else:
         for name in ("hdl-64e-kitti", "os1-64", "vlp-16"):
-            print(speed(name, 0, 32))
-            print(speed(name, 32, 1))
+            print(speed(name, 0, 16))
+            print(speed(name, 16, 1))
 
 
 if __name__ == "__main__":
