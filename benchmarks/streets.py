@@ -70,7 +70,8 @@ def odometry(seeds: int, frames: int, name: str) -> None:
                 truth = np.stack([sensor_pose(reader.sensor, pose) for pose in drive.poses(stamps)])
                 what = "deskewed" if deskewed else "as measured, times given" if timed else "as measured, no times"
                 found = estimated(made, timed)
-                print(f"| {seed} | {what} | {errors(truth[SETTLED:], found[SETTLED:])} |", flush=True)
+                first = SETTLED if timed else 0
+                print(f"| {seed} | {what} | {errors(truth[first:], found[first:])} |", flush=True)
 
 
 def main() -> None:
