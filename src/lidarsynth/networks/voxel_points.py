@@ -1,0 +1,72 @@
+"""Between points and the voxels of a level: the mean of a voxel's points, and the value at a point of its eight corners.
+
+The point branch of SPVCNN (Tang et al. 2020), equal to its published program on torchsparse. Points are (P, 4): x, y, z in
+units of the finest voxel, as float32, and the batch.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lidarsynth.networks.sparse_convolution import OFFSETS_2, Level
+
+
+def voxels_of(points: Tensor) -> Level:
+    """The occupied unit cells floor(p) of points (P, 4), ordered by batch, x, y, z."""
+    cells = torch.floor(points).long()
+    # unique rows come sorted by their columns, so the batch goes first
+    return Level(torch.unique(cells.roll(1, 1), dim=0).roll(-1, 1))
+
+
+def voxel_of_points(points: Tensor, level: Level) -> Tensor:
+    """(P,) int64: the row of the voxel floor(p / s) * s around each point, -1 where it is not occupied."""
+    return level.find(_corner(points, level.stride).long())
+
+
+def _corner(points: Tensor, stride: int) -> Tensor:
+    """(P, 4) float32: the lower corner of each point's voxel, and the batch."""
+    return torch.cat([torch.floor(points[:, :3] / stride) * stride, points[:, 3:]], 1)
+
+
+def voxelise(features: Tensor, rows: Tensor, count: int) -> Tensor:
+    """(count, C): the mean of the point features (P, C) per voxel, 0 where none is; `rows` as `voxel_of_points` says."""
+    met = rows >= 0
+    if not met.all():
+        rows, features = rows[met], features[met]
+    total = features.new_zeros(count, features.shape[1]).index_add_(0, rows, features)
+    number = torch.bincount(rows, minlength=count).clamp(min=1)
+    return total / number[:, None].to(total)
+
+
+def corners(points: Tensor, level: Level) -> tuple[Tensor, Tensor]:
+    """Rows (P, 8) int64 of the corners around each point, -1 where free or without weight, and weights (P, 8) float32.
+
+    Trilinear weights; those of free corners are 0, and the others are divided by their sum + 1e-8.
+    """
+    stride = level.stride
+    lower = _corner(points, stride)
+    low = (points - lower)[:, :3]
+    high = (lower[:, :3] + stride) - points[:, :3]
+    base = lower.long()
+    rows, weights = [], []
+    for offset in OFFSETS_2:
+        x, y, z = (low[:, i] if side else high[:, i] for i, side in enumerate(offset))
+        weight = x * y * z / stride**3
+        near = (weight > 0).nonzero()[:, 0]  # few, where the points stand on the grid
+        found = level.find(base[near] + base.new_tensor([*offset, 0]) * stride)
+        row = base.new_full((len(points),), -1)
+        row[near] = found
+        rows.append(row)
+        weights.append(torch.where(row >= 0, weight, 0))
+    weight = torch.stack(weights, 1)
+    return torch.stack(rows, 1), weight / (weight.sum(1, keepdim=True) + 1e-8)
+
+
+def devoxelise(features: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """(P, C): the voxels' features (N, C) at the points whose `corners` are given."""
+    result = features.new_zeros(len(rows), features.shape[1])
+    for row, weight in zip(rows.unbind(1), weights.unbind(1), strict=True):
+        near = (weight > 0).nonzero()[:, 0]
+        result.index_add_(0, near, features.index_select(0, row[near]) * weight[near, None])
+    return result
