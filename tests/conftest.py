@@ -34,3 +34,9 @@ def fixture_tensors(shared: Path) -> Callable[[str], dict[str, Tensor]]:
         return load_file(path)
 
     return load
+
+
+@pytest.fixture(scope="session")
+def oracle_tensors() -> Callable[[str], dict[str, Tensor]]:
+    """`oracle_tensors("lidm_points")` -> the tensors of tests/oracles/lidm_points.safetensors, of every checkout."""
+    return lambda name: load_file(REPO_ROOT / "tests/oracles" / f"{name}.safetensors")

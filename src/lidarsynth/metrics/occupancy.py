@@ -1,0 +1,130 @@
+"""Which cells of the ground plane scans occupy: the JSD and the minimum matching distance of LiDAR-Diffusion (2024).
+
+A cell counts once per scan, however many points lie in it. Cells over -extent < x, y < extent, strict, of `cell` metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lidarsynth.metrics.distributions import Array, as_tensor
+
+EXTENT = 50.0  # metres
+
+
+def occupied_cells(points: Array, cell: float = 0.05, extent: float = EXTENT) -> np.ndarray:
+    """(n,) int32, rising: numbers x * size + y of the cells that points (N, 3) in metres lie in, size = 2 extent / cell.
+
+    Cell = floor(p / cell) in float32, as published; 2,000 a side by default. Raises ValueError for another shape, NaN.
+    """
+    xy = as_tensor(points).cpu().numpy().astype(np.float32)
+    if xy.ndim != 2 or xy.shape[1] != 3:
+        raise ValueError(f"points must be (N, 3), got {xy.shape}")
+    xy = xy[(np.abs(xy[:, :2]) < extent).all(1), :2]
+    size = side(cell, extent)
+    x, y = np.floor(xy / np.float32(cell)).astype(np.int64).T + size // 2
+    return np.unique(x * size + y).astype(np.int32)
+
+
+def side(cell: float, extent: float = EXTENT) -> int:
+    """Cells along one side of the square."""
+    return 2 * round(extent / cell)
+
+
+class Occupancy:
+    """Of scans that arrive one by one: in how many each cell is occupied, and the cells of the first `keep` of them.
+
+    count   scans so far
+    pooled  (size, size) int32, for `jensen_shannon_distance`: each scan adds 1 to each of its cells (16 MB)
+    scans   occupied cells of `matching` metres, int32, one array per scan, for `minimum_matching`
+
+    `merge` adds what another process gathered.
+    """
+
+    def __init__(self, cell: float = 0.05, matching: float = 0.5, extent: float = EXTENT, keep: int | None = None):
+        self.cell, self.matching, self.extent, self.keep = cell, matching, extent, keep
+        self.count = 0
+        self.pooled = np.zeros((side(cell, extent), side(cell, extent)), np.int32)
+        self.scans: list[np.ndarray] = []
+
+    def update(self, points: Array) -> None:
+        """Take in the points (N, 3) of one scan, metres. Raises ValueError as `occupied_cells` does."""
+        self.pooled.ravel()[occupied_cells(points, self.cell, self.extent)] += 1
+        self.count += 1
+        if self.keep is None or len(self.scans) < self.keep:
+            self.scans.append(occupied_cells(points, self.matching, self.extent))
+
+    def merge(self, other: Occupancy) -> None:
+        """Take in all that `other` has seen; it stays as it is. Raises ValueError for other cells."""
+        own, its = ((o.cell, o.matching, o.extent) for o in (self, other))
+        if own != its:
+            raise ValueError(f"expected cells of {own} (JSD, matching, extent, metres), found {its}")
+        self.count += other.count
+        self.pooled += other.pooled
+        self.scans += other.scans
+        del self.scans[self.keep :]
+
+
+def total_variation(p: Array, q: Array) -> float:
+    """Sum of |p - q| of two tables of counts, each divided by its sum: 0 for equal, 2 for disjoint ones (R3DPA)."""
+    first, second = (as_tensor(values).double() for values in (p, q))
+    if first.shape != second.shape or not (first.sum() > 0 and second.sum() > 0):
+        raise ValueError(f"expected counts of one shape, found {tuple(first.shape)} and {tuple(second.shape)}")
+    return float((first / first.sum() - second / second.sum()).abs().sum())
+
+
+def minimum_matching(
+    reference: Sequence[np.ndarray],
+    samples: Sequence[np.ndarray],
+    size: int,
+    on_scan: Callable[[int, int], object] | None = None,
+) -> float:
+    """Mean over reference scans of the least squared Chamfer distance to a sample, in units of the square's side.
+
+    Scans are their occupied cells, numbers x * size + y. Distances are exact, and each scan's table of them is made
+    once: 2,000 against 2,000 scans of 0.5 m cells take a minute or two, 1,000 against 2,000 of 5 cm cells an hour.
+    """
+    table = chamfer_table(reference, samples, size, on_scan)
+    return float(table.min(1).mean())
+
+
+def chamfer_table(
+    reference: Sequence[np.ndarray],
+    samples: Sequence[np.ndarray],
+    size: int,
+    on_scan: Callable[[int, int], object] | None = None,
+) -> np.ndarray:
+    """(R, S) float64: (mean over a of min_b |a - b|^2 + mean over b of min_a |a - b|^2) / 2, unit size^2 cells.
+
+    Raises ValueError for no scan, or one without any cell; ImportError without scipy.
+    """
+    if not reference or not samples or not all(map(len, (*reference, *samples))):
+        raise ValueError("expected scans with points within the square, found none or one without")
+    total = len(reference) + len(samples)
+    table = np.zeros((len(reference), len(samples)))
+    for own, others, rows, done in (
+        (reference, samples, table, 0),
+        (samples, reference, table.T, len(reference)),
+    ):
+        cells, starts = np.concatenate(others), np.cumsum([0, *map(len, others)])[:-1]
+        counts = np.diff([*starts, len(cells)])
+        for i, scan in enumerate(own):
+            rows[i] += np.add.reduceat(_squared_distances(scan, size)[cells], starts) / counts
+            if on_scan:
+                on_scan(done + i + 1, total)
+    return table / (2 * size**2)
+
+
+def _squared_distances(cells: np.ndarray, size: int) -> np.ndarray:
+    """(size * size,) float64 whole numbers: of every cell, the squared distance to the nearest of `cells`, in cells."""
+    try:
+        from scipy.ndimage import distance_transform_edt
+    except ImportError as error:
+        raise ImportError("distances of cells need scipy: pip install 'lidarsynth[metrics]'") from error
+    free = np.ones(size * size, bool)
+    free[cells] = False
+    distances = distance_transform_edt(free.reshape(size, size))
+    assert isinstance(distances, np.ndarray)
+    return np.rint(np.square(distances, out=distances), out=distances).ravel()
