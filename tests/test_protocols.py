@@ -18,7 +18,8 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.distributions import kernel_distance
 from lidarsynth.networks.pointnet import read_pointnet
-from lidarsynth.networks.rangenet import RangeNet, read_rangenet
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.networks.rangenet_archive import read_rangenet
 
 GRID = Sensor("grid", (2.0, 0.0, -2.0, -4.0, -8.0, -12.0, -16.0, -20.0), 32, 0.1, 100.0)
 

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from lidarsynth.metrics.knn import knn_labels, smooth_labels
-from lidarsynth.networks.rangenet import RangeNet, frechet_features, frechet_positions, read_rangenet
+from lidarsynth.networks.rangenet import RangeNet, frechet_features, frechet_positions
+from lidarsynth.networks.rangenet_archive import read_rangenet
 from lidarsynth.networks.tensors import load_state
 
 
@@ -141,8 +142,8 @@ WHOLE |= {"net/arch_cfg.yaml": CONFIG}
         ({"/etc/backbone": b"", **WHOLE}, "found '/?etc/backbone'"),
         ({**WHOLE, "net/backbone": link("net/backbone")}, "found 'net/backbone' .a link"),
         ({**WHOLE, "other/backbone": b""}, "found 'other/backbone' .again"),
-        ({**WHOLE, "net/arch_cfg.yaml": b"a: [1"}, "arch_cfg.yaml: expected the fields of RangeNet"),
-        ({**WHOLE, "net/arch_cfg.yaml": b"!!python/object/apply:os.getcwd []"}, "expected the fields of RangeNet"),
+        ({**WHOLE, "net/arch_cfg.yaml": b"a: [1"}, "arch_cfg.yaml: expected YAML"),
+        ({**WHOLE, "net/arch_cfg.yaml": b"!!python/object/apply:os.getcwd []"}, "expected YAML"),
         ({**WHOLE, "net/arch_cfg.yaml": b"a: " + b" " * (1 << 20)}, "at most 1048576 bytes"),
         ({**WHOLE, "net/arch_cfg.yaml": CONFIG.replace(b"32,", b"16,", 1)}, "OS 32 .* found .16,"),
         ({**WHOLE, "net/arch_cfg.yaml": CONFIG.replace(b"21", b"22")}, "21 or 53 layers, found 22"),

@@ -39,7 +39,9 @@ def test_interpolation_keeps_linear_functions_where_all_corners_are_and_constant
     holes = Level(full[torch.rand(len(full), generator=generator) < 0.7], 2)
     rows, weights = corners(points, holes)
     some = (rows >= 0).any(1)
-    torch.testing.assert_close(devoxelise(torch.ones(len(holes), 1), rows, weights)[some], torch.ones(int(some.sum()), 1))
+    torch.testing.assert_close(
+        devoxelise(torch.ones(len(holes), 1), rows, weights)[some], torch.ones(int(some.sum()), 1)
+    )
 
 
 def test_points_without_a_voxel_take_no_part():

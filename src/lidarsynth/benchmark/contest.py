@@ -14,7 +14,7 @@ from lidarsynth.benchmark.store import Store, open_store
 from lidarsynth.data.cache import sha256 as sha256_of_file
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, load_networks
 from lidarsynth.evaluation.protocols import get_protocol
-from lidarsynth.networks.rangenet import read_rangenet
+from lidarsynth.networks.rangenet_archive import read_rangenet
 from lidarsynth.systems.fingerprint import fingerprint
 from lidarsynth.systems.scan_model import ScanModel
 

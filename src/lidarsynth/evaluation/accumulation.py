@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import random
 import time
 from collections.abc import Callable, Sequence
@@ -13,12 +14,14 @@ from torch import nn
 
 from lidarsynth.data.cache import sha256
 from lidarsynth.evaluation.image_sets import ImageSet
-from lidarsynth.evaluation.protocols import EvaluationProtocol, Network
+from lidarsynth.evaluation.protocol import EvaluationProtocol, Network
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
 from lidarsynth.experiment.folder import WEIGHTS
 from lidarsynth.metrics.point_sets import spread
 from lidarsynth.networks.pointnet import read_pointnet
-from lidarsynth.networks.rangenet import RangeNet, read_rangenet
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.networks.rangenet_archive import read_lidm_rangenet, read_rangenet
+from lidarsynth.networks.sparse_weights import read_sparse
 from lidarsynth.networks.street_features import StreetFeatures
 from lidarsynth.weights.download import cache_folder, download
 from lidarsynth.weights.load import load_parts, shipped
@@ -31,6 +34,10 @@ OnImages: TypeAlias = Callable[[str, int, int], object] | None  # (what, images 
 URLS: dict[str, str] = {
     "rangenet": "https://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models",
     "pointnet": "https://github.com/microsoft/SpareNet/raw/HEAD/Frechet",
+    # LiDM's weights as R2Flow's authors packed them; LiDM's own lie in folders on a drive that no program can ask
+    "lidm-rangenet": "https://github.com/kazuto1011/r2flow/releases/download/weights",
+    "minkowskinet": "https://github.com/kazuto1011/r2flow/releases/download/weights",
+    "spvcnn": "https://github.com/kazuto1011/r2flow/releases/download/weights",
 }
 
 
@@ -61,8 +68,10 @@ def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu",
             loaded.weights[network.kind] = sha256(own[name] / WEIGHTS)
             continue
         path = cache_folder() / name
+        if (folder := cache_folder() / name.removesuffix(".tar.gz")).is_dir():
+            path = folder
         try:
-            for done, total in download(f"{URLS[network.kind]}/{name}", path):
+            for done, total in download(f"{URLS[network.kind]}/{name}", path) if path != folder else ():
                 if on_images:
                     on_images(f"download {name}", done, total or done)
         except ValueError as error:
@@ -72,8 +81,17 @@ def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu",
             loaded.networks[network.kind] = _read_network(network, path).to(device)
         except ValueError as error:
             raise ValueError(f"{error}; delete the file to download it again") from None
-        loaded.weights[network.kind] = sha256(path)
+        loaded.weights[network.kind] = _sha256_of(path)
     return loaded
+
+
+def _sha256_of(path: Path) -> str:
+    """Of a file, or of all files of a folder."""
+    if path.is_file():
+        return sha256(path)
+    return hashlib.sha256(
+        "".join(sha256(file) for file in sorted(path.iterdir()) if file.is_file()).encode()
+    ).hexdigest()
 
 
 def _read_shipped(word: str) -> RangeNet:
@@ -85,7 +103,9 @@ def _read_shipped(word: str) -> RangeNet:
 def _read_network(network: Network, path: Path) -> nn.Module:
     if network.kind == "pointnet":
         return read_pointnet(path)
-    rangenet = read_rangenet(path)
+    if network.kind == "minkowskinet" or network.kind == "spvcnn":
+        return read_sparse(path, network.kind)
+    rangenet = read_lidm_rangenet(path) if network.kind == "lidm-rangenet" else read_rangenet(path)
     if rangenet.layers != network.layers:
         raise ValueError(f"{path}: expected RangeNet-{network.layers}, found RangeNet-{rangenet.layers}")
     return rangenet
@@ -93,7 +113,10 @@ def _read_network(network: Network, path: Path) -> nn.Module:
 
 @dataclass(frozen=True)
 class Selection:
-    """Numbers of the images that count for features, for the bird's eye view, and for the measures of point sets."""
+    """Numbers of the images that count for features, for the bird's eye view, and for the measures of point sets.
+
+    Of scans as lists of points: for features, for the JSD, and for the matching distance.
+    """
 
     features: frozenset[int]
     bev: frozenset[int]
@@ -113,6 +136,8 @@ def select(
     if role == "samples":
         limits = (protocol.samples, protocol.samples_bev)
         features, bev = (frozenset(range(len(names))[:limit]) for limit in limits)
+        if protocol.clouds:
+            return Selection(features, bev, bev & frozenset(range(len(names))[: protocol.clouds.samples]))
         return Selection(features, bev, _spread(protocol, range(len(names))[: protocol.samples]))
     chosen = []
     for sequences, limit in ((protocol.sequences, protocol.real), (protocol.sequences_bev, protocol.real_bev)):
@@ -122,6 +147,11 @@ def select(
             random.Random(0).shuffle(numbers)  # as R2DM and LiDARGen order their real scans
             numbers = numbers[: samples if limit == 0 else limit]
         chosen.append(frozenset(numbers))
+    if protocol.clouds:
+        matched = sorted(chosen[1])
+        if protocol.clouds.real is not None:
+            random.Random(0).shuffle(matched)
+        return Selection(chosen[0], chosen[1], frozenset(matched[: protocol.clouds.real]))
     return Selection(chosen[0], chosen[1], _spread(protocol, range(len(names))))
 
 
@@ -162,9 +192,15 @@ def gather(
     saved = time.monotonic()
     for start in range(done, len(numbers), batch_size):
         batch = numbers[start : start + batch_size]
-        arrays = [images.image(i, empty.sensor, projection, resize=empty.role == "real") for i in batch]
-        wanted = ([i in numbered for i in batch] for numbered in (chosen.features, chosen.bev, chosen.sets))
-        statistics.update(arrays, *wanted)
+        features, bev, sets = (
+            [i in numbered for i in batch] for numbered in (chosen.features, chosen.bev, chosen.sets)
+        )
+        if clouds := empty.protocol.clouds:
+            scans = [images.points(i, empty.sensor, clouds, empty.role == "real") for i in batch]
+            statistics.update_clouds(scans, features, bev, sets)
+        else:
+            arrays = [images.image(i, empty.sensor, projection, resize=empty.role == "real") for i in batch]
+            statistics.update(arrays, features, bev, sets)
         if on_images:
             on_images(empty.role, start + len(batch), len(numbers))
         if unfinished and time.monotonic() - saved > SAVE_EVERY:

@@ -16,7 +16,8 @@ from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
 from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, sensor_of, stem_of
 from lidarsynth.evaluation.pairs import Pairs, classes_of
-from lidarsynth.evaluation.protocols import EvaluationProtocol, get_protocol
+from lidarsynth.evaluation.protocol import EvaluationProtocol
+from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
@@ -77,7 +78,11 @@ class _Run:
             return self.fallback()
         if files := _statistics_files(_single(reference)):
             return load_statistics(files[0], self.protocol)[0].sensor
-        return sensor_of(image_set(reference).item(0), self.fallback())
+        return self.sensor_of(image_set(reference), self.fallback())
+
+    def sensor_of(self, images: ImageSet, fallback: Sensor) -> Sensor:
+        """Of a set by its first image; lists of points are judged as the protocol's own sensor draws them."""
+        return self.fallback() if self.protocol.clouds else sensor_of(images.item(0), fallback)
 
     def networks(self, sensor: Sensor) -> Loaded:
         return load_networks(self.protocol, sensor.width, self.device, self.on_images)
@@ -149,7 +154,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         warnings = unlike_names(run.protocol, truth.names)
     fallback = real.sensor if real else run.fallback()
     if truth and not run.sensor:
-        fallback = sensor_of(truth.item(0), fallback)
+        fallback = run.sensor_of(truth, fallback)
     loaded = Loaded()
     if files:
         fake, more = merged(files, run.protocol)
@@ -158,11 +163,11 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
             loaded = run.networks(fake.sensor)
     else:
         judged = image_set(samples)
-        sensor = sensor_of(judged.item(0), fallback)
+        sensor = run.sensor_of(judged, fallback)
         loaded, told["samples"] = run.networks(sensor), judged.source
         fake, _ = run.statistics(judged, sensor, "samples", loaded)
     if truth:
-        sensor = _at_size(sensor_of(truth.item(0), fake.sensor), fake.sensor)
+        sensor = _at_size(run.sensor_of(truth, fake.sensor), fake.sensor)
         real, kept = run.statistics(truth, sensor, "real", loaded, fake.count)
         real_files = [kept] if kept else []
     assert real
@@ -238,7 +243,7 @@ def gather_part(
         raise ValueError(f"{record.title} takes as many of the reference as there are samples: expected it to be "
                          "gathered with them, found it alone")  # fmt: skip
     run, images = _Run(record, sensor, batch_size, device, on_images), image_set(samples)
-    spec = sensor_of(images.item(0), run.sensor_like(reference))
+    spec = run.sensor_of(images, run.sensor_like(reference))
     role: Role = "real" if side == "reference" else "samples"
     statistics, _ = run.statistics(images, spec, role, run.networks(spec), part=part)
     return save_statistics(out, statistics, {"source": images.source, "part": part})

@@ -16,9 +16,11 @@ import torch
 from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
+from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.files.arrays import image_of, unzip
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import READERS, read, read_image
+from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -53,8 +55,23 @@ class ImageSet:
         try:
             return as_image(self.item(i), sensor, projection, resize)
         except ValueError as error:
-            text = str(error)
-            raise ValueError(text if text.startswith(self.names[i]) else f"{self.names[i]}: {text}") from None
+            raise self._named(i, error) from None
+
+    def points(self, i: int, sensor: Sensor, clouds: Clouds, real: bool) -> Scan:
+        """The points of image i as the record takes those of real scans or of samples; no reflectance.
+
+        sensor  of tensors, at their size
+        Raises ValueError that begins with the image's name, also for a scan without any point in range.
+        """
+        try:
+            xyz = points_of(self.item(i), sensor, clouds, real)
+        except ValueError as error:
+            raise self._named(i, error) from None
+        return Scan(xyz, np.zeros(len(xyz), np.float32))
+
+    def _named(self, i: int, error: ValueError) -> ValueError:
+        text = str(error)
+        return ValueError(text if text.startswith(self.names[i]) else f"{self.names[i]}: {text}")
 
 
 def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) -> ImageSet:
@@ -168,6 +185,24 @@ def as_image(item: Item, sensor: Sensor, projection: str, resize: bool = False) 
         raise ValueError(f"expected images of one size, {size[0]} x {size[1]}, found one of {item.shape[0]} x "
                          f"{item.shape[1]}")  # fmt: skip
     return item if item.shape == size else thin(item, *size)
+
+
+def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> np.ndarray:
+    """(n, 3) float32 metres of any stored form, as `ImageSet.points`. Raises ValueError for NaN, or none in range."""
+    if isinstance(item, Tensor):
+        item = from_tensor(item, sensor_of(item, sensor))
+    xyz = (item.xyz if isinstance(item, Scan) else item.points()[item.mask]).astype(np.float32)
+    if not np.isfinite(xyz).all():
+        raise ValueError(f"expected finite points, found {np.sum(~np.isfinite(xyz).all(1))} with NaN or infinity")
+    distance = np.linalg.norm(xyz, axis=1)
+    within = (distance > clouds.near) & (distance < clouds.far)
+    if not within.any():
+        raise ValueError(f"expected points between {clouds.near:g} and {clouds.far:g} m, found none of {len(xyz)}")
+    if not (real and clouds.redrawn):
+        return xyz[within] if clouds.gated and not real else xyz
+    if isinstance(item, RangeImage) and item.xyz is None and on_corner_grid(item.sensor):
+        return decoded(item.range * item.mask, clouds.near, clouds.far)  # drawn once already
+    return drawn_and_coded(xyz, clouds.near, clouds.far)
 
 
 def _divides(size: tuple[int, int], larger: tuple[int, int]) -> bool:

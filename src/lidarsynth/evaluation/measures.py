@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from torch import Tensor
 
-from lidarsynth.evaluation.protocols import Row, Sets
+from lidarsynth.evaluation.protocol import Row, Sets
 from lidarsynth.evaluation.statistics import Statistics
 from lidarsynth.metrics.distributions import frechet_distance, gaussian_mmd, jensen_shannon_distance, kernel_distance
 from lidarsynth.metrics.neighbours import (
@@ -18,6 +18,7 @@ from lidarsynth.metrics.neighbours import (
     minimum_matching_distance,
     nearest_neighbour_accuracy,
 )
+from lidarsynth.metrics.occupancy import Occupancy, cells_along, minimum_matching, total_variation
 from lidarsynth.metrics.point_sets import earth_movers_distance, sphere_counts
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 
@@ -105,6 +106,25 @@ def set_distances(samples: Statistics, real: Statistics) -> tuple[np.ndarray, np
     )
 
 
+def _cloud_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return jensen_shannon_distance(*(_occupancy(side).pooled for side in (samples, real)))
+
+
+def _cloud_tv(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    return total_variation(*(_occupancy(side).pooled for side in (samples, real)))
+
+
+def _cloud_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    counts = _occupancy(real)
+    reference, fake = ([scan for scan in _occupancy(side).scans if len(scan)] for side in (real, samples))
+    return minimum_matching(reference, fake, cells_along(counts.matching, counts.extent))
+
+
+def _occupancy(statistics: Statistics) -> Occupancy:
+    assert statistics.occupancy
+    return statistics.occupancy
+
+
 MEASURES: dict[str, Callable[[Row, Statistics, Statistics, int], float]] = {
     "frechet": _frechet,
     "kernel": _kernel,
@@ -112,6 +132,9 @@ MEASURES: dict[str, Callable[[Row, Statistics, Statistics, int], float]] = {
     "bev-jsd": _bev_jsd,
     "drop-rate": _drop_rate,
     "beam-range": _beam_range,
+    "cloud-jsd": _cloud_jsd,
+    "cloud-mmd": _cloud_mmd,
+    "cloud-tv": _cloud_tv,
     "sets-jsd": _sets_jsd,
     "sets-coverage": _sets_coverage,
     "sets-mmd": _sets_mmd,

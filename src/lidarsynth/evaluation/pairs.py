@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from lidarsynth.evaluation.protocols import EvaluationProtocol
+from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.report import Report, Result
 from lidarsynth.evaluation.statistics import hash_of
 from lidarsynth.lidar.scan import RangeImage
@@ -21,6 +21,7 @@ from lidarsynth.metrics.reconstruction import (
     confusion_matrix,
     mean_errors,
     mean_iou,
+    point_errors,
     reconstruction_errors,
     weighted_iou,
 )
@@ -37,6 +38,7 @@ class Pairs:
     def __init__(self, protocol: EvaluationProtocol, classes: RangeNet | None = None):
         self.protocol, self.classes = protocol, classes
         self.errors: list[Errors] = []
+        self.chamfer: list[float] | None = [] if any(row.measure == "chamfer" for row in protocol.rows) else None
         self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
         self.lit = False
         self._digests = [0, 0]
@@ -45,6 +47,8 @@ class Pairs:
         """Take in a batch of images and their truths, all pixels of both. Raises ValueError for different sizes."""
         for result, truth in zip(results, truths, strict=True):
             self.errors.append(reconstruction_errors(result, truth))
+            if self.chamfer is not None:
+                self.chamfer.append(_chamfer(result, truth, self.protocol))
             self.lit |= bool(result.reflectance.any())
             self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:
@@ -64,13 +68,16 @@ class Pairs:
         """Plain lists and numbers, for a file; the inverse of `restore`."""
         errors = [list(asdict(e).values()) for e in self.errors]
         digests = [f"{digest:032x}" for digest in self._digests]
-        return {"errors": errors, "confusion": self.confusion.tolist(), "lit": self.lit, "digests": digests}
+        state = {"errors": errors, "confusion": self.confusion.tolist(), "lit": self.lit, "digests": digests}
+        return state if self.chamfer is None else {**state, "chamfer": self.chamfer}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take in what `state` of another gave."""
         self.errors += [Errors(*values) for values in state["errors"]]
         self.confusion += np.array(state["confusion"], np.int64)
         self.lit |= state["lit"]
+        if self.chamfer is not None:
+            self.chamfer += state["chamfer"]
         self._add_digests([int(digest, 16) for digest in state["digests"]])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -96,7 +103,7 @@ class Pairs:
                 reason = (missing or {}).get(row.network, f"no {row.network} is here")
             elif (row.network or row.measure == "reflectance-mae") and not self.lit:
                 reason = "the samples have no reflectance"
-            value = None if reason else MEASURES[row.measure](mean, self.confusion) * row.scale
+            value = None if reason else MEASURES[row.measure](mean, self.confusion, self.chamfer or []) * row.scale
             results.append(Result(row.name, value, row.unit, row.digits, reason))
         counts = {"samples": len(self.errors), "reference": len(self.errors)}
         names = ("samples", "reference")
@@ -106,11 +113,22 @@ class Pairs:
         return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {}, classes=classes)
 
 
-MEASURES: dict[str, Callable[[Errors, np.ndarray], float]] = {
-    "range-mae": lambda errors, confusion: errors.range_mae,
-    "reflectance-mae": lambda errors, confusion: errors.reflectance_mae,
-    "iou": lambda errors, confusion: mean_iou(confusion),
-    "iou-weighted": lambda errors, confusion: weighted_iou(confusion),
+def _chamfer(result: RangeImage, truth: RangeImage, protocol: EvaluationProtocol) -> float:
+    """CD of LiDAR-Diffusion, m^2: half the sum of both mean squared distances between the points in range."""
+    points = []
+    for image in (result, truth):
+        xyz = image.points()[image.mask]
+        distance = np.linalg.norm(xyz, axis=1)
+        points.append(xyz[(distance > protocol.near) & (distance < protocol.far)])
+    return point_errors(points[0], points[1]).chamfer_squared / 2
+
+
+MEASURES: dict[str, Callable[[Errors, np.ndarray, Sequence[float]], float]] = {
+    "range-mae": lambda errors, confusion, chamfer: errors.range_mae,
+    "reflectance-mae": lambda errors, confusion, chamfer: errors.reflectance_mae,
+    "iou": lambda errors, confusion, chamfer: mean_iou(confusion),
+    "iou-weighted": lambda errors, confusion, chamfer: weighted_iou(confusion),
+    "chamfer": lambda errors, confusion, chamfer: float(np.mean(chamfer)),
 }
 
 

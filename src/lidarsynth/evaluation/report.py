@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from lidarsynth.evaluation.measures import MEASURES, filled_scans, set_distances
-from lidarsynth.evaluation.protocols import EvaluationProtocol, Row
+from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 
@@ -99,8 +99,12 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     if protocol.samples is not None and samples.count != protocol.samples:
         told.append(f"{protocol.title} judges {protocol.samples:,} samples, found {samples.count:,}")
     size = (samples.sensor.height, samples.sensor.width)
-    own_size = protocol.measured or protocol.sets  # published with images of one size
-    if own_size and (samples.sensor.name, *size) != (protocol.sensor, protocol.height, protocol.width):
+    own_size = protocol.networks or protocol.sets  # made for, or published with, images of one sensor
+    if (
+        own_size
+        and not protocol.clouds
+        and (samples.sensor.name, *size) != (protocol.sensor, protocol.height, protocol.width)
+    ):
         told.append(f"{protocol.title} is of {protocol.height} x {protocol.width} images of {protocol.sensor}, found "
                     f"{size[0]} x {size[1]} of {samples.sensor.name}")  # fmt: skip
     if samples.count != real.count:

@@ -17,12 +17,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from lidarsynth.evaluation.features import drawn_again, features, gated
-from lidarsynth.evaluation.protocols import EvaluationProtocol, Side, get_protocol
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.evaluation.features import cloud_features, drawn_again, features, gated
+from lidarsynth.evaluation.protocol import EvaluationProtocol, Side
+from lidarsynth.evaluation.protocols import get_protocol
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, from_dict
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import Array, Moments
+from lidarsynth.metrics.occupancy import Occupancy
 from lidarsynth.metrics.point_sets import farthest_points
 from lidarsynth.metrics.sensor_report import BeamCounts
 
@@ -64,6 +66,8 @@ class Statistics:
         far = min(protocol.far, sensor.max_range)  # so that sensors of other limits compare
         counted = {row.measure for row in protocol.rows} & {"drop-rate", "beam-range"}
         self.beams = BeamCounts(replace(sensor, min_range=0.0, max_range=far), protocol.beam_step) if counted else None
+        c = protocol.clouds
+        self.occupancy = Occupancy(c.cell, c.matching, c.extent) if c else None
 
     @property
     def digest(self) -> str:
@@ -78,6 +82,24 @@ class Statistics:
         """(n, P, 3) float32: the farthest points of the images taken for the measures of point sets."""
         size = self.protocol.sets.points if self.protocol.sets else 0
         return torch.cat([torch.zeros(0, size, 3), *self._sets]).numpy()
+
+    def update_clouds(
+        self, scans: Sequence[Scan], features: Sequence[bool], counted: Sequence[bool], matched: Sequence[bool]
+    ) -> None:
+        """Take in a batch of scans; which of them count for the networks, for the JSD, for the matching distance.
+
+        Raises ValueError for a protocol of images, and for points that are not finite or out of every range.
+        """
+        clouds = self.protocol.clouds
+        if not clouds or self.occupancy is None:
+            raise ValueError(f"{self.protocol.title} judges images: expected images, found lists of points")
+        self._digest = (self._digest + sum(map(hash_of_points, scans))) % (1 << 128)
+        chosen = [scan.xyz for scan, wanted in zip(scans, features, strict=True) if wanted]
+        self.count += len(chosen)
+        for kind, network in self.networks.items() if chosen else ():
+            self.add_features(kind, cloud_features(network, chosen, clouds), [False] * len(chosen))
+        for scan, count, match in zip(scans, counted, matched, strict=True):
+            self.occupancy.update(scan.xyz, count, match)
 
     def update(
         self, images: Sequence[RangeImage], features: Sequence[bool], bev: Sequence[bool], sets: Sequence[bool] = ()
@@ -116,8 +138,8 @@ class Statistics:
         masks = np.stack([gated(image, self.protocol, self.role) for image in images])
         xyz = np.stack([image.points() for image in images]) * masks[..., None]
         for kind, network in self.networks.items():
-            size = getattr(self.protocol.network(kind), "features", 0)
-            self.add_features(kind, features(network, images, xyz, masks, size), keep)
+            record = self.protocol.network(kind)
+            self.add_features(kind, features(network, images, xyz, masks, record.features if record else 0), keep)
 
     def add_features(self, kind: str, values: Array, keep: Iterable[bool]) -> None:
         """Take in features (B, D) of a network that ran elsewhere. Raises ValueError for NaN or another D."""
@@ -165,6 +187,8 @@ class Statistics:
             free = self.protocol.keep - sum(map(len, self._kept[kind]))
             self._kept[kind].append(other.features(kind)[: max(free, 0)])
         self._sets += other._sets
+        if self.occupancy and other.occupancy:
+            self.occupancy.merge(other.occupancy)
         if self.bev and other.bev:
             self.bev.merge(other.bev)
         if self.beams and other.beams:
@@ -177,6 +201,9 @@ class Statistics:
             state |= {f"{kind}.moments.{name}": value.cpu() for name, value in moments.state().items()}
             state[f"{kind}.features"] = self.features(kind)
         state |= {f"bev.{name}": value for name, value in (self.bev.state() if self.bev else {}).items()}
+        state |= {
+            f"occupancy.{name}": value for name, value in (self.occupancy.state() if self.occupancy else {}).items()
+        }
         if self.beams:
             state["beams.pixels"] = torch.from_numpy(self.beams.pixels)
             state["beams.histogram"] = torch.from_numpy(self.beams.histogram)
@@ -193,6 +220,8 @@ class Statistics:
             self._kept[kind] = [state[f"{kind}.features"]]
         if self.bev:
             self.bev.load_state(_under(state, "bev."))
+        if self.occupancy:
+            self.occupancy.load_state(_under(state, "occupancy."))
         if self.beams:
             self.beams.pixels += state["beams.pixels"].numpy()
             self.beams.histogram += state["beams.histogram"].numpy()
@@ -208,6 +237,11 @@ def hash_of(image: RangeImage) -> int:
     """128 bits of range, reflectance and mask; the sum of those of a set is the same in any order."""
     content = b"".join(np.ascontiguousarray(v).tobytes() for v in (image.range, image.reflectance, image.mask))
     return int(blake2b(content, digest_size=16).hexdigest(), 16)
+
+
+def hash_of_points(scan: Scan) -> int:
+    """128 bits of a scan's points; as `hash_of`."""
+    return int(blake2b(np.ascontiguousarray(scan.xyz, np.float32).tobytes(), digest_size=16).hexdigest(), 16)
 
 
 def _under(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -279,6 +313,8 @@ def definition(protocol: EvaluationProtocol) -> str:
     fields = asdict(protocol)
     for text in ("source", "notes", "absent", "rows"):  # what is said and shown, not what is gathered
         del fields[text]
+    if protocol.clouds is None:  # so that protocols from before it keep their hash
+        del fields["clouds"]
     fields["measures"] = sorted({row.measure for row in protocol.rows})
     return f"v{protocol.version} {sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:16]}"
 

@@ -1,4 +1,4 @@
-"""LiDAR-Diffusion's way from points to an image and back (CVPR 2024): each pixel's ray runs through its upper left corner.
+"""LiDAR-Diffusion's way from points to an image and back (CVPR 2024): a pixel's ray runs through its upper left corner.
 
 The grid is that of our `hdl-64e`, but points out of view pile up on the border rows, and what was written last, the
 nearest, stays. Arithmetic is float32 where the published one is: points drawn twice lie exactly on corners, so that
@@ -9,9 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.lidar.sensor import Sensor
+
 TOP, BOTTOM = 3.0, -25.0  # degrees, of KITTI's sensor
 HEIGHT, WIDTH = 64, 1024
 CODE = 5.84  # binary logarithms of metres: the range code is log2(r + 1.0001) / CODE
+
+
+def on_corner_grid(sensor: Sensor) -> bool:
+    """Whether a sensor's pixels are those of this grid, as of our `hdl-64e`."""
+    rows = tuple(TOP - (TOP - BOTTOM) * i / HEIGHT for i in range(HEIGHT))
+    return sensor.edges and sensor.width == WIDTH and sensor.elevations == rows
 
 
 def corner_image(points: np.ndarray, near: float = 1.0, far: float = 56.0) -> np.ndarray:

@@ -1,13 +1,15 @@
 """Which cells of the ground plane scans occupy: the JSD and the minimum matching distance of LiDAR-Diffusion (2024).
 
-A cell counts once per scan, however many points lie in it. Cells over -extent < x, y < extent, strict, of `cell` metres.
+A cell counts once per scan, however many points lie in it. The ground is -extent < x, y < extent, strict.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lidarsynth.metrics.distributions import Array, as_tensor
 
@@ -15,45 +17,47 @@ EXTENT = 50.0  # metres
 
 
 def occupied_cells(points: Array, cell: float = 0.05, extent: float = EXTENT) -> np.ndarray:
-    """(n,) int32, rising: numbers x * size + y of the cells that points (N, 3) in metres lie in, size = 2 extent / cell.
+    """(n,) int32, rising: numbers x * size + y of the cells of points (N, 3) in metres, size = 2 extent / cell a side.
 
-    Cell = floor(p / cell) in float32, as published; 2,000 a side by default. Raises ValueError for another shape, NaN.
+    Cell = floor(p / cell) in float32, as published. Raises ValueError for another shape, NaN.
     """
     xy = as_tensor(points).cpu().numpy().astype(np.float32)
     if xy.ndim != 2 or xy.shape[1] != 3:
         raise ValueError(f"points must be (N, 3), got {xy.shape}")
     xy = xy[(np.abs(xy[:, :2]) < extent).all(1), :2]
-    size = side(cell, extent)
+    size = cells_along(cell, extent)
     x, y = np.floor(xy / np.float32(cell)).astype(np.int64).T + size // 2
     return np.unique(x * size + y).astype(np.int32)
 
 
-def side(cell: float, extent: float = EXTENT) -> int:
+def cells_along(cell: float, extent: float = EXTENT) -> int:
     """Cells along one side of the square."""
     return 2 * round(extent / cell)
 
 
 class Occupancy:
-    """Of scans that arrive one by one: in how many each cell is occupied, and the cells of the first `keep` of them.
+    """Of scans that arrive one by one: in how many each cell is occupied, and the coarser cells of some of them.
 
-    count   scans so far
+    count   scans so far that count for `pooled`
     pooled  (size, size) int32, for `jensen_shannon_distance`: each scan adds 1 to each of its cells (16 MB)
-    scans   occupied cells of `matching` metres, int32, one array per scan, for `minimum_matching`
+    scans   occupied cells of `matching` metres, int32, one array per scan, for `minimum_matching`: about 10 kB each
+            at 0.5 m, 120 kB at 5 cm
 
     `merge` adds what another process gathered.
     """
 
-    def __init__(self, cell: float = 0.05, matching: float = 0.5, extent: float = EXTENT, keep: int | None = None):
-        self.cell, self.matching, self.extent, self.keep = cell, matching, extent, keep
+    def __init__(self, cell: float = 0.05, matching: float = 0.5, extent: float = EXTENT):
+        self.cell, self.matching, self.extent = cell, matching, extent
         self.count = 0
-        self.pooled = np.zeros((side(cell, extent), side(cell, extent)), np.int32)
+        self.pooled = np.zeros((cells_along(cell, extent), cells_along(cell, extent)), np.int32)
         self.scans: list[np.ndarray] = []
 
-    def update(self, points: Array) -> None:
-        """Take in the points (N, 3) of one scan, metres. Raises ValueError as `occupied_cells` does."""
-        self.pooled.ravel()[occupied_cells(points, self.cell, self.extent)] += 1
-        self.count += 1
-        if self.keep is None or len(self.scans) < self.keep:
+    def update(self, points: Array, count: bool = True, match: bool = True) -> None:
+        """Take in the points (N, 3) of one scan, metres, for what is wanted. Raises ValueError as `occupied_cells`."""
+        if count:
+            self.pooled.ravel()[occupied_cells(points, self.cell, self.extent)] += 1
+            self.count += 1
+        if match:
             self.scans.append(occupied_cells(points, self.matching, self.extent))
 
     def merge(self, other: Occupancy) -> None:
@@ -64,7 +68,31 @@ class Occupancy:
         self.count += other.count
         self.pooled += other.pooled
         self.scans += other.scans
-        del self.scans[self.keep :]
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors by name, for a file or another process; the inverse of `load_state`."""
+        occupied = np.flatnonzero(self.pooled)
+        arrays = {
+            "count": np.array(self.count),
+            "cells": occupied.astype(np.int32),
+            "counts": self.pooled.ravel()[occupied],
+            "scans": np.concatenate([np.zeros(0, np.int32), *self.scans]),
+            "lengths": np.array([len(scan) for scan in self.scans], np.int64),
+        }
+        return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Take in what `state` of another gave. Raises ValueError where it does not fit."""
+        try:
+            arrays = {name: state[name].numpy() for name in ("count", "cells", "counts", "scans", "lengths")}
+            self.pooled.ravel()[arrays["cells"]] += arrays["counts"]
+            scans = np.split(arrays["scans"], np.cumsum(arrays["lengths"]))
+        except (KeyError, IndexError, TypeError) as error:
+            raise ValueError(f"expected the state of an Occupancy, found {error!s:.80}") from None
+        if len(scans[-1]) or arrays["lengths"].sum() != len(arrays["scans"]):
+            raise ValueError(f"expected {arrays['lengths'].sum()} cells of scans, found {len(arrays['scans'])}")
+        self.count += int(arrays["count"])
+        self.scans += scans[:-1]
 
 
 def total_variation(p: Array, q: Array) -> float:

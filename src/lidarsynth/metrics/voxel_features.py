@@ -1,4 +1,4 @@
-"""Points -> voxels for a sparse network, and its features -> one vector of a scan (FSVD, FPVD of LiDAR-Diffusion 2024)."""
+"""Points -> voxels of a sparse network, and its features -> one vector of a scan: FSVD and FPVD (Ran et al. 2024)."""
 
 from __future__ import annotations
 

@@ -1,25 +1,19 @@
 """RangeNet-21 and -53 (Milioto et al. 2019): the class of every pixel of a range image, and the features of the FRD.
 
-Parameters have the published names, so that official archives load as they are: `read_rangenet`. Label 0 is unlabeled;
-names and colours of the 20 classes are in `pictures/colours.py`.
+Parameters have the published names, so that official archives load as they are (`rangenet_archive`). Label 0 is
+unlabeled; names and colours of the 20 classes are in `pictures/colours.py`.
 """
 
 from __future__ import annotations
 
 import random
-import tarfile
-import zlib
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from io import BytesIO
-from pathlib import Path, PurePosixPath
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from lidarsynth.lidar.semantic_kitti import CLASSES
-from lidarsynth.networks.tensors import load_state, read_state
 
 BLOCKS: dict[int, tuple[int, ...]] = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # layers -> residual units per stage
 MEANS = (12.12, 10.88, 0.23, -1.04, 0.21)  # range, x, y, z in metres, remission: of SemanticKITTI's pixels
@@ -34,7 +28,7 @@ class RangeNet(nn.Module):
     width    channels of the first stage, 32 in the published networks; smaller ones are for training from scratch
     classes  number of classes, 0 included
     dropout  share of channels dropped in training, after every stage
-    means, stds  of the five input channels, for `network_input`
+    means, stds  of the input channels, for `network_input`: five, or four of a network without remission (LiDM)
 
     The image is normalised, (B, 5, H, W) with W a multiple of 32; padding is zeros, also at the seam.
     """
@@ -54,31 +48,31 @@ class RangeNet(nn.Module):
         super().__init__()
         if layers not in BLOCKS:
             raise ValueError(f"expected RangeNet with {' or '.join(map(str, BLOCKS))} layers, found {layers}")
-        if len(means) != 5 or len(stds) != 5 or min(stds) <= 0:
+        if len(means) not in (4, 5) or len(stds) != len(means) or min(stds) <= 0:
             raise ValueError(f"expected 5 means and 5 positive stds, found {list(means)} and {list(stds)}")
-        self.layers, self.width = layers, width
-        self.backbone = _Backbone(BLOCKS[layers], width, dropout)
+        self.layers, self.width, self.channels = layers, width, len(means)
+        self.backbone = _Backbone(self.channels, BLOCKS[layers], width, dropout)
         self.decoder = _Decoder(width, dropout)
         # the published head is a sequence whose second member is the convolution: keys 1.weight and 1.bias
         self.head = nn.Sequential(nn.Dropout2d(dropout), nn.Conv2d(width, classes, 3, padding=1))
-        self.register_buffer("means", torch.tensor(means).view(1, 5, 1, 1), persistent=False)
-        self.register_buffer("stds", torch.tensor(stds).view(1, 5, 1, 1), persistent=False)
+        self.register_buffer("means", torch.tensor(means).view(1, -1, 1, 1), persistent=False)
+        self.register_buffer("stds", torch.tensor(stds).view(1, -1, 1, 1), persistent=False)
 
     def network_input(self, image: Tensor, mask: Tensor) -> Tensor:
         """(B, 5, H, W) normalised image, 0 where not measured; image: range, x, y, z in metres, reflectance in [0, 1].
 
         mask  (B, 1, H, W) or (B, H, W), True or 1 where measured
         """
-        if image.ndim != 4 or image.shape[1] != 5 or mask.numel() * 5 != image.numel():
-            raise ValueError(f"expected an image (B, 5, H, W) and a mask (B, 1, H, W), "
+        if image.ndim != 4 or image.shape[1] != self.channels or mask.numel() * self.channels != image.numel():
+            raise ValueError(f"expected an image (B, {self.channels}, H, W) and a mask (B, 1, H, W), "
                              f"got {tuple(image.shape)} and {tuple(mask.shape)}")  # fmt: skip
         measured = mask.view(len(image), 1, *image.shape[2:]).bool()
         return torch.where(measured, (image - self.means) / self.stds, 0)
 
     def features(self, x: Tensor) -> Tensor:
         """(B, width, H, W): the decoder's output for the normalised image, which the FRD samples."""
-        if x.ndim != 4 or x.shape[1] != 5 or x.shape[3] % 32:
-            raise ValueError(f"x must be (B, 5, H, W) with W a multiple of 32, got {tuple(x.shape)}")
+        if x.ndim != 4 or x.shape[1] != self.channels or x.shape[3] % 32:
+            raise ValueError(f"x must be (B, {self.channels}, H, W) with W a multiple of 32, got {tuple(x.shape)}")
         return self.decoder(*self.backbone(x))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -102,11 +96,11 @@ class _Residual(nn.Module):
 
 
 class _Backbone(nn.Module):
-    """(B, 5, H, W) -> (B, 32 width, H, W / 32), and the inputs of the five stages, widest first."""
+    """(B, channels, H, W) -> (B, 32 width, H, W / 32), and the inputs of the five stages, widest first."""
 
-    def __init__(self, blocks: tuple[int, ...], width: int, dropout: float):
+    def __init__(self, channels: int, blocks: tuple[int, ...], width: int, dropout: float):
         super().__init__()
-        self.conv1 = nn.Conv2d(5, width, 3, padding=1, bias=False)
+        self.conv1 = nn.Conv2d(channels, width, 3, padding=1, bias=False)
         self.bn1 = nn.BatchNorm2d(width, momentum=0.01)
         self.enc1, self.enc2, self.enc3, self.enc4, self.enc5 = (
             _stage(
@@ -178,92 +172,14 @@ def frechet_features(network: RangeNet, image: Tensor, mask: Tensor, count: int 
     return maps.flatten(1)[:, frechet_positions(height, width, channels, count).to(maps.device)]
 
 
-def read_rangenet(path: str | Path) -> RangeNet:
-    """The network of an official archive `<name>.tar.gz`, or of a folder with its files, in evaluation mode.
+@torch.no_grad()
+def band_features(network: RangeNet, x: Tensor, rows: int = 4) -> Tensor:
+    """(B, 32 H / rows) float32 features of LiDM's FRID: means of the decoder's output over bands of whole rows.
 
-    Nothing is written to disk: the files are read in memory, weights with `weights_only`. Raises ValueError when the
-    archive is damaged, lacks a file, holds links or paths that lead outside, or another network; ImportError without
-    pyyaml.
+    x  (B, 4, H, W) as the protocol feeds it: LiDM raw metres with -1 where empty, R2Flow normalised. Index =
+    channel * bands + band. Raises ValueError for a network in training mode.
     """
-    path = Path(path)
-    files = _files_of_folder(path) if path.is_dir() else _files_of_archive(path)
-    config = _read_config(files["arch_cfg.yaml"], f"{path}: arch_cfg.yaml")
-    sensor = config["dataset"]["sensor"]
-    try:
-        network = RangeNet(config["backbone"]["extra"]["layers"], means=sensor["img_means"], stds=sensor["img_stds"])
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: arch_cfg.yaml: {error}") from None
-    parts = {"backbone": network.backbone, "segmentation_decoder": network.decoder, "segmentation_head": network.head}
-    for name, module in parts.items():
-        load_state(module, read_state(BytesIO(files[name]), f"{path}: {name}"), f"{path}: {name}")
-    return network.eval()
-
-
-# File of an archive -> the most bytes it may have; RangeNet-53's encoder has 163 MB.
-FILES: dict[str, int] = {
-    "backbone": 1 << 29,
-    "segmentation_decoder": 1 << 29,
-    "segmentation_head": 1 << 26,
-    "arch_cfg.yaml": 1 << 20,
-}
-
-
-def _files_of_folder(path: Path) -> dict[str, bytes]:
-    absent = [name for name in FILES if not (path / name).is_file()]
-    if absent:
-        raise ValueError(f"{path}: expected the files {', '.join(FILES)}, found no {', '.join(absent)}")
-    return {name: (path / name).read_bytes() for name in FILES}
-
-
-def _files_of_archive(path: Path) -> dict[str, bytes]:
-    files: dict[str, bytes] = {}
-    try:
-        with tarfile.open(path, "r:*") as archive:
-            for member in archive:
-                name = PurePosixPath(member.name).name
-                if name in FILES:
-                    _check_member(path, member, name in files)
-                    content = archive.extractfile(member)
-                    files[name] = content.read() if content else b""
-    except (OSError, EOFError, tarfile.TarError, zlib.error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ValueError(f"{path}: expected a RangeNet archive (.tar.gz), found {reason:.120}") from None
-    absent = [name for name in FILES if name not in files]
-    if absent:
-        raise ValueError(f"{path}: expected the files {', '.join(FILES)}, found no {', '.join(absent)}")
-    return files
-
-
-def _check_member(path: Path, member: tarfile.TarInfo, twice: bool) -> None:
-    place = PurePosixPath(member.name)
-    if not member.isfile() or place.is_absolute() or ".." in place.parts or twice:
-        raise ValueError(f"{path}: expected each file once, in one folder, found {member.name!r:.80} "
-                         f"({'again' if twice else 'a link or a path that leads outside'})")  # fmt: skip
-    if member.size > FILES[place.name]:
-        raise ValueError(f"{path}: expected {place.name} of at most {FILES[place.name]} bytes, found {member.size}")
-
-
-def _read_config(text: bytes, where: str) -> Mapping[str, Any]:
-    """The arch_cfg.yaml of a network that we can build, fields as in the RangeNet repository."""
-    try:
-        import yaml
-    except ImportError as error:
-        raise ImportError("RangeNet archives need pyyaml: pip install 'lidarsynth[metrics]'") from error
-    try:
-        config = yaml.safe_load(text)
-        found = [
-            config["backbone"]["OS"],
-            *(config["backbone"]["input_depth"][k] for k in ("range", "xyz", "remission")),
-        ]
-        fields = [
-            config["backbone"]["extra"]["layers"],
-            *(config["dataset"]["sensor"][k] for k in ("img_means", "img_stds")),
-        ]
-    except (yaml.YAMLError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{where}: expected the fields of RangeNet, found {str(error)!r:.100}") from None
-    if found != [32, True, True, True]:
-        raise ValueError(f"{where}: expected backbone OS 32 with range, xyz and remission, found {found}")
-    numbers = [value for values in fields[1:] for value in (values if isinstance(values, list) else [None])]
-    if not all(isinstance(value, int | float) for value in numbers):
-        raise ValueError(f"{where}: expected img_means and img_stds as numbers, found {fields[1:]}")
-    return config
+    if network.training:
+        raise ValueError("expected the network in evaluation mode, found it in training mode")
+    maps = network.features(x)
+    return maps.unflatten(2, (-1, rows)).mean((3, 4)).flatten(1)

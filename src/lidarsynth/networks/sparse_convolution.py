@@ -1,8 +1,8 @@
 """Convolutions over occupied voxels only, in plain torch: hash of voxels, gather, matmul, scatter; forward only.
 
-Equal to torchsparse 1.4 and 2.0: order of the kernel's offsets, of the coarser voxels, and of the eight corners. A voxel
-is a row (x, y, z, batch) of whole numbers in units of the finest voxel, also at coarser strides, where all of them are
-multiples of the stride. Batch comes last.
+Equal to torchsparse 1.4 and 2.0, order of the kernel's offsets, of coarser voxels and of corners included. A voxel is a
+row (x, y, z, batch) of whole numbers in units of the finest voxel, also at coarser strides, where x, y, z are multiples
+of the stride.
 """
 
 from __future__ import annotations

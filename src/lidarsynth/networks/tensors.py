@@ -3,10 +3,44 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor, nn
+
+
+def read_pickle(file: str | Path | BinaryIO, where: str) -> Any:
+    """What torch.save wrote, old formats too, read with `weights_only`, on the CPU: tensors and plain containers.
+
+    where  names the file in errors. Raises ValueError for anything else: damaged files, and pickled classes, which it
+    names, saying how a checkpoint with such becomes one of tensors.
+    """
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ValueError(f"{where}: expected weights, found {error.strerror or error}") from None
+    except Exception as error:  # a damaged pickle raises whatever it likes
+        if classes := _classes_of(file):
+            raise ValueError(f"{where}: expected tensors, found a pickle of {', '.join(classes)[:120]}, which is not "
+                             f"loaded; {CONVERT}") from None  # fmt: skip
+        reason = str(error).rpartition("WeightsUnpickler error:")[2].strip().partition("\n")[0]
+        raise ValueError(f"{where}: expected weights, found a damaged or unsafe file ({reason:.120})") from None
+
+
+CONVERT = (  # loading it for good runs what it names, so not here and not at the user's desk
+    'if you trust its origin, convert it once in a container without network: python -c "import torch; '
+    "torch.save(torch.load('model.ckpt', map_location='cpu', weights_only=False)['state_dict'], 'tensors.ckpt')\""
+)
+
+
+def _classes_of(file: str | Path | BinaryIO) -> list[str]:
+    """Names of the classes and functions that a zip checkpoint wants to import, without importing any; [] of others."""
+    try:
+        if not isinstance(file, str | Path):
+            file.seek(0)
+        return sorted(torch.serialization.get_unsafe_globals_in_checkpoint(file))
+    except Exception:  # not of the zip format, or damaged
+        return []
 
 
 def read_state(file: str | Path | BinaryIO, where: str) -> dict[str, Tensor]:
@@ -14,13 +48,7 @@ def read_state(file: str | Path | BinaryIO, where: str) -> dict[str, Tensor]:
 
     where  names the file in errors. Raises ValueError for anything else, damaged files and pickled code included.
     """
-    try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise ValueError(f"{where}: expected weights, found {error.strerror or error}") from None
-    except Exception as error:  # a damaged pickle raises whatever it likes
-        reason = str(error).rpartition("WeightsUnpickler error:")[2].strip().partition("\n")[0]
-        raise ValueError(f"{where}: expected weights, found a damaged or unsafe file ({reason:.120})") from None
+    state = read_pickle(file, where)
     if not isinstance(state, dict) or not all(isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()):
         raise ValueError(f"{where}: expected tensors by name, found {type(state).__name__}")
     return state

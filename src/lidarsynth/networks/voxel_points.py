@@ -1,7 +1,7 @@
-"""Between points and the voxels of a level: the mean of a voxel's points, and the value at a point of its eight corners.
+"""Between points and voxels: the mean of a voxel's points, and the value at a point of the eight corners around it.
 
-The point branch of SPVCNN (Tang et al. 2020), equal to its published program on torchsparse. Points are (P, 4): x, y, z in
-units of the finest voxel, as float32, and the batch.
+The point branch of SPVCNN (Tang et al. 2020), equal to its published program on torchsparse. Points are (P, 4) float32:
+x, y, z in units of the finest voxel, and the batch.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _corner(points: Tensor, stride: int) -> Tensor:
 
 
 def voxelise(features: Tensor, rows: Tensor, count: int) -> Tensor:
-    """(count, C): the mean of the point features (P, C) per voxel, 0 where none is; `rows` as `voxel_of_points` says."""
+    """(count, C): the mean of the point features (P, C) per voxel, 0 where none is; `rows` as of `voxel_of_points`."""
     met = rows >= 0
     if not met.all():
         rows, features = rows[met], features[met]
