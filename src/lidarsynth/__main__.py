@@ -1,5 +1,10 @@
 """`python -m lidarsynth`."""
 
-from lidarsynth.cli.main import main
+import sys
 
-main()
+try:
+    from lidarsynth.cli.main import main
+
+    main()
+except KeyboardInterrupt:  # while the program was still being read
+    sys.exit(130)

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lidarsynth.experiment.record import from_dict
+from lidarsynth.lidar.small_file import read_toml
 from lidarsynth.networks.interpolation import METHODS as INTERPOLATIONS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # type: ignore[import-not-found]
 
 
 @dataclass(frozen=True)
@@ -108,9 +103,7 @@ def read_config(
     """
     path = Path(path)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected a benchmark in TOML, found {error}") from None
+        values = read_toml(path)
     except OSError as error:
         raise ValueError(f"{path}: expected a readable file, found {error.strerror}") from None
     record, method, field = KINDS[kind]

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from lidarsynth.cli.arguments import Count, Positional
-from lidarsynth.cli.terminal import counted, say
+from lidarsynth.cli.terminal import at_least, counted, say
+
+MOST = 10_000_000  # synthetic scans of one cache; more fit on no disk
 
 
 def data(
@@ -44,6 +46,10 @@ def data(
     """
     from lidarsynth.data.sources import prepare, summary
 
+    at_least(1, {"count": count})
+    at_least(0, {"seed": seed, "workers": workers})
+    if count > MOST:
+        raise ValueError(f"expected --count of at most {MOST:,} synthetic scans, found {count:,}")
     more = (workers, count, check, seed, intensity, apart)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from lidarsynth.cli.arguments import Device, Positional, arg
-from lidarsynth.cli.terminal import at_least, say
+from lidarsynth.cli.terminal import at_least, check_device, say
 
 
 def evaluate(
@@ -27,6 +27,7 @@ def evaluate(
 
     at_least(1, {"batch-size": batch_size})
     at_least(0, {"seed": seed})
+    check_device(device)
     if not samples:
         raise ValueError("expected SAMPLES to judge: a folder, a cache or .safetensors parts, found none")
     with image_bar() as on_images:

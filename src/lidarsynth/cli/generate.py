@@ -23,6 +23,7 @@ def generate(
     picture: Picture = True,
 ) -> None:
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
+    from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
     from lidarsynth.verbs.generation import batches, claim, generate_into
 
@@ -32,9 +33,10 @@ def generate(
     loaded = loaded.into(sensor) if sensor else loaded
     steps = loaded.generation_steps(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
-    claim(out, settings)
     endings = (f".{format}", ".png") if picture else (f".{format}",)
-    runs = batches(out, count, endings, loaded.at_once(batch_size))
-    with step_bar("generate", len(runs) * steps) as on_step:
-        new = sum(1 for _ in generate_into(out, loaded, runs, batch_size, endings, steps, sampler, seed, on_step))
+    with only_writer(out, "generation"):
+        claim(out, settings)
+        runs = batches(out, count, endings, loaded.at_once(batch_size))
+        with step_bar("generate", len(runs) * steps) as on_step:
+            new = sum(1 for _ in generate_into(out, loaded, runs, batch_size, endings, steps, sampler, seed, on_step))
     say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import io
 import os
 import re
@@ -18,12 +19,14 @@ if TYPE_CHECKING:
     from lidarsynth.systems.scan_model import ScanModel
     from lidarsynth.training.loop import Progress
 
+NARROWEST = 40  # columns
+MOST = 1200  # characters of a refusal
 REFUSED, STOPPED, UNHEARD = 2, 130, 141  # exit codes; the last two as shells have them for Ctrl-C and a closed pipe
 
 
 def say(text: str) -> None:
-    """A line on stdout, at once."""
-    print(text, flush=True)
+    """A line on stdout, at once; escape codes, which a file's own names may hold, stay out of the terminal."""
+    print("".join(c if c.isprintable() or c in "\n\t" else "?" for c in text), flush=True)
 
 
 def warn(text: str) -> None:
@@ -43,8 +46,13 @@ def step_bar(title: str, steps: int) -> Iterator[Callable[[], object]]:
     """A progress bar for work over two seconds; gives what to call after every network step."""
     from tqdm import tqdm
 
-    with tqdm(total=steps, unit="step", delay=2, desc=title, leave=False) as bar:
+    with tqdm(total=steps, unit="step", delay=2, desc=title, leave=False, mininterval=_seconds()) as bar:
         yield bar.update
+
+
+def _seconds() -> float:
+    """Between two drawings of a bar: a log file wants few of them."""
+    return 0.1 if sys.stderr.isatty() else 30.0
 
 
 @contextmanager
@@ -61,7 +69,7 @@ def image_bar() -> Iterator[Callable[[str, int, int], object]]:
     """A progress bar for work over two seconds; gives what to call with (what, images done, images in all)."""
     from tqdm import tqdm
 
-    with tqdm(unit="image", delay=2, leave=False) as bar:
+    with tqdm(unit="image", delay=2, leave=False, mininterval=_seconds()) as bar:
 
         def on_images(what: str, done: int, total: int) -> None:
             bar.total, bar.unit = total, {"download": "B", "compute": "row"}.get(what.split()[0], "image")
@@ -76,7 +84,7 @@ def counted(stored: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
     """Pass (images done, images in all) on, under a progress bar."""
     from tqdm import tqdm
 
-    with tqdm(unit="image", delay=2) as bar:
+    with tqdm(unit="image", delay=2, mininterval=_seconds()) as bar:
         for done, total in stored:
             bar.total = total
             bar.update(done - bar.n)
@@ -89,6 +97,8 @@ def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
 
     bar = None
     for progress in run:  # its first is where the run stands
+        if progress.note:
+            tqdm.write(f"lidarsynth: {progress.note}", file=sys.stderr)
         bar = bar or tqdm(
             total=steps, initial=progress.step, unit="step", mininterval=0.5 if sys.stderr.isatty() else 30
         )
@@ -107,6 +117,7 @@ def load_with_bar(source: str, device: str) -> ScanModel:
     from lidarsynth.systems.table import assemble
     from lidarsynth.weights.load import load_parts
 
+    check_device(device)
     with tqdm(desc=f"download {source}", unit="B", unit_scale=True, delay=2) as bar:
 
         def on_bytes(done: int, total: int | None) -> None:
@@ -120,6 +131,18 @@ def load_with_bar(source: str, device: str) -> ScanModel:
         raise ValueError(f"expected a device of torch, such as cpu or cuda, found {device!r}: {error}") from None
 
 
+def check_device(device: str) -> None:
+    """Raises ValueError for what is no device of torch, or one that holds no numbers."""
+    import torch
+
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ValueError(f"expected a device of torch, such as cpu or cuda, found {device!r}: {error}") from None
+    if kind == "meta":
+        raise ValueError(f"expected a device that computes, such as cpu or cuda, found {device!r}")
+
+
 def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> None:
     """Run the verb of a command line (None = the process's own) and turn every failure into one line and an exit code.
 
@@ -128,6 +151,8 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
     if isinstance(sys.stdout, io.TextIOWrapper):
         codecs.register_error("lidarsynth", _sayable)
         sys.stdout.reconfigure(errors="lidarsynth")
+    if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)  # the help of a narrower terminal would never be laid out
     try:
         _parsed(verbs, argv)()
     except BrokenPipeError:
@@ -137,11 +162,7 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
         print("lidarsynth: stopped", file=sys.stderr)
         sys.exit(STOPPED)
     except OSError as error:
-        _refuse(
-            f"{error.filename}: expected a file that can be used, found: {error.strerror}"
-            if error.filename
-            else str(error)
-        )
+        _refuse(_of_system(error))
     except (ValueError, ImportError, FloatingPointError) as error:
         _refuse(str(error))
     except RecursionError:
@@ -186,6 +207,20 @@ def _sayable(error: UnicodeError) -> tuple[str, int]:
     return lacking.encode("ascii", "backslashreplace").decode(), error.end
 
 
+def _of_system(error: OSError) -> str:
+    """A failure of the system in words: where, what was expected, what was found, what to do."""
+    where = f"{error.filename}: " if error.filename else ""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{where}expected room to write, found: {error.strerror}; make room and run the same command again"
+    if error.filename:
+        return f"{where}expected a file that can be used, found: {error.strerror}"
+    return str(error) if error.errno is None else f"expected the system to go along, found: {error.strerror}"
+
+
 def _refuse(reason: str) -> NoReturn:
-    print(f"lidarsynth: {' '.join(reason.split()) or 'stopped for no known reason'}", file=sys.stderr)
+    """One line of at most MOST characters, on a line of its own, whatever a file's own names hold."""
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(reason.split()))
+    line = line if len(line) <= MOST else f"{line[: MOST // 2]} ... {line[-MOST // 3 :]}"
+    start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over a progress bar that stood there
+    print(f"{start}lidarsynth: {line or 'stopped for no known reason'}", file=sys.stderr)
     sys.exit(REFUSED)

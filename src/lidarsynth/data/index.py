@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 
 INDEX, REPORT = "index.json", "report.json"
 PLACE = ("root", "missing")  # of a source: where it lies on this disk, not what it is
@@ -19,14 +21,38 @@ def read_index(folder: str | Path) -> dict[str, Any]:
     """The index of a cache. Raises ValueError when the folder is not one."""
     path = Path(folder) / INDEX
     try:
-        index = json.loads(path.read_text())
+        index = read_json(path, LARGEST_INDEX)
     except OSError as error:
         raise ValueError(f"{folder}: expected a cache folder with {INDEX}, found {error.strerror}") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, found {error}") from None
-    if not isinstance(index, dict) or not {"source", "sensor", "count", "shards"} <= index.keys():
-        raise ValueError(f"{path}: expected the fields source, sensor, count, shards, found another table")
+    _check(index, path)
     return index
+
+
+KINDS = {"source": dict, "sensor": dict, "count": int, "shards": dict}
+
+
+def _check(index: Any, path: Path) -> None:
+    """Raises ValueError by name unless the index has the fields and types that `write_index` writes."""
+    if not isinstance(index, dict) or not KINDS.keys() <= index.keys():
+        raise ValueError(f"{path}: expected the fields source, sensor, count, shards, found another table")
+    for key, kind in KINDS.items():
+        if type(index[key]) is not kind:
+            raise ValueError(f"{path}: expected {key} as {kind.__name__}, found {index[key]!r:.60}")
+    if not isinstance(index["source"].get("name", ""), str) or not isinstance(index["source"].get("missing", []), list):
+        raise ValueError(f"{path}: expected a source with a name, found {index['source']!r:.60}")
+    for name, shard in index["shards"].items():
+        lists = [shard.get("frames", []), shard.get("skipped", [])] if isinstance(shard, dict) else [None]
+        if not all(isinstance(part, list) for part in lists) or type(shard.get("count")) is not int:
+            raise ValueError(f"{path}: expected the shard {name!r:.60} with count and frames, found {shard!r:.60}")
+        rows = [(row, size) for part, size in zip(lists, (2, 3), strict=True) for row in part]
+        if wrong := [row for row, size in rows if not _words(row, size)]:
+            raise ValueError(f"{path}: expected frames as [sequence, frame] in {name!r:.60}, found {wrong[0]!r:.60}")
+        if shard["count"] < 0 or (shard.get("frames") and len(shard["frames"]) != shard["count"]):
+            raise ValueError(f"{path}: expected as many frames as {name!r:.60} counts, found {shard['count']}")
+
+
+def _words(row: Any, size: int) -> bool:
+    return isinstance(row, list) and len(row) == size and all(isinstance(word, str) for word in row)
 
 
 def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int) -> dict[str, Any]:
@@ -92,7 +118,7 @@ def report(index: dict[str, Any]) -> dict[str, Any]:
 @contextmanager
 def whole(path: Path, size: int) -> Iterator[Path]:
     """A place to write `path` to, moved there afterwards. Raises OSError of one line that says how much was wanted."""
-    scratch = path.with_name(f".{path.stem}.{os.getpid()}.part")
+    scratch = path.with_name(f".{path.stem}.{secrets.token_hex(8)}.part")  # a pid is not alone on a shared disk
     try:
         yield scratch
         os.replace(scratch, path)

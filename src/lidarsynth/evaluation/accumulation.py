@@ -6,6 +6,7 @@ import hashlib
 import random
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -186,9 +187,11 @@ def gather(
     """
     statistics, done = empty, 0
     if unfinished and unfinished.is_file():
-        statistics, metadata = load_statistics(unfinished, empty.protocol)
-        statistics.networks, statistics.weights = empty.networks, empty.weights
-        done = int(metadata["done"])
+        with suppress(ValueError, KeyError):  # damaged: begin again
+            found, metadata = load_statistics(unfinished, empty.protocol)
+            done = int(metadata["done"])
+            found.networks, found.weights = empty.networks, empty.weights
+            statistics = found
     saved = time.monotonic()
     for start in range(done, len(numbers), batch_size):
         batch = numbers[start : start + batch_size]
@@ -204,7 +207,8 @@ def gather(
         if on_images:
             on_images(empty.role, start + len(batch), len(numbers))
         if unfinished and time.monotonic() - saved > SAVE_EVERY:
-            save_statistics(unfinished, statistics, {"done": str(start + len(batch))})
+            with suppress(OSError):  # the cache is for going on only
+                save_statistics(unfinished, statistics, {"done": str(start + len(batch))})
             saved = time.monotonic()
     return statistics
 

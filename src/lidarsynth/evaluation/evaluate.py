@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -22,6 +24,7 @@ from lidarsynth.evaluation.report import Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
@@ -95,7 +98,10 @@ class _Run:
         stamped = judged.stamp and truth.stamp
         unfinished = cache_folder() / "statistics" / f"unfinished-{self.protocol.name}-{key}.json" if stamped else None
         if unfinished and unfinished.is_file():
-            pairs.restore(json.loads(unfinished.read_text()))
+            with suppress(ValueError, KeyError, TypeError, AttributeError):  # damaged: begin again
+                fresh = Pairs(self.protocol, pairs.classes)
+                fresh.restore(read_json(unfinished, LARGEST_INDEX))
+                pairs = fresh
         saved = time.monotonic()
         for start in range(len(pairs.errors), len(judged), self.batch_size):
             numbers = range(start, min(start + self.batch_size, len(judged)))
@@ -104,10 +110,12 @@ class _Run:
             if self.on_images:
                 self.on_images("pairs", numbers.stop, len(judged))
             if unfinished and time.monotonic() - saved > accumulation.SAVE_EVERY:
-                _write(unfinished, json.dumps(pairs.state()))
+                with suppress(OSError):  # the cache is for going on only
+                    _write(unfinished, json.dumps(pairs.state()))
                 saved = time.monotonic()
-        if unfinished:
-            unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            if unfinished:
+                unfinished.unlink(missing_ok=True)
         return pairs
 
     def statistics(
@@ -127,7 +135,8 @@ class _Run:
         key = sha256(repr([*identity, *limits]).encode()).hexdigest()[:16]
         kept = cache_folder() / "statistics" / f"{self.protocol.name}-{key}{ENDING}" if images.stamp else None
         if kept and kept.is_file():
-            return load_statistics(kept, self.protocol)[0], kept
+            with suppress(ValueError):  # damaged: it is only kept to save time, and made anew
+                return load_statistics(kept, self.protocol)[0], kept
         unfinished = kept.with_name(f"unfinished-{kept.name}") if kept else None
         empty = Statistics(self.protocol, sensor, role, loaded.networks, loaded.weights)
         projection = self.protocol.projection if sensor.name == self.protocol.sensor else "auto"
@@ -135,9 +144,13 @@ class _Run:
             images, numbers, chosen, empty, projection, unfinished, self.batch_size, self.on_images
         )  # fmt: skip
         if kept and role == "real":
-            save_statistics(kept, statistics, {"source": images.source})
-        if unfinished:
-            unfinished.unlink(missing_ok=True)
+            try:
+                save_statistics(kept, statistics, {"source": images.source})
+            except OSError:  # a cache that cannot be written to costs the next run its time, no more
+                kept = None
+        with suppress(OSError):
+            if unfinished:
+                unfinished.unlink(missing_ok=True)
         return statistics, kept if role == "real" else None
 
 
@@ -304,6 +317,8 @@ def check_out(out: Path) -> None:
         raise ValueError(f"{out}: expected the name of a file that ends in .json, "
                          f"found {'a folder' if out.is_dir() else repr(out.name[-20:])}")  # fmt: skip
     out.parent.mkdir(parents=True, exist_ok=True)
+    if not os.access(out.parent, os.W_OK | os.X_OK):
+        raise ValueError(f"{out}: expected a folder that may be written to, found none of that right at {out.parent}")
 
 
 def write_report(report: Report, out: Path) -> None:

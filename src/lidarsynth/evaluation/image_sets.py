@@ -12,18 +12,19 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.files.arrays import image_of, unzip
-from lidarsynth.files.fields import FileError
+from lidarsynth.files.fields import MAX_BYTES, FileError
 from lidarsynth.files.formats import READERS, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.small_file import check_regular
+from lidarsynth.networks.tensors import read_pickle
 
 TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen
 Item: TypeAlias = RangeImage | Scan | Tensor
@@ -165,10 +166,8 @@ def _batch(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_tensor(path: Path) -> Tensor:
-    try:
-        tensor = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged pickle raises whatever it likes
-        raise ValueError(f"{path}: expected a tensor, found a damaged or unsafe file ({error!s:.60})") from None
+    check_regular(path, MAX_BYTES)
+    tensor = read_pickle(path, str(path))
     if not isinstance(tensor, Tensor):
         raise ValueError(f"{path}: expected a tensor (5, H, W) or (2, H, W), found {type(tensor).__name__}")
     return tensor

@@ -22,6 +22,7 @@ from lidarsynth.evaluation.protocol import EvaluationProtocol, Side
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, from_dict
+from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import Array, Moments
 from lidarsynth.metrics.occupancy import Occupancy
@@ -285,6 +286,7 @@ def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> t
     Raises ValueError for another kind of file, another protocol or version, or a content that is not the one hashed.
     """
     try:
+        check_regular(path, LARGEST_WEIGHTS)
         with safe_open(path, "pt") as file:
             metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict

@@ -12,6 +12,7 @@ from safetensors.torch import save as serialized
 from torch import nn
 
 from lidarsynth.experiment.record import Experiment, from_dict
+from lidarsynth.lidar.small_file import read_json
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
 
@@ -36,10 +37,8 @@ def read_experiment(folder: str | Path) -> Experiment:
     """The record of a saved model. Raises ValueError when the folder is not one."""
     path = Path(folder) / RECORD
     try:
-        return from_dict(json.loads(path.read_text()), str(path))
+        return from_dict(read_json(path), str(path))
     except FileNotFoundError:
         raise ValueError(f"{folder}: expected a model folder with {WEIGHTS} and {RECORD}, found no {RECORD}") from None
     except OSError as error:
         raise ValueError(f"{path}: expected a readable record, found {error.strerror}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected JSON, found {error}") from None

@@ -6,6 +6,8 @@ from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass,
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
+from lidarsynth.experiment.ranges import check_ranges, within
+
 
 @dataclass(frozen=True)
 class Data:
@@ -13,15 +15,20 @@ class Data:
 
     sensor: str | dict = "hdl-64e"  # a word of lidar.sensor.SENSORS, or a sensor of one's own as a table
     projection: str = "spherical"  # spherical | unfolding | auto
-    height: int = 64  # rows of the image
-    width: int = 1024  # columns of the image
+    height: int = within(64, 1, 4096)  # rows of the image
+    width: int = within(1024, 4, 65_536)  # columns of the image
     codec: str = "log"  # log | inverse | metric | log-63m (LiDARGen) | inverse-minmax (DUSty of 2021)
     reflectance: bool = True  # whether the network knows reflectance
     roll: bool = False  # augmentation: turn the scan by any number of columns
     mirror: bool = False  # augmentation: swap left and right
     mend: bool = True  # mixed pixels that a conditional network makes are put onto the surface beside them
-    scale: float = 0.0  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
-    mix: float = 0.0  # augmentation of completion: share of samples with a sector of another image of the cache
+    scale: float = within(0.0, 0, 0.99)  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
+    mix: float = within(
+        0.0, 0, 1
+    )  # augmentation of completion: share of samples with a sector of another image
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -29,19 +36,22 @@ class Model:
     """The network."""
 
     network: str = "efficient-unet"  # efficient-unet | conditional-unet (told the known pixels)
-    base_channels: int = 64
-    temb_channels: int | None = None  # None = 4 * base_channels
-    channel_multipliers: tuple[int, ...] = (1, 2, 4, 8)
-    num_residual_blocks: tuple[int, ...] = (3, 3, 3, 3)
-    gn_num_groups: int = 8
-    gn_eps: float = 1e-6
-    attn_num_heads: int = 8
+    base_channels: int = within(64, 1, 8192)
+    temb_channels: int | None = within(None, 1, 65_536)  # None = 4 * base_channels
+    channel_multipliers: tuple[int, ...] = within((1, 2, 4, 8), 1, 1024)
+    num_residual_blocks: tuple[int, ...] = within((3, 3, 3, 3), 0, 64)
+    gn_num_groups: int = within(8, 1, 8192)
+    gn_eps: float = within(1e-6, 0, 1)
+    attn_num_heads: int = within(8, 1, 1024)
     coords_encoding: str | None = "fourier_features"  # | spherical_harmonics | polar_coordinates | None
     ring: bool = True  # circular in width
-    stem: tuple[int, int] = (1, 1)  # patch of pixels that becomes channels, (1, 1) = R2DM
+    stem: tuple[int, int] = within((1, 1), 1, 64)  # patch of pixels that becomes channels, (1, 1) = R2DM
     candidates: bool = False  # conditional-unet: chooses among the nearest known values, not only corrects their mean
     around: bool = False  # and the nearest known value in any direction
-    dropout: float = 0.0
+    dropout: float = within(0.0, 0, 0.999)
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -52,88 +62,116 @@ class Diffusion:
     kind: str = "eps"  # eps | x_0 | v | velocity | score
     clip: bool = True  # clamp x_0_hat to [-1, 1]
     loss: str = "l2"  # l1 | l2 | huber
-    gamma: float | None = 5.0  # min-SNR; None = unweighted
-    floor: float = 0.0  # least min-SNR weight of a sample
+    gamma: float | None = within(5.0, 0)  # min-SNR; None = unweighted
+    floor: float = within(0.0, 0)  # least min-SNR weight of a sample
     mean_weight: bool = True  # every sample gets the batch's mean weight, as in R2DM's program
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class Score:
     """Denoising score matching and annealed Langevin steps; defaults are LiDARGen's, sigmas those of data in [0, 1]."""
 
-    levels: int = 232  # noise levels, falling geometrically
-    sigma_max: float = 50.0
-    sigma_min: float = 0.01
-    steps: int = 5  # Langevin steps at each level
-    rate: float = 0.062  # share of the way to x_0_hat in a step: step_lr / sigma_min^2
+    levels: int = within(232, 1, 100_000)  # noise levels, falling geometrically
+    sigma_max: float = within(50.0, 0)
+    sigma_min: float = within(0.01, 0)
+    steps: int = within(5, 1, 100_000)  # Langevin steps at each level
+    rate: float = within(0.062, 0)  # share of the way to x_0_hat in a step: step_lr / sigma_min^2
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class Upsampling:
     """Networks that put beams between known ones: LiDAR-SR, ILN and LIIF. Lengths are metres."""
 
-    factor: tuple[int, int] = (4, 1)  # rows and columns of the image per known row and column
-    first: int = 0  # the first known row from the top, as in beams:4:FIRST
+    factor: tuple[int, int] = within((4, 1), 1, 64)  # rows and columns of the image per known row and column
+    first: int = within(0, 0, 4096)  # the first known row from the top, as in beams:4:FIRST
     spread: bool = False  # LiDAR-SR's rows reach from the first known row to the last (official weights)
-    norm: float = 100.0  # the range that is 1
-    max_range: float = 80.0  # farther is no return
-    noise: float = 0.0  # standard deviation of what training adds to ranges
+    norm: float = within(100.0, 1e-6)  # the range that is 1
+    max_range: float = within(80.0, 0)  # farther is no return
+    noise: float = within(0.0, 0)  # standard deviation of what training adds to ranges
     keras: bool = False  # LiDAR-SR's original program: no return is 0 and not 1, dropout of single values
-    passes: int = 50  # of LiDAR-SR under Monte-Carlo dropout
-    threshold: float = 0.03  # LiDAR-SR drops pixels whose standard deviation is more than this share of their mean
-    depth: int = 1  # layers of ILN's transformer
-    queries: int = 16_384  # pixels of a scan that a step of ILN or LIIF learns from
+    passes: int = within(50, 1, 100_000)  # of LiDAR-SR under Monte-Carlo dropout
+    threshold: float = within(
+        0.03, 0
+    )  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
+    depth: int = within(1, 0, 64)  # layers of ILN's transformer
+    queries: int = within(16_384, 1)  # pixels of a scan that a step of ILN or LIIF learns from
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class Adversarial:
     """A GAN and how it is trained; defaults are those of the DUSty v2 program (WACV 2023), the same for all three."""
 
-    latent_channels: int = 512  # of z ~ N(0, I)
-    style_channels: int = 512  # of dusty-v2; the styles of the others are z
-    max_channels: int = 512  # at the coarsest map; model.base_channels are those of the finest
-    discriminator_channels: int | None = None  # at its finest map; None = model.base_channels
-    temperature: float = 1.0  # of the Gumbel-sigmoid that drops rays
+    latent_channels: int = within(512, 1, 8192)  # of z ~ N(0, I)
+    style_channels: int = within(512, 1, 8192)  # of dusty-v2; the styles of the others are z
+    max_channels: int = within(512, 1, 8192)  # at the coarsest map; model.base_channels are those of the finest
+    discriminator_channels: int | None = within(None, 1, 8192)  # at its finest map; None = model.base_channels
+    temperature: float = within(1.0, 1e-6)  # of the Gumbel-sigmoid that drops rays
     iros21: bool = False  # layers of the first release of vanilla GAN and DUSty v1: tanh, mirrored blur
     empty_below: float = 0.0  # code in [0, 1] up to which a pixel is empty
-    r1_weight: float = 1.0
-    r1_every: int = 16  # steps
-    path_length_weight: float = 0.0  # 0 = off
-    path_length_every: int = 4  # steps
-    augmentation_target: float | None = 0.6  # mean sign of the logits of real images; None = no augmentation
-    augmentation_images: int = 500_000  # in which its probability can rise from 0 to 1
-    augmentation_every: int = 4  # steps between its updates
-    warmup_images: int = 200_000  # in which pixels are dropped before the discriminator, half of them at first
+    r1_weight: float = within(1.0, 0)
+    r1_every: int = within(16, 1)  # steps
+    path_length_weight: float = within(0.0, 0)  # 0 = off
+    path_length_every: int = within(4, 1)  # steps
+    augmentation_target: float | None = within(
+        0.6, -1, 1
+    )  # mean sign of real images' logits; None = no augmentation
+    augmentation_images: int = within(500_000, 1)  # in which its probability can rise from 0 to 1
+    augmentation_every: int = within(4, 1)  # steps between its updates
+    warmup_images: int = within(
+        200_000, 0
+    )  # in which pixels are dropped before the discriminator, at first half
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class Segmentation:
     """A class for every pixel: RangeNet; `model.base_channels` is its width, 32 in the published networks."""
 
-    layers: int = 53  # 21 | 53
-    columns: int | None = None  # of a training image, cut out anywhere; None = all
-    drop: float = 0.0  # augmentation: the largest share of an image's points that is dropped
+    layers: int = within(53, 1, 1000)  # 21 | 53
+    columns: int | None = within(None, 1, 65_536)  # of a training image, cut out anywhere; None = all
+    drop: float = within(0.0, 0, 1)  # augmentation: the largest share of an image's points that is dropped
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class Training:
     """The optimiser and its budget; defaults are R2DM's."""
 
-    steps: int = 300_000
-    batch_size: int = 8
-    learning_rate: float = 1e-4
-    betas: tuple[float, float] = (0.9, 0.99)
-    warmup: int = 10_000  # steps of linear warm-up
+    steps: int = within(300_000, 0)
+    batch_size: int = within(8, 1, 1_048_576)
+    learning_rate: float = within(1e-4, 0)
+    betas: tuple[float, float] = within((0.9, 0.99), 0, 1)
+    warmup: int = within(10_000, 0)  # steps of linear warm-up
     decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant | inverse | halving
-    clip_norm: float | None = 1.0  # None = gradients as they are
-    ema_decay: float = 0.995
-    ema_every: int = 10  # steps
-    ema_start: int = 10_000  # steps of plain copying
-    ema_half_life: int = 10_000  # images; of GANs, in the place of the three above
-    generation_share: float = 1.0  # share of a batch trained without known pixels; 1 for unconditional networks
-    upsampling_share: float = 0.0  # of the others, the share that knows every fourth beam and begins at pure noise
-    metres_weight: float = 0.1  # of completion's error in metres, beside that in code
-    seed: int = 0
+    clip_norm: float | None = within(1.0, 0)  # None = gradients as they are
+    ema_decay: float = within(0.995, 0, 1)
+    ema_every: int = within(10, 1)  # steps
+    ema_start: int = within(10_000, 0)  # steps of plain copying
+    ema_half_life: int = within(10_000, 1)  # images; of GANs, in the place of the three above
+    generation_share: float = within(
+        1.0, 0, 1
+    )  # share of a batch without known pixels; 1 for unconditional networks
+    upsampling_share: float = within(
+        0.0, 0, 1
+    )  # of the others, knows every fourth beam, begins at pure noise
+    metres_weight: float = within(0.1, 0)  # of completion's error in metres, beside that in code
+    seed: int = within(0, 0)
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -179,7 +217,11 @@ def from_dict(values: Any, source: str = "experiment", record: type = Experiment
     needed = {f.name for f in fields(record) if f.default is MISSING and f.default_factory is MISSING}
     if missing := needed - values.keys():
         raise ValueError(f"{source}: expected the field {', '.join(sorted(missing))}, found {sorted(values)}")
-    return record(**{key: _value(v, hints[key], f"{source}.{key}") for key, v in values.items()})
+    found = {key: _value(v, hints[key], f"{source}.{key}") for key, v in values.items()}
+    try:
+        return record(**found)
+    except ValueError as error:  # of a range
+        raise ValueError(f"{source}.{error}") from None
 
 
 def _value(value: Any, hint: Any, source: str) -> Any:
@@ -213,5 +255,8 @@ def with_fields(experiment: Experiment, changes: dict[str, Any]) -> Experiment:
         if not is_dataclass(part) or name not in {f.name for f in fields(part)}:
             raise ValueError(f"expected an experiment field such as training.steps, found {path!r}")
         value = _value(value, get_type_hints(type(part))[name], path)
-        experiment = replace(experiment, **{group: replace(part, **{name: value})})  # type: ignore[type-var]
+        try:
+            experiment = replace(experiment, **{group: replace(part, **{name: value})})  # type: ignore[type-var]
+        except ValueError as error:  # of a range
+            raise ValueError(f"{group}.{error}") from None
     return experiment

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,10 +9,7 @@ from typing import Any
 
 import numpy as np
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # type: ignore[import-not-found]
+from lidarsynth.lidar.small_file import read_json, read_toml
 
 
 @dataclass(frozen=True)
@@ -217,11 +212,9 @@ def read_sensor(path: str | Path) -> Sensor:
     path = Path(path)
     try:
         if path.suffix == ".toml":
-            return from_dict(tomllib.loads(path.read_text()), path.stem)
+            return from_dict(read_toml(path), path.stem)
         if path.suffix == ".json":
-            return from_dict(json.loads(path.read_text()), path.stem)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected a sensor file in {path.suffix[1:].upper()}, found {error}") from None
+            return from_dict(read_json(path), path.stem)
     except OSError as error:
         raise ValueError(f"{path}: expected a readable sensor file, found {error.strerror}") from None
     raise ValueError(f"{path}: expected a .toml or .json sensor file, found {path.suffix or 'no suffix'}")

@@ -157,7 +157,8 @@ class Kernel(nn.Module):
     def __init__(self, cells: int, inputs: int, outputs: int):
         super().__init__()
         shape = (inputs, outputs) if cells == 1 else (cells, inputs, outputs)
-        self.kernel = nn.Parameter(torch.randn(shape) / (cells * inputs) ** 0.5, requires_grad=False)
+        self.kernel = nn.Parameter(torch.empty(shape), requires_grad=False)
+        nn.init.normal_(self.kernel, std=(cells * inputs) ** -0.5)
 
 
 def voxel_hash(coordinates: Tensor) -> Tensor:

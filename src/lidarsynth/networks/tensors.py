@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor, nn
+
+from lidarsynth.networks.finite import not_finite
 
 
 def read_pickle(file: str | Path | BinaryIO, where: str) -> Any:
@@ -16,7 +20,9 @@ def read_pickle(file: str | Path | BinaryIO, where: str) -> Any:
     names, saying how a checkpoint with such becomes one of tensors.
     """
     try:
-        return torch.load(file, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():  # of torch, about old formats and sparse tensors: three lines for one
+            warnings.simplefilter("ignore")
+            content = torch.load(file, map_location="cpu", weights_only=True)
     except OSError as error:
         raise ValueError(f"{where}: expected weights, found {error.strerror or error}") from None
     except Exception as error:  # a damaged pickle raises whatever it likes
@@ -25,6 +31,25 @@ def read_pickle(file: str | Path | BinaryIO, where: str) -> Any:
                              f"loaded; {CONVERT}") from None  # fmt: skip
         reason = str(error).rpartition("WeightsUnpickler error:")[2].strip().partition("\n")[0]
         raise ValueError(f"{where}: expected weights, found a damaged or unsafe file ({reason:.120})") from None
+    return plain(content, where)
+
+
+def plain(content: Any, where: str) -> Any:
+    """The same tables and lists with every tensor detached. Raises ValueError for tensors that hold no plain numbers.
+
+    A crafted file may hold sparse, quantised, complex or nested tensors, and such of the device "meta", without values.
+    """
+    if isinstance(content, Tensor):
+        ordinary = content.layout == torch.strided and content.device.type == "cpu"
+        if not ordinary or content.is_quantized or content.is_complex() or content.is_nested:
+            raise ValueError(f"{where}: expected tensors of plain numbers, found one of {content.layout} on "
+                             f"{content.device}, {content.dtype}")  # fmt: skip
+        return content.detach()
+    if type(content) in (dict, OrderedDict):
+        return {key: plain(value, where) for key, value in content.items()}
+    if type(content) in (list, tuple):
+        return type(content)(plain(value, where) for value in content)
+    return content
 
 
 CONVERT = (  # loading it for good runs what it names, so not here and not at the user's desk
@@ -69,6 +94,8 @@ def load_state(module: nn.Module, state: dict[str, Tensor], where: str) -> None:
         key = wrong[0]
         raise ValueError(f"{where}: expected {key} {expected.get(key, 'not to be there')}, found "
                          f"{found.get(key, 'none')}; {len(wrong)} tensors do not fit")  # fmt: skip
+    if name := not_finite(state):
+        raise ValueError(f"{where}: expected finite weights, found NaN or infinity in {name}")
     module.load_state_dict({**{key: own[key] for key in counters}, **state})
 
 
@@ -120,6 +147,8 @@ def fill(network: nn.Module, weights: dict[str, Tensor]) -> None:
             f"expected {key} {expected.get(key, 'not to be there')} for {type(network).__name__}, "
             f"found {found.get(key, 'none')}; {len(wrong)} tensors do not fit"
         )
+    if name := not_finite(weights):
+        raise ValueError(f"expected finite weights, found NaN or infinity in {name}")
     network.load_state_dict(weights)
 
 
@@ -135,4 +164,6 @@ def load_weights(network: nn.Module, weights: dict[str, Tensor], source: str) ->
     for name, tensor in own.items():
         if weights[name].shape != tensor.shape:
             raise ValueError(f"{source}: expected {name} {tuple(tensor.shape)}, found {tuple(weights[name].shape)}")
+    if name := not_finite(weights):
+        raise ValueError(f"{source}: expected finite weights, found NaN or infinity in {name}")
     network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})

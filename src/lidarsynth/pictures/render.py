@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from pathlib import Path
 
 import numpy as np
@@ -135,13 +135,11 @@ def save_png(path: str | Path, rgb: np.ndarray) -> Path:
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
         raise ValueError(f"rgb must be (H, W, 3) uint8 with pixels, got {rgb.shape} {rgb.dtype}")
     path = Path(path)
-    handle, temporary = tempfile.mkstemp(suffix=".png", prefix=f".{path.name}.", dir=path.parent)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.png")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with open(temporary, "xb") as file:  # with the rights that the user's umask leaves
             Image.fromarray(rgb).save(file, format="PNG", compress_level=6)
-        os.chmod(temporary, 0o644)  # mkstemp's 0600 would hide the picture from the user's group
         os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    finally:
+        temporary.unlink(missing_ok=True)
     return path

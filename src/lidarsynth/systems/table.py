@@ -11,11 +11,15 @@ from torch import nn
 from lidarsynth.experiment.folder import RECORD, WEIGHTS, read_experiment
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.finite import refuse_not_finite
 from lidarsynth.networks.tensors import load_weights
 from lidarsynth.systems.cascade.family import CASCADE
 from lidarsynth.systems.diffusion.family import CONDITIONAL_UNET, EFFICIENT_UNET, REFINENET
 from lidarsynth.systems.gan.family import GAN
 from lidarsynth.systems.interpolation.family import INTERPOLATION
+from lidarsynth.systems.memory import check_memory
 from lidarsynth.systems.model_card import card_text
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.segmentation.family import RANGENET
@@ -52,9 +56,11 @@ def system_of(experiment: Experiment) -> System:
 def build_network(experiment: Experiment) -> nn.Module:
     """The experiment's network with fresh weights and, where it has them, the sensor's ray angles; for evaluation.
 
-    Raises ValueError for a word that is not in SYSTEMS.
+    Raises ValueError for a word that is not in SYSTEMS, and for a network larger than this machine's memory.
     """
-    return system_of(experiment).build(experiment, build_sensor(experiment)).eval()
+    system, sensor = system_of(experiment), build_sensor(experiment)
+    check_memory(experiment, lambda: system.build(experiment, sensor))
+    return system.build(experiment, sensor).eval()
 
 
 def assemble(experiment: Experiment, network: nn.Module) -> ScanModel:
@@ -64,6 +70,8 @@ def assemble(experiment: Experiment, network: nn.Module) -> ScanModel:
         words = ", ".join(word for word, system in SYSTEMS.items() if system.model)
         raise ValueError(f"{experiment.name}: expected a network of {words}, which make scans, "
                          f"found {experiment.model.network}")  # fmt: skip
+    for part in (network.coarse, network.fill) if isinstance(network, Cascade) else (network,):
+        refuse_not_finite(part, experiment.name)
     return model(experiment, network.eval())
 
 
@@ -104,6 +112,7 @@ def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
     experiment, path = read_experiment(folder), Path(folder) / WEIGHTS
     network = build_network(experiment)
     try:
+        check_regular(path, LARGEST_WEIGHTS)
         weights = load_file(path)
     except FileNotFoundError:
         raise ValueError(f"{folder}: expected {WEIGHTS} beside {RECORD}, found none") from None

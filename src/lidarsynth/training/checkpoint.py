@@ -1,7 +1,8 @@
 """Checkpoints: folders that appear whole or not at all, each a model that loads and a state that continues exactly.
 
     out/experiment.json, model.safetensors     the newest averaged weights: `lidarsynth generate --model out`
-    out/checkpoints/step-00001000/             the same two files as of that step, and state.pt: everything of the run
+    out/checkpoints/step-00001000/             the same two files as of that step, and state.pt: everything of the run;
+                                               checksums.json, the SHA-256 of each: a flipped byte is found
     out/checkpoints/latest                     link to the newest
 
 Nothing of the random generators or of the data order has to be kept: both are functions of the step (`training.steps`).
@@ -9,6 +10,8 @@ Nothing of the random generators or of the data order has to be kept: both are f
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -16,11 +19,12 @@ from pathlib import Path
 
 import torch
 
-from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.folder import RECORD, WEIGHTS, save
 from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.small_file import read_json
 from lidarsynth.training.loop import Run
 
-FOLDER, LATEST, STATE = "checkpoints", "latest", "state.pt"
+FOLDER, LATEST, STATE, CHECKSUMS = "checkpoints", "latest", "state.pt", "checksums.json"
 SCRATCH = ".saving-"
 
 
@@ -40,7 +44,57 @@ def load_run(path: str | Path, run: Run) -> None:
     try:
         run.load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
     except Exception as error:  # a damaged pickle raises whatever it likes
-        raise ValueError(f"{path}: expected a training state of this experiment, found {error!s:.120}") from None
+        reason = " ".join(f"{error or type(error).__name__}".split())
+        raise ValueError(f"{path}: expected a training state of this experiment, found {reason:.120}") from None
+
+
+def damage_of(checkpoint: Path) -> str:
+    """What is wrong with a checkpoint's files, or "" where all are as they were written (or from before checksums)."""
+    try:
+        expected = read_json(checkpoint / CHECKSUMS)
+    except FileNotFoundError:
+        empty = [name for name in (STATE, WEIGHTS, RECORD) if not _size(checkpoint / name)]
+        return f"{empty[0]} is empty or missing" if empty else ""
+    except (OSError, ValueError):
+        return f"{CHECKSUMS} cannot be read"
+    if not isinstance(expected, dict):
+        return f"{CHECKSUMS} holds no table"
+    for name, digest in expected.items():
+        path = checkpoint / Path(name).name
+        if not path.is_file():
+            return f"{name} is missing"
+        if _sha256(path) != digest:
+            return f"{name} is not what was written"
+    return ""
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def newest_whole(out: str | Path) -> tuple[Path | None, str]:
+    """The newest checkpoint whose files are as they were written, and a line that names newer ones that are not.
+
+    None where there is no checkpoint. Raises ValueError where all are damaged.
+    """
+    told: list[str] = []
+    for checkpoint in reversed(found := checkpoints(out)):
+        if not (damage := damage_of(checkpoint)):
+            note = f"{'; '.join(told)}: going on from {checkpoint.name}" if told else ""
+            return checkpoint, note
+        told.append(f"{checkpoint} is damaged ({damage})")
+    if found:
+        raise ValueError(f"{out}: expected a checkpoint to go on from, found only damaged ones: {'; '.join(told)}; "
+                         f"delete {Path(out) / FOLDER} to begin again, or name another folder")  # fmt: skip
+    return None, ""
 
 
 def checkpoints(out: str | Path) -> list[Path]:
@@ -51,13 +105,20 @@ def checkpoints(out: str | Path) -> list[Path]:
 def save_checkpoint(out: str | Path, experiment: Experiment, run: Run, keep: int = 3) -> Path:
     """Write the checkpoint of the present step, point `latest` to it, drop all but the last `keep`.
 
-    A full disk raises OSError and leaves the earlier checkpoints as they were.
+    A full disk raises OSError that names the folder, and leaves the earlier checkpoints as they were.
     """
-    out = Path(out)
+    try:
+        return _save_checkpoint(Path(out), experiment, run, keep)
+    except OSError as error:
+        where = f"{out}: expected room for a checkpoint, found: {error.strerror or error}"
+        raise OSError(f"{where}; make room, and the same command goes on from the last one") from None
+
+
+def _save_checkpoint(out: Path, experiment: Experiment, run: Run, keep: int) -> Path:
     home = out / FOLDER / f"step-{run.step:08d}"
     home.parent.mkdir(parents=True, exist_ok=True)
     if not home.exists():
-        _appear(home, lambda folder: (save(folder, experiment, run.ema), save_run(folder / STATE, run)))
+        _appear(home, lambda folder: _write(folder, experiment, run))
     link = home.parent / f"{SCRATCH}{LATEST}"
     link.unlink(missing_ok=True)
     link.symlink_to(home.name)
@@ -67,6 +128,13 @@ def save_checkpoint(out: str | Path, experiment: Experiment, run: Run, keep: int
         # renamed first, so that no half-deleted folder looks like a checkpoint
         shutil.rmtree(old.rename(old.with_name(f"{SCRATCH}{old.name}")))
     return home
+
+
+def _write(folder: Path, experiment: Experiment, run: Run) -> None:
+    save(folder, experiment, run.ema)
+    save_run(folder / STATE, run)
+    digests = {name: _sha256(folder / name) for name in (STATE, WEIGHTS, RECORD)}
+    (folder / CHECKSUMS).write_text(json.dumps(digests, indent=1) + "\n")
 
 
 def _appear(home: Path, write: Callable[[Path], object]) -> None:

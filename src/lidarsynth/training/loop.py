@@ -73,6 +73,7 @@ class Progress:
     learning_rate: float
     seconds: float = 0.0  # that the step took
     waited: float = 0.0  # seconds of these spent waiting for data
+    note: str = ""  # what the user should know, such as a damaged checkpoint that was passed over
 
 
 def start(experiment: Experiment, network: nn.Module, task: Task, scaler: torch.amp.GradScaler | None = None) -> Run:

@@ -30,6 +30,8 @@ class Monitor:
         held_out = validation is not None or str(data) in (SYNTHETIC, VIRTUAL)
         self._name = "validation" if held_out else "training_images"
         self._images: list[RangeImage] = []
+        if validation is not None:  # now, and not in 5,000 steps
+            open_images(validation, experiment, VALIDATION_SEED)
 
     def look(self, network: nn.Module, step: int, journal: Journal) -> None:
         """The task's numbers and pictures of the averaged weights, into the journal."""

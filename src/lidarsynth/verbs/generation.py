@@ -15,6 +15,7 @@ from typing import Any
 
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.small_file import read_json
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.scan_model import OnStep, ScanModel
@@ -46,10 +47,7 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
 
 
 def _recorded(record: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(record.read_text())
-    except ValueError as error:
-        raise ValueError(f"{record}: expected the settings of generated scans in JSON, found {error}") from None
+    found = read_json(record)
     if not isinstance(found, dict):
         raise ValueError(f"{record}: expected the settings of generated scans, found {found!r:.60}")
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,9 +16,10 @@ from lidarsynth.experiment.folder import read_experiment
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Card, Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.table import build_network, task_of, transfer
-from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, save_checkpoint, sweep
+from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
 from lidarsynth.training.examples import Learned, Streets, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
@@ -90,10 +91,25 @@ def run(
     options = options or Options()
     out, accelerator = Path(out), accelerator_of(options)
     images = open_images(data, experiment)
-    experiment, state = _begin(experiment, images, out, weights, resume, accelerator)
-    if accelerator.is_main_process:
-        yield Progress(state.step, {}, 0.0, 0.0)
+    with only_writer(out, "training") if accelerator.is_main_process else nullcontext():
+        yield from _run(experiment, images, data, out, weights, validation, options, resume, accelerator)
+
+
+def _run(
+    experiment: Experiment,
+    images: Learned,
+    data: str | Path,
+    out: Path,
+    weights: str | None,
+    validation: str | Path | None,
+    options: Options,
+    resume: bool,
+    accelerator: Accelerator,
+) -> Iterator[Progress]:
+    experiment, state, note = _begin(experiment, images, out, weights, resume, accelerator)
     monitor = Monitor(experiment, state.task, data, validation)
+    if accelerator.is_main_process:
+        yield Progress(state.step, {}, 0.0, 0.0, note=note)
     with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
         for progress in _named(train(experiment, state, images, options, accelerator), out):
             stop = any_process(accelerator, bool(received))
@@ -116,8 +132,11 @@ def _begin(
     weights: str | None,
     resume: bool,
     accelerator: Accelerator,
-) -> tuple[Experiment, Run]:
-    """The experiment with its card, and the run: fresh, from weights, or as the newest checkpoint has it."""
+) -> tuple[Experiment, Run, str]:
+    """The experiment with its card, and the run: fresh, from weights, or as the newest whole checkpoint has it.
+
+    And a line that names newer checkpoints that are damaged.
+    """
     found, expected = images.sensor, build_sensor(experiment)
     if (found.height, found.width) != (expected.height, expected.width):
         raise ValueError(f"{images.source}: expected images of {expected.height} x {expected.width}, "
@@ -125,7 +144,7 @@ def _begin(
     with fixed_randomness(experiment.training.seed):
         network = build_network(experiment)
     card = replace(experiment.card, data=_learned_from(images))
-    saved = checkpoints(out)
+    saved, note = newest_whole(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
     if weights and not saved:
@@ -136,18 +155,17 @@ def _begin(
         card = Card(licence, learned, (*source.card.history, f"from {source.name}"))
     state = start(experiment, network, task_of(experiment), accelerator.scaler)
     if saved:
-        card = _same_experiment(saved[-1], experiment).card
+        card = _same_experiment(saved, experiment).card
         # The history's last line is this run's, written anew at each checkpoint.
         card = replace(card, history=card.history[:-1], licence=experiment.card.licence or card.licence)
-        load_run(saved[-1] / STATE, state)
+        load_run(saved / STATE, state)
         if state.step > experiment.training.steps:
             raise ValueError(f"{out}: expected training.steps of at least {state.step}, which are done, "
                              f"found {experiment.training.steps}")  # fmt: skip
-    elif accelerator.is_main_process:
-        out.mkdir(parents=True, exist_ok=True)
+    if accelerator.is_main_process:
         sweep(out)
     accelerator.wait_for_everyone()
-    return replace(experiment, card=card), state
+    return replace(experiment, card=card), state, note
 
 
 def _learned_from(images: Learned) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import os
 import re
+import tempfile
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -17,14 +18,20 @@ OnBytes = Callable[[int, "int | None"], object]  # called with (bytes so far, by
 
 def cache_folder() -> Path:
     """Where releases are kept: LIDARSYNTH_CACHE, or ~/.cache/lidarsynth."""
-    return Path(os.environ.get("LIDARSYNTH_CACHE") or Path.home() / ".cache" / "lidarsynth")
+    if chosen := os.environ.get("LIDARSYNTH_CACHE"):
+        return Path(chosen)
+    try:
+        return Path.home() / ".cache" / "lidarsynth"
+    except RuntimeError:  # neither HOME nor a passwd entry, as in some containers
+        return Path(tempfile.gettempdir()) / "lidarsynth-cache"
 
 
 def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
     """Fetch `url` into `path`, yielding (bytes so far, bytes in all or None if not told); nothing if it is there.
 
     The bytes gather in `<path>.part`, which moves into place when it is complete; after an interruption, the next call
-    continues there. Raises ValueError that says where to put the file by hand.
+    continues there, if the server still has the same file: `<path>.part.origin` keeps its address and its tag.
+    Raises ValueError that says where to put the file by hand.
     """
     path = Path(path)
     part = path.with_name(path.name + ".part")
@@ -34,9 +41,11 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.touch()
         # Written in place, not appended: two processes that fetch the same file write the same bytes.
+        origin = path.with_name(path.name + ".part.origin")
         with part.open("r+b") as file:
-            yield from _receive(url, file)
+            yield from _receive(url, file, origin)
         os.replace(part, path)
+        origin.unlink(missing_ok=True)
     except (OSError, http.client.HTTPException) as error:
         if path.is_file():  # another process was faster
             return
@@ -44,12 +53,18 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
         raise ValueError(f"{url}: expected a download, found {_reason(error)}; {place}") from None
 
 
-def _receive(url: str, file: BinaryIO) -> Iterator[tuple[int, int | None]]:
-    """Continue `file` to the end of `url`; from the start where the server cannot continue."""
+def _receive(url: str, file: BinaryIO, origin: Path) -> Iterator[tuple[int, int | None]]:
+    """Continue `file` to the end of `url`; from the start where it is not of that file, or the server cannot."""
+    told = origin.read_text().splitlines() if origin.is_file() else []
+    tag = told[1] if len(told) == 2 and told[0] == url else ""
     # The last byte is asked for again, so that a complete file is answered like any other.
-    start = max(file.seek(0, os.SEEK_END) - 1, 0)
-    with _reply(url, start) as reply:
+    start = max(file.seek(0, os.SEEK_END) - 1, 0) if told[:1] == [url] else 0
+    with _reply(url, start, tag) as reply:
         done, total = _extent(reply)
+        now = reply.headers["ETag"] or reply.headers["Last-Modified"] or ""
+        if done and tag and now and now != tag:
+            raise ConnectionError("another file than the one that was begun; delete the .part file")
+        origin.write_text(f"{url}\n{now}\n")
         file.seek(done)
         yield done, total
         while chunk := reply.read(1 << 20):
@@ -61,9 +76,12 @@ def _receive(url: str, file: BinaryIO) -> Iterator[tuple[int, int | None]]:
     file.truncate(done)  # the rest, if any, is of an older and longer file
 
 
-def _reply(url: str, start: int) -> http.client.HTTPResponse:
+def _reply(url: str, start: int, tag: str) -> http.client.HTTPResponse:
+    headers = {"Range": f"bytes={start}-"}
+    if tag and not tag.startswith("W/"):  # a weak tag is not allowed here
+        headers["If-Range"] = tag  # where the file changed, all of it comes
     try:
-        return urllib.request.urlopen(urllib.request.Request(url, headers={"Range": f"bytes={start}-"}), timeout=30)
+        return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=30)
     except urllib.error.HTTPError as error:
         if error.code != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise

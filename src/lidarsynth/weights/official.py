@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.networks.tensors import load_weights
+from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
+from lidarsynth.networks.tensors import load_weights, plain
 from lidarsynth.systems.diffusion.official_r2dm import experiment_of
 from lidarsynth.systems.table import build_network, official_readers
 from lidarsynth.systems.upsampling.official import is_keras, read_keras
@@ -55,6 +57,7 @@ def _unpickled(path: Path) -> Any:
     """What the file holds. Raises ValueError for a file that is damaged or is none."""
     expected = f"{path}: {EXPECTED}"
     try:
+        check_regular(path, LARGEST_WEIGHTS)
         zipped = zipfile.is_zipfile(path)
         with path.open("rb") as file:
             start = file.read(4)
@@ -63,10 +66,12 @@ def _unpickled(path: Path) -> Any:
     stand_ins = [pair for reader in official_readers().values() for pair in reader.stand_ins]
     try:
         # Mapped, so that the optimiser's two thirds of the file are not read.
-        with torch.serialization.safe_globals(stand_ins):
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
+        with torch.serialization.safe_globals(stand_ins), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch, about old formats and sparse tensors
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except Exception as error:  # a damaged pickle raises whatever it likes
         raise ValueError(f"{expected}, found {_damage(start, zipped, error)}") from None
+    return plain(content, str(path))
 
 
 def _damage(start: bytes, zipped: bool, error: Exception) -> str:
