@@ -135,7 +135,7 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ("elevations = [1]\nmin_range = -1", r"expected 0 <= min_range < max_range, got -1 and 100.0"),
         ("elevations = [1]\nmax_range = nan", r"expected 0 <= min_range < max_range, got 1.0 and nan"),
         ("elevations = [2, 1]\noffsets = [1]", r"offsets must have one height per beam \(2\), got 1"),
-        ("elevations = [1", r"mine.toml: expected a sensor file in TOML, found"),
+        ("elevations = [1", r"mine.toml: expected TOML, found"),
     ],
 )
 def test_files_that_make_no_sensor_get_one_line(tmp_path, content, message):
@@ -152,8 +152,8 @@ def test_files_of_another_kind_get_one_line(tmp_path):
     (tmp_path / "folder.toml").mkdir()
     for name, message in {
         "list.json": r"list: expected .*, found \[1, 2\]",
-        "bad.json": "bad.json: expected a sensor file in JSON, found",
-        "binary.json": "binary.json: expected a sensor file in JSON, found 'utf-8' codec",
+        "bad.json": "bad.json: expected JSON, found",
+        "binary.json": "binary.json: expected text in UTF-8, found invalid start byte",
         "folder.toml": "folder.toml: expected a readable sensor file, found Is a directory",
         "absent.toml": "absent.toml: expected a readable sensor file, found No such file",
         "sensor.yaml": "sensor.yaml: expected a .toml or .json sensor file, found .yaml",

@@ -209,7 +209,7 @@ def broken_files(folder: Path, good: bytes) -> Iterator[tuple[Path, str]]:
     yield folder / "list", "found a list"
     yield folder / "foreign", r"found a damaged or unsafe file .*Foreign"
     yield folder / "plain", r"found 1 keys \['conv.weight'\]"
-    yield folder, "found Is a directory"
+    yield folder, "found a folder"
     yield folder / "absent.pth", "found No such file"
 
 

@@ -68,11 +68,10 @@ def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu",
             loaded.networks[network.kind] = (rangenet if protocol.pairs else StreetFeatures(rangenet)).to(device)
             loaded.weights[network.kind] = sha256(own[name] / WEIGHTS)
             continue
-        path = cache_folder() / name
-        if (folder := cache_folder() / name.removesuffix(".tar.gz")).is_dir():
-            path = folder
+        path, folder = cache_folder() / name, cache_folder() / name.removesuffix(".tar.gz")
+        path = folder if folder.is_dir() else path
         try:
-            for done, total in download(f"{URLS[network.kind]}/{name}", path) if path != folder else ():
+            for done, total in download(f"{URLS[network.kind]}/{name}", path) if not path.is_dir() else ():
                 if on_images:
                     on_images(f"download {name}", done, total or done)
         except ValueError as error:

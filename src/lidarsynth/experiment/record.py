@@ -23,9 +23,7 @@ class Data:
     mirror: bool = False  # augmentation: swap left and right
     mend: bool = True  # mixed pixels that a conditional network makes are put onto the surface beside them
     scale: float = within(0.0, 0, 0.99)  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
-    mix: float = within(
-        0.0, 0, 1
-    )  # augmentation of completion: share of samples with a sector of another image
+    mix: float = within(0.0, 0, 1)  # augmentation of completion: share of samples with a sector of another image
 
     def __post_init__(self):
         check_ranges(self)
@@ -96,9 +94,7 @@ class Upsampling:
     noise: float = within(0.0, 0)  # standard deviation of what training adds to ranges
     keras: bool = False  # LiDAR-SR's original program: no return is 0 and not 1, dropout of single values
     passes: int = within(50, 1, 100_000)  # of LiDAR-SR under Monte-Carlo dropout
-    threshold: float = within(
-        0.03, 0
-    )  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
+    threshold: float = within(0.03, 0)  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
     depth: int = within(1, 0, 64)  # layers of ILN's transformer
     queries: int = within(16_384, 1)  # pixels of a scan that a step of ILN or LIIF learns from
 
@@ -116,19 +112,15 @@ class Adversarial:
     discriminator_channels: int | None = within(None, 1, 8192)  # at its finest map; None = model.base_channels
     temperature: float = within(1.0, 1e-6)  # of the Gumbel-sigmoid that drops rays
     iros21: bool = False  # layers of the first release of vanilla GAN and DUSty v1: tanh, mirrored blur
-    empty_below: float = 0.0  # code in [0, 1] up to which a pixel is empty
+    empty_below: float = within(0.0, 0, 1)  # code in [0, 1] up to which a pixel is empty
     r1_weight: float = within(1.0, 0)
     r1_every: int = within(16, 1)  # steps
     path_length_weight: float = within(0.0, 0)  # 0 = off
     path_length_every: int = within(4, 1)  # steps
-    augmentation_target: float | None = within(
-        0.6, -1, 1
-    )  # mean sign of real images' logits; None = no augmentation
+    augmentation_target: float | None = within(0.6, -1, 1)  # mean sign of real images' logits; None = no augmentation
     augmentation_images: int = within(500_000, 1)  # in which its probability can rise from 0 to 1
     augmentation_every: int = within(4, 1)  # steps between its updates
-    warmup_images: int = within(
-        200_000, 0
-    )  # in which pixels are dropped before the discriminator, at first half
+    warmup_images: int = within(200_000, 0)  # in which pixels are dropped before the discriminator, at first half
 
     def __post_init__(self):
         check_ranges(self)
@@ -153,7 +145,7 @@ class Training:
     steps: int = within(300_000, 0)
     batch_size: int = within(8, 1, 1_048_576)
     learning_rate: float = within(1e-4, 0)
-    betas: tuple[float, float] = within((0.9, 0.99), 0, 1)
+    betas: tuple[float, float] = within((0.9, 0.99), 0, 0.999999)
     warmup: int = within(10_000, 0)  # steps of linear warm-up
     decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant | inverse | halving
     clip_norm: float | None = within(1.0, 0)  # None = gradients as they are
@@ -161,12 +153,8 @@ class Training:
     ema_every: int = within(10, 1)  # steps
     ema_start: int = within(10_000, 0)  # steps of plain copying
     ema_half_life: int = within(10_000, 1)  # images; of GANs, in the place of the three above
-    generation_share: float = within(
-        1.0, 0, 1
-    )  # share of a batch without known pixels; 1 for unconditional networks
-    upsampling_share: float = within(
-        0.0, 0, 1
-    )  # of the others, knows every fourth beam, begins at pure noise
+    generation_share: float = within(1.0, 0, 1)  # share of a batch without known pixels; 1 for unconditional networks
+    upsampling_share: float = within(0.0, 0, 1)  # of the others, knows every fourth beam, begins at pure noise
     metres_weight: float = within(0.1, 0)  # of completion's error in metres, beside that in code
     seed: int = within(0, 0)
 

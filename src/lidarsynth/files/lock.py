@@ -9,6 +9,7 @@ all, work goes on without one.
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,13 +33,21 @@ def only_writer(folder: Path, work: str) -> Iterator[None]:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK).open("ab") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"{folder}: expected a folder that nobody else writes to, found another {work} at work "
-                             "in it; name another folder, or wait") from None  # fmt: skip
-        except OSError as error:
-            if error.errno not in UNKNOWN:
-                raise
-        yield
+    path, held = folder / LOCK, False
+    while not held:
+        with path.open("ab") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(f"{folder}: expected a folder that nobody else writes to, found another {work} at "
+                                 "work in it; name another folder, or wait") from None  # fmt: skip
+            except OSError as error:
+                if error.errno not in UNKNOWN:
+                    raise
+            # who held it before may have taken the file away after we opened it: then it is another one now
+            held = path.exists() and path.stat().st_ino == os.fstat(file.fileno()).st_ino
+            if held:
+                try:
+                    yield
+                finally:
+                    path.unlink(missing_ok=True)

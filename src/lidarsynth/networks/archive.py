@@ -45,7 +45,7 @@ def _of_archive(path: Path, largest: Mapping[str, int], what: str) -> dict[str, 
                     content = archive.extractfile(member)
                     files[name] = content.read() if content else b""
     except (OSError, EOFError, tarfile.TarError, zlib.error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
         raise ValueError(f"{path}: expected a {what} archive (.tar.gz), found {reason:.120}") from None
     return files
 

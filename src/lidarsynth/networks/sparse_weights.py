@@ -12,7 +12,7 @@ from torch import Tensor
 from lidarsynth.networks.archive import read_yaml, weight_files
 from lidarsynth.networks.minkowski_unet import MinkowskiUNet, widths_of
 from lidarsynth.networks.spvcnn import SPVCNN
-from lidarsynth.networks.tensors import load_state, read_pickle
+from lidarsynth.networks.tensors import CONVERT, check_shapes, load_state, read_pickle
 
 Kind = Literal["minkowskinet", "spvcnn"]
 CHECKPOINT, CONFIG = "model.ckpt", "config.yaml"
@@ -30,23 +30,25 @@ def read_sparse(path: str | Path, kind: Kind) -> MinkowskiUNet | SPVCNN:
     """
     path = Path(path)
     if path.suffix in (".ckpt", ".pth", ".pt"):
-        files, where, checkpoint = {}, str(path), read_pickle(path, str(path))
+        files, where, checkpoint = {}, str(path), read_pickle(path, str(path), CONVERT)
     else:
         files, where = weight_files(path, FILES, (CHECKPOINT,), kind), f"{path}: {CHECKPOINT}"
-        checkpoint = read_pickle(BytesIO(files[CHECKPOINT]), where)
+        checkpoint = read_pickle(BytesIO(files[CHECKPOINT]), where, CONVERT)
     tensors = _tensors_of(checkpoint, where)
     if absent := [name for name in WIDTHS if name not in tensors or tensors[name].ndim != 3]:
         raise ValueError(f"{where}: expected the tensors of {kind}, found no kernel {absent[0]}")
     widths = tuple(tensors[name].shape[2] for name in WIDTHS)
     if CONFIG in files:
         _check_widths(files[CONFIG], f"{path}: {CONFIG}", widths)
-    with torch.device("meta"):  # shapes first, so that absurd ones cost nothing
-        build = {"minkowskinet": MinkowskiUNet, "spvcnn": SPVCNN}[kind]
-        names = build(widths).state_dict().keys()
     if kind == "minkowskinet" and any(name.startswith("point_transforms.") for name in tensors):
         raise ValueError(f"{where}: expected the tensors of minkowskinet, found a point branch, as of spvcnn")
+    build = {"minkowskinet": MinkowskiUNet, "spvcnn": SPVCNN}[kind]
+    with torch.device("meta"):  # shapes first, so that absurd ones cost nothing
+        shapes = build(widths)
+    own = {name: value for name, value in tensors.items() if name in shapes.state_dict()}
+    check_shapes(shapes, own, where)
     network = build(widths)
-    load_state(network, {name: value for name, value in tensors.items() if name in names}, where)
+    load_state(network, own, where)
     return network.eval()
 
 

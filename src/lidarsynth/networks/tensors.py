@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from lidarsynth.networks.finite import not_finite
 
 
-def read_pickle(file: str | Path | BinaryIO, where: str) -> Any:
+def read_pickle(file: str | Path | BinaryIO, where: str, advice: str = "") -> Any:
     """What torch.save wrote, old formats too, read with `weights_only`, on the CPU: tensors and plain containers.
 
     where  names the file in errors. Raises ValueError for anything else: damaged files, and pickled classes, which it
-    names, saying how a checkpoint with such becomes one of tensors.
+    names; `advice`, such as CONVERT, follows them.
     """
     try:
         with warnings.catch_warnings():  # of torch, about old formats and sparse tensors: three lines for one
@@ -27,8 +27,8 @@ def read_pickle(file: str | Path | BinaryIO, where: str) -> Any:
         raise ValueError(f"{where}: expected weights, found {error.strerror or error}") from None
     except Exception as error:  # a damaged pickle raises whatever it likes
         if classes := _classes_of(file):
-            raise ValueError(f"{where}: expected tensors, found a pickle of {', '.join(classes)[:120]}, which is not "
-                             f"loaded; {CONVERT}") from None  # fmt: skip
+            raise ValueError(f"{where}: expected tensors, found a damaged or unsafe file: a pickle of "
+                             f"{', '.join(classes)[:120]}, which is not loaded{advice}") from None  # fmt: skip
         reason = str(error).rpartition("WeightsUnpickler error:")[2].strip().partition("\n")[0]
         raise ValueError(f"{where}: expected weights, found a damaged or unsafe file ({reason:.120})") from None
     return plain(content, where)
@@ -41,7 +41,7 @@ def plain(content: Any, where: str) -> Any:
     """
     if isinstance(content, Tensor):
         ordinary = content.layout == torch.strided and content.device.type == "cpu"
-        if not ordinary or content.is_quantized or content.is_complex() or content.is_nested:
+        if not ordinary or content.is_quantized or content.is_complex() or content.is_nested or _spread(content):
             raise ValueError(f"{where}: expected tensors of plain numbers, found one of {content.layout} on "
                              f"{content.device}, {content.dtype}")  # fmt: skip
         return content.detach()
@@ -52,8 +52,13 @@ def plain(content: Any, where: str) -> Any:
     return content
 
 
+def _spread(tensor: Tensor) -> bool:
+    """Whether it claims more numbers than its file holds, as one number repeated a billion times does."""
+    return tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes()
+
+
 CONVERT = (  # loading it for good runs what it names, so not here and not at the user's desk
-    'if you trust its origin, convert it once in a container without network: python -c "import torch; '
+    '; if you trust its origin, convert it once in a container without network: python -c "import torch; '
     "torch.save(torch.load('model.ckpt', map_location='cpu', weights_only=False)['state_dict'], 'tensors.ckpt')\""
 )
 
@@ -82,21 +87,26 @@ def read_state(file: str | Path | BinaryIO, where: str) -> dict[str, Tensor]:
 def load_state(module: nn.Module, state: dict[str, Tensor], where: str) -> None:
     """Put tensors into a module; counters of batch normalisation may be absent.
 
-    where  names the file in errors. Raises ValueError, naming the first, when names or shapes do not fit.
+    where  names the file in errors. Raises ValueError as `check_shapes`, and for NaN or infinity.
     """
+    check_shapes(module, state, where)
     own = module.state_dict()
-    expected = {key: tuple(value.shape) for key, value in own.items()}
     counters = {key for key in own if key.endswith("num_batches_tracked")}
+    if name := not_finite(state):
+        raise ValueError(f"{where}: expected finite weights, found NaN or infinity in {name}")
+    module.load_state_dict({**{key: own[key] for key in counters}, **state})
+
+
+def check_shapes(module: nn.Module, state: dict[str, Tensor], where: str) -> None:
+    """Raises ValueError, naming the first, when names or shapes do not fit; counters of normalisation may be absent."""
+    expected = {key: tuple(value.shape) for key, value in module.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in state.items()}
     wrong = [key for key in {**expected, **found} if expected.get(key) != found.get(key)]
-    wrong = [key for key in wrong if key in found or key not in counters]
+    wrong = [key for key in wrong if key in found or not key.endswith("num_batches_tracked")]
     if wrong:
         key = wrong[0]
         raise ValueError(f"{where}: expected {key} {expected.get(key, 'not to be there')}, found "
                          f"{found.get(key, 'none')}; {len(wrong)} tensors do not fit")  # fmt: skip
-    if name := not_finite(state):
-        raise ValueError(f"{where}: expected finite weights, found NaN or infinity in {name}")
-    module.load_state_dict({**{key: own[key] for key in counters}, **state})
 
 
 def tensors_of(part: object, expected: str, prefix: str = "") -> dict[str, Tensor]:

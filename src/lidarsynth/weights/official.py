@@ -25,6 +25,12 @@ def read_official(path: str | Path, ema: bool = True) -> tuple[Experiment, nn.Mo
     them. Raises ValueError when the file is no such checkpoint, is damaged or cannot be built.
     """
     path = Path(path)
+    try:
+        check_regular(path, LARGEST_WEIGHTS)
+    except ValueError as error:
+        raise ValueError(f"{path}: {EXPECTED}, {str(error).rpartition(', ')[2]}") from None
+    except OSError as error:
+        raise ValueError(f"{path}: {EXPECTED}, found {error.strerror or error}") from None
     if is_keras(path):
         return _read_keras(path)
     checkpoint = _unpickled(path)
@@ -57,7 +63,6 @@ def _unpickled(path: Path) -> Any:
     """What the file holds. Raises ValueError for a file that is damaged or is none."""
     expected = f"{path}: {EXPECTED}"
     try:
-        check_regular(path, LARGEST_WEIGHTS)
         zipped = zipfile.is_zipfile(path)
         with path.open("rb") as file:
             start = file.read(4)

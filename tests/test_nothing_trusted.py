@@ -1,0 +1,226 @@
+"""Files of settings, weights and caches that are pipes, devices, huge, crafted or cut short; and odd surroundings."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lidarsynth.benchmark.config import read_config
+from lidarsynth.cli.terminal import check_device
+from lidarsynth.data.index import read_index
+from lidarsynth.evaluation import accumulation, evaluate
+from lidarsynth.evaluation.image_sets import as_image, image_set
+from lidarsynth.evaluation.statistics import load_statistics
+from lidarsynth.experiment.folder import read_experiment
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, read_sensor
+from lidarsynth.lidar.small_file import read_json, read_toml
+from lidarsynth.networks.tensors import read_state
+from lidarsynth.pictures.render import save_png
+from lidarsynth.systems.build import load_folder
+from lidarsynth.weights import download
+from lidarsynth.weights.official import read_official
+
+SENSOR = SENSORS["hdl-64e"].resized(8, 64)
+READERS = {
+    "a.toml": read_sensor,
+    "a.json": read_sensor,
+    "b.toml": lambda path: read_config("upsampling", path),
+    "experiment.json": lambda path: read_experiment(path.parent),
+    "index.json": lambda path: read_index(path.parent),
+    "model.safetensors": lambda path: load_folder(_with_record(path.parent)),
+    "a.safetensors": load_statistics,
+    "a.pth": read_official,
+    "sample.pth": lambda path: image_set(path).item(0),
+}
+
+
+def _with_record(folder: Path) -> Path:
+    from lidarsynth.experiment.presets import preset
+
+    (folder / "experiment.json").write_text(json.dumps(preset("tiny").to_dict()))
+    return folder
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("kind", ["pipe", "device", "sparse", "folder"])
+@pytest.mark.parametrize("name", READERS)
+def test_pipes_devices_and_sparse_files_are_refused_at_once(name: str, kind: str, tmp_path: Path):
+    path = tmp_path / name
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        with path.open("wb") as file:
+            file.truncate(1 << 37)
+    with pytest.raises((ValueError, OSError)) as error:
+        READERS[name](path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.timeout(20)
+def test_toml_of_a_thousand_dots_and_json_of_a_thousand_brackets_are_refused_at_once(tmp_path: Path):
+    (tmp_path / "a.toml").write_text("a." * 30_000 + "a = 1\n")
+    with pytest.raises(ValueError, match="expected keys of a few words"):
+        read_toml(tmp_path / "a.toml")
+    (tmp_path / "a.json").write_text("[" * 200_000)
+    with pytest.raises(ValueError, match="expected JSON"):
+        read_json(tmp_path / "a.json")
+    (tmp_path / "b.toml").write_text('a.b.c = "x.y.z"\n')
+    assert read_toml(tmp_path / "b.toml") == {"a": {"b": {"c": "x.y.z"}}}
+
+
+CRAFTED = {
+    "sparse": lambda: torch.eye(8).to_sparse(),
+    "meta": lambda: torch.empty(5, 8, 64, device="meta"),
+    "complex": lambda: torch.zeros(5, 8, 64, dtype=torch.complex64),
+    "repeated": lambda: torch.zeros(1, 1, 1).expand(5, 8, 64),
+}
+
+
+@pytest.mark.parametrize("name", CRAFTED)
+def test_tensors_without_plain_numbers_are_refused_in_one_line(name: str, tmp_path: Path, recwarn):
+    path = tmp_path / "a.pth"
+    torch.save({"w": CRAFTED[name]()}, path)
+    with pytest.raises(ValueError, match="expected tensors of plain numbers, found one of"):
+        read_state(path, "here")
+    with pytest.raises(ValueError, match="plain numbers"):
+        read_official(path)
+    torch.save(CRAFTED[name](), path)
+    with pytest.raises(ValueError, match="plain numbers"):
+        image_set(path).item(0)
+    assert not recwarn.list
+
+
+def test_parameters_and_gradients_are_plain_numbers(tmp_path: Path):
+    for tensor in (torch.nn.Parameter(torch.ones(5, 8, 64)), torch.ones(5, 8, 64, requires_grad=True)):
+        torch.save(tensor, tmp_path / "a.pth")
+        assert as_image(image_set(tmp_path / "a.pth").item(0), SENSOR, "auto").range.sum() == 8 * 64
+        torch.save({"w": tensor}, tmp_path / "a.pth")
+        assert not read_state(tmp_path / "a.pth", "here")["w"].requires_grad
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shards": []},
+        {"shards": {"0000000.npy": 3}},
+        {"shards": {"0000000.npy": {"count": "3"}}},
+        {"shards": {"0000000.npy": {"count": 3, "frames": [1, 2, 3]}}},
+        {"shards": {"0000000.npy": {"count": 1, "frames": [["a", "b"], ["c", "d"]]}}},
+        {"source": "words"},
+        {"source": {"name": 7}},
+        {"sensor": [1]},
+        {"count": True},
+    ],
+)
+def test_indexes_with_other_types_are_refused_by_the_field(change: dict, tmp_path: Path):
+    index = {"source": {"name": "x"}, "sensor": SENSOR.to_dict(), "count": 3, "shards": {}}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    assert read_index(tmp_path)
+    (tmp_path / "index.json").write_text(json.dumps({**index, **change}))
+    with pytest.raises(ValueError, match=r"index.json: expected .*, found"):
+        read_index(tmp_path)
+
+
+def noise(i: int) -> RangeImage:
+    rng = np.random.default_rng(i)
+    distance = rng.uniform(5, 60, (8, 64)).astype(np.float32)
+    return RangeImage(distance, rng.random((8, 64)).astype(np.float32), distance > 0, SENSOR)
+
+
+def saved(folder: Path, first: int) -> Path:
+    from lidarsynth.files.formats import write
+
+    folder.mkdir()
+    for i in range(first, first + 3):
+        write(folder / f"{i}.npz", noise(i))
+    return folder
+
+
+def test_damaged_statistics_of_the_cache_are_made_anew(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
+    samples, real = saved(tmp_path / "samples", 0), saved(tmp_path / "real", 10)
+    expected = evaluate.evaluate(samples, real).values
+    (kept,) = (tmp_path / "cache/statistics").glob("bev-1-*")
+    whole = kept.read_bytes()
+    for content in (whole[:-100], b"", whole[:8] + b"x" * 50):
+        kept.write_bytes(content)
+        assert evaluate.evaluate(samples, real).values == expected
+        assert load_statistics(kept)[0].count == 3, "whole again"
+
+
+def test_a_cache_that_cannot_be_written_to_costs_time_only(tmp_path: Path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "file/cache"))  # also root cannot make a folder in a file
+    monkeypatch.setattr(accumulation, "SAVE_EVERY", 0.0)
+    samples, real = saved(tmp_path / "samples", 0), saved(tmp_path / "real", 10)
+    assert evaluate.evaluate(samples, real).values["JSD x1e2"] is not None
+    assert evaluate.evaluate(samples, samples, "street-upsampling-1").values["range MAE"] == 0
+
+
+def test_a_folder_without_rights_is_refused_before_the_work(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(ValueError, match="expected a folder that may be written to"):
+        evaluate.check_out(tmp_path / "report.json")
+
+
+def test_a_cache_folder_is_found_without_a_home(monkeypatch):
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("LIDARSYNTH_CACHE", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert download.cache_folder().name == "lidarsynth-cache"
+
+
+@pytest.mark.parametrize("device", ["meta", "tpu-9", ""])
+def test_devices_that_compute_nothing_are_refused(device: str):
+    with pytest.raises(ValueError, match="expected a device"):
+        check_device(device)
+
+
+def test_pictures_have_the_rights_that_the_umask_leaves(tmp_path: Path):
+    old = os.umask(0o027)
+    try:
+        path = save_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
+    finally:
+        os.umask(old)
+    assert path.stat().st_mode & 0o777 == 0o640 and [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
+def command(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "lidarsynth", *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, **environment},
+    )
+
+
+def test_help_in_a_narrow_terminal_and_absurd_counts_answer_at_once(tmp_path: Path):
+    assert command("--help", COLUMNS="5").returncode == 0
+    done = command("data", "synthetic", str(tmp_path / "cache"), "-n", str(10**23))
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "--count" in done.stderr
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_part_of_another_origin_is_not_continued(tmp_path: Path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.write_bytes(b"a" * 1000)
+    second.write_bytes(b"b" * 1000)
+    part = tmp_path / "out.part"
+    part.write_bytes(b"a" * 400)
+    (tmp_path / "out.part.origin").write_text(f"{first.as_uri()}\n\n")
+    list(download.download(second.as_uri(), tmp_path / "out"))
+    assert (tmp_path / "out").read_bytes() == b"b" * 1000
+    assert not (tmp_path / "out.part.origin").exists()
