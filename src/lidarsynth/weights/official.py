@@ -63,7 +63,7 @@ def _unpickled(path: Path) -> Any:
     """What the file holds. Raises ValueError for a file that is damaged or is none."""
     expected = f"{path}: {EXPECTED}"
     try:
-        zipped = zipfile.is_zipfile(path)
+        zipped = _is_zip(path)
         with path.open("rb") as file:
             start = file.read(4)
     except OSError as error:
@@ -77,6 +77,13 @@ def _unpickled(path: Path) -> Any:
     except Exception as error:  # a damaged pickle raises whatever it likes
         raise ValueError(f"{expected}, found {_damage(start, zipped, error)}") from None
     return plain(content, str(path))
+
+
+def _is_zip(path: Path) -> bool:
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # of several disks, says a damaged one
+        return False
 
 
 def _damage(start: bytes, zipped: bool, error: Exception) -> str:
