@@ -22,8 +22,7 @@ from lidarsynth.experiment.record import Experiment, from_dict, with_fields
 from lidarsynth.files.lock import LOCK, only_writer
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.systems.assemble import assemble
-from lidarsynth.systems.build import build_network
+from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.training import checkpoint
 from lidarsynth.training.checkpoint import STATE, checkpoints, damage_of
 from lidarsynth.training.options import Options

@@ -22,7 +22,7 @@ from lidarsynth.lidar.sensor import SENSORS, read_sensor
 from lidarsynth.lidar.small_file import read_json, read_toml
 from lidarsynth.networks.tensors import read_state
 from lidarsynth.pictures.render import save_png
-from lidarsynth.systems.build import load_folder
+from lidarsynth.systems.table import load_folder
 from lidarsynth.weights import download
 from lidarsynth.weights.official import read_official
 
