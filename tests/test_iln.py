@@ -147,7 +147,5 @@ def test_errors_say_both_sides():
     with pytest.raises(ValueError, match=r"expected a checkpoint of 'iln' .*, found a list"):
         from_official([])
     small = {"model": {"name": "iln", "state_dict": network.state_dict()}}
-    with pytest.raises(
-        ValueError, match=r"head.0.conv.weight \(64, 1, 3, 3\) for ILN, found \(4, 1, 3, 3\); \d+ tensors"
-    ):
+    with pytest.raises(ValueError, match=r"head.0.conv.weight \(64, 1, 3, 3\), found \(4, 1, 3, 3\); \d+ tensors"):
         from_official(small)

@@ -215,11 +215,11 @@ def test_a_file_of_the_published_size_loads(shapes, tmp_path):
     [
         (
             {"res2.0.conv1.weight": [64, 128, 3, 3]},
-            r"res2.0.conv1.weight \(128, 128, 3, 3\) for RefineNet, found \(64,",
+            r"res2.0.conv1.weight \(128, 128, 3, 3\), found \(64,",
         ),
-        ({"begin_conv.weight": [64, 4, 3, 3]}, r"\(64,\) for RefineNet, found \(128,\); \d+ tensors do not fit"),
+        ({"begin_conv.weight": [64, 4, 3, 3]}, r"\(64,\), found \(128,\); \d+ tensors do not fit"),
         ({"begin_conv.weight": [128, 3, 3, 3]}, r"for range, reflectance and two coordinates|tensors do not fit"),
-        ({"refine4.crp.convs.0.weight": None}, r"\(128, 128, 3, 3\) for RefineNet, found none; 1 tensors do not fit"),
+        ({"refine4.crp.convs.0.weight": None}, r"\(128, 128, 3, 3\), found none; 1 tensors do not fit"),
         ({"res5.0.conv1.weight": [256, 256, 3, 3]}, r"res5.0.conv1.weight not to be there"),
         ({"sigmas": [1]}, "noise levels `sigmas` that fall geometrically, found 1 from 50 to 50"),
         ({"begin_conv.weight": None}, "expected LiDARGen's begin_conv.weight and sigmas, found"),

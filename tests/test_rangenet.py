@@ -14,7 +14,7 @@ from torch import Tensor
 from lidarsynth.metrics.knn import knn_labels, smooth_labels
 from lidarsynth.networks.rangenet import RangeNet, frechet_features, frechet_positions
 from lidarsynth.networks.rangenet_archive import read_rangenet
-from lidarsynth.networks.tensors import load_state
+from lidarsynth.networks.tensors import load_weights
 
 
 def assert_net(actual: Tensor, expected: Tensor) -> None:
@@ -183,14 +183,14 @@ def test_damaged_archives(damage: Callable, tmp_path: Path):
 def test_weights_may_lack_the_counters_but_nothing_else():
     network, other = small(0), small(1)
     state = {k: v for k, v in other.state_dict().items() if "num_batches_tracked" not in k}
-    load_state(network, state, "here")
+    load_weights(network, state, "here", counters=True)
     torch.testing.assert_close(network.state_dict(), other.state_dict())
     for change, message in (
         ({"head.1.bias": torch.ones(3)}, r"here: expected head.1.bias \(20,\), found \(3,\)"),
         ({"more": torch.ones(3)}, r"here: expected more not to be there, found \(3,\); 1 tensors"),
     ):
         with pytest.raises(ValueError, match=message):
-            load_state(network, state | change, "here")
+            load_weights(network, state | change, "here", counters=True)
 
 
 def test_knn_equals_the_reference_exactly(fixture_tensors):

@@ -162,5 +162,5 @@ def test_errors_say_both_sides(checkpoint):
     with pytest.raises(ValueError, match=r"begin_conv.weight and sigmas, found \['conv1.weight'\]"):
         from_official([{"module.conv1.weight": torch.zeros(1)}, {}, 0, 0])
     cut = [{key: value for key, value in checkpoint[0].items() if "refine4" not in key}, {}, 0, 0]
-    with pytest.raises(ValueError, match=r"\(8, 8, 3, 3\) for RefineNet, found none; 20 tensors do not fit"):
+    with pytest.raises(ValueError, match=r"\(8, 8, 3, 3\), found none; 20 tensors do not fit"):
         from_official(cut)

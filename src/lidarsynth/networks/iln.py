@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarsynth.networks.tensors import fill, iln_arguments, iln_tensors
+from lidarsynth.networks.tensors import iln_arguments, iln_tensors, load_weights
 
 LIIF_ARGUMENTS: dict[str, int | bool] = {"local_ensemble": True, "feat_unfold": False, "cell_decode": False}
 SHIFTS = ((-1, -1), (-1, 1), (1, -1), (1, 1))  # of the four neighbours: (vertical, horizontal), in half pixels
@@ -265,5 +265,5 @@ def from_official(checkpoint: object, model: str = "iln") -> ILN | LIIF:
         if found["d"] != depth:
             raise ValueError(f"expected tensors of d = {found['d']} layers, as model.args says, found {depth}")
         network = ILN(depth, heads=found["h"])
-    fill(network, weights)
+    load_weights(network, weights)
     return network.eval()

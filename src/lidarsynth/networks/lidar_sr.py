@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarsynth.networks.tensors import fill, iln_tensors
+from lidarsynth.networks.tensors import iln_tensors, load_weights
 
 
 class TransposedConv(nn.ConvTranspose2d):
@@ -250,7 +250,7 @@ def from_official(checkpoint: object, scale: tuple[int, int] = (4, 1)) -> LidarS
     if last is None or last.ndim != 4:
         raise ValueError(f"expected LiDAR-SR's outc.conv.1.weight, found {list(weights)[:4]}")
     network = LidarSR(scale, width=last.shape[1])
-    fill(network, weights)
+    load_weights(network, weights)
     return network.eval()
 
 
@@ -268,5 +268,5 @@ def from_keras(weights: Sequence[Tensor], scale: int = 4, dropout: float = 0.25)
         raise ValueError(f"expected {len(names)} tensors of Keras' LiDAR-SR, found {len(weights)}")
     own = [tensor.permute(3, 2, 0, 1) if tensor.ndim == 4 else tensor for tensor in weights]
     counters = {name: value for name, value in network.state_dict().items() if name not in names}
-    fill(network, {**dict(zip(names, own, strict=True)), **counters})
+    load_weights(network, {**dict(zip(names, own, strict=True)), **counters})
     return network.eval()

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from lidarsynth.metrics.distributions import Array, as_tensor
-from lidarsynth.networks.tensors import load_state, read_state
+from lidarsynth.networks.tensors import load_weights, read_state
 
 SCALE = 80.0  # metres; points are divided by it
 WEIGHTS = "cls_model_39.pth"  # the official file, of TreeGAN
@@ -79,7 +79,7 @@ class _PointFeatures(nn.Module):
 def read_pointnet(path: str | Path) -> PointNet:
     """The network of the official `cls_model_39.pth`, in evaluation mode. Raises ValueError for any other file."""
     network = PointNet()
-    load_state(network, read_state(path, str(path)), str(path))
+    load_weights(network, read_state(path, str(path)), str(path), counters=True)
     return network.eval()
 
 

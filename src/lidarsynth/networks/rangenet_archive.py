@@ -9,7 +9,7 @@ from typing import Any
 
 from lidarsynth.networks.archive import read_yaml, weight_files
 from lidarsynth.networks.rangenet import MEANS, STDS, RangeNet
-from lidarsynth.networks.tensors import load_state, read_state
+from lidarsynth.networks.tensors import load_weights, read_state
 
 # File of an archive -> the most bytes it may have; RangeNet-53's encoder has 163 MB.
 FILES: dict[str, int] = {
@@ -58,7 +58,7 @@ def _filled(
     parts = {"backbone": network.backbone, "segmentation_decoder": network.decoder, "segmentation_head": network.head}
     for name, module in parts.items():
         if name in files:
-            load_state(module, read_state(BytesIO(files[name]), f"{path}: {name}"), f"{path}: {name}")
+            load_weights(module, read_state(BytesIO(files[name]), f"{path}: {name}"), f"{path}: {name}", counters=True)
     return network.eval()
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarsynth.networks.tensors import fill, tensors_of
+from lidarsynth.networks.tensors import load_weights, tensors_of
 
 
 class InstanceNormPlus(nn.Module):
@@ -234,5 +234,5 @@ def from_official(checkpoint: object, ema: bool = True, unit_range: bool = True)
     if begin is None or begin.ndim != 4 or sigmas is None or sigmas.ndim != 1:
         raise ValueError(f"expected LiDARGen's begin_conv.weight and sigmas, found {list(weights)[:4]}")
     network = RefineNet(begin.shape[1] - 2, len(begin), len(sigmas), unit_range)
-    fill(network, weights)
+    load_weights(network, weights)
     return network.eval()

@@ -12,7 +12,7 @@ from torch import Tensor
 from lidarsynth.networks.archive import read_yaml, weight_files
 from lidarsynth.networks.minkowski_unet import MinkowskiUNet, widths_of
 from lidarsynth.networks.spvcnn import SPVCNN
-from lidarsynth.networks.tensors import CONVERT, check_shapes, load_state, read_pickle
+from lidarsynth.networks.tensors import CONVERT, check_shapes, load_weights, read_pickle
 
 Kind = Literal["minkowskinet", "spvcnn"]
 CHECKPOINT, CONFIG = "model.ckpt", "config.yaml"
@@ -48,7 +48,7 @@ def read_sparse(path: str | Path, kind: Kind) -> MinkowskiUNet | SPVCNN:
     own = {name: value for name, value in tensors.items() if name in shapes.state_dict()}
     check_shapes(shapes, own, where)
     network = build(widths)
-    load_state(network, own, where)
+    load_weights(network, own, where, counters=True)
     return network.eval()
 
 

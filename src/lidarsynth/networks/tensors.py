@@ -1,9 +1,10 @@
-"""Published weights of the feature networks: tensors by name from a file, and into a module, with clear errors."""
+"""Tensors by name: from files and checkpoints, and into a network, with clear errors."""
 
 from __future__ import annotations
 
 import warnings
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -84,29 +85,38 @@ def read_state(file: str | Path | BinaryIO, where: str) -> dict[str, Tensor]:
     return state
 
 
-def load_state(module: nn.Module, state: dict[str, Tensor], where: str) -> None:
-    """Put tensors into a module; counters of batch normalisation may be absent.
+def load_weights(network: nn.Module, weights: Mapping[str, Tensor], where: str = "", counters: bool = False) -> None:
+    """Copy tensors into a network, of whatever floating type they are.
 
-    where  names the file in errors. Raises ValueError as `check_shapes`, and for NaN or infinity.
+    where     names the file in errors
+    counters  whether counters of batch normalisation may be absent, as older files have none
+
+    Raises ValueError as `check_shapes`, and for NaN or infinity.
     """
-    check_shapes(module, state, where)
-    own = module.state_dict()
-    counters = {key for key in own if key.endswith("num_batches_tracked")}
-    if name := not_finite(state):
-        raise ValueError(f"{where}: expected finite weights, found NaN or infinity in {name}")
-    module.load_state_dict({**{key: own[key] for key in counters}, **state})
+    check_shapes(network, weights, where, counters)
+    if name := not_finite(dict(weights)):
+        raise ValueError(f"{_begin(where)}expected finite weights, found NaN or infinity in {name}")
+    own = network.state_dict()
+    spare = {key for key in own if key.endswith("num_batches_tracked")} - weights.keys()
+    network.load_state_dict({**{key: own[key] for key in spare}, **weights})
 
 
-def check_shapes(module: nn.Module, state: dict[str, Tensor], where: str) -> None:
-    """Raises ValueError, naming the first, when names or shapes do not fit; counters of normalisation may be absent."""
-    expected = {key: tuple(value.shape) for key, value in module.state_dict().items()}
-    found = {key: tuple(value.shape) for key, value in state.items()}
+def check_shapes(network: nn.Module, weights: Mapping[str, Tensor], where: str = "", counters: bool = True) -> None:
+    """Raises ValueError, naming the first, when names or shapes do not fit; `counters` as in `load_weights`."""
+    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in weights.items()}
     wrong = [key for key in {**expected, **found} if expected.get(key) != found.get(key)]
-    wrong = [key for key in wrong if key in found or not key.endswith("num_batches_tracked")]
+    wrong = [key for key in wrong if key in found or not (counters and key.endswith("num_batches_tracked"))]
     if wrong:
         key = wrong[0]
-        raise ValueError(f"{where}: expected {key} {expected.get(key, 'not to be there')}, found "
-                         f"{found.get(key, 'none')}; {len(wrong)} tensors do not fit")  # fmt: skip
+        raise ValueError(
+            f"{_begin(where)}expected {key} {expected.get(key, 'not to be there')}, found {found.get(key, 'none')}; "
+            f"{len(wrong)} tensors do not fit {type(network).__name__}"
+        )
+
+
+def _begin(where: str) -> str:
+    return f"{where}: " if where else ""
 
 
 def tensors_of(part: object, expected: str, prefix: str = "") -> dict[str, Tensor]:
@@ -144,36 +154,3 @@ def iln_arguments(checkpoint: dict, defaults: dict[str, int | bool]) -> dict[str
     if not known:
         raise ValueError(f"expected model.args of {', '.join(defaults)}, found {args!r:.80}")
     return {**defaults, **args}
-
-
-def fill(network: nn.Module, weights: dict[str, Tensor]) -> None:
-    """Put tensors into a network. Raises ValueError, naming the first, when names or shapes do not fit."""
-    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    found = {key: tuple(value.shape) for key, value in weights.items()}
-    wrong = [key for key in {**expected, **found} if expected.get(key) != found.get(key)]
-    if wrong:
-        key = wrong[0]
-        raise ValueError(
-            f"expected {key} {expected.get(key, 'not to be there')} for {type(network).__name__}, "
-            f"found {found.get(key, 'none')}; {len(wrong)} tensors do not fit"
-        )
-    if name := not_finite(weights):
-        raise ValueError(f"expected finite weights, found NaN or infinity in {name}")
-    network.load_state_dict(weights)
-
-
-def load_weights(network: nn.Module, weights: dict[str, Tensor], source: str) -> None:
-    """Copy weights into the network. Raises ValueError that names what is missing, unknown or of another shape."""
-    own = network.state_dict()
-    missing, unknown = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
-    if missing or unknown:
-        raise ValueError(
-            f"{source}: expected the {len(own)} tensors of the experiment's network, found {len(missing)} missing "
-            f"{missing[:2]} and {len(unknown)} unknown {unknown[:2]}"
-        )
-    for name, tensor in own.items():
-        if weights[name].shape != tensor.shape:
-            raise ValueError(f"{source}: expected {name} {tuple(tensor.shape)}, found {tuple(weights[name].shape)}")
-    if name := not_finite(weights):
-        raise ValueError(f"{source}: expected finite weights, found NaN or infinity in {name}")
-    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})

@@ -24,7 +24,6 @@ from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel, with_known
 
 METHODS = ("auto", "conditional", "repaint", "posterior")
-SAMPLERS = (*STEPS, "langevin")
 REPAINT_STEPS, REPAINT_RESAMPLES = 32, 10  # R2DM, section IV-C
 
 
@@ -88,8 +87,8 @@ class LidarModel(ScanModel):
         Raises ValueError for other words, and for what the method would ignore.
         """
         how, method = how.at_least_one(), self._method(how.method)
-        if how.sampler is not None and how.sampler not in SAMPLERS:
-            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {how.sampler!r}")
+        if how.sampler is not None:
+            self._sampler(how.sampler)
         if method == "posterior":
             how.without("resamples", "sampler", reason="since posterior is Langevin dynamics")
             return replace(how, method=method)
@@ -140,8 +139,8 @@ class LidarModel(ScanModel):
     def _sampler(self, sampler: str | None) -> str:
         if sampler is None:
             return "ddpm" if self.experiment.score is None else "langevin"
-        if sampler not in SAMPLERS:
-            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {sampler!r}")
+        if sampler not in (*STEPS, "langevin"):
+            raise ValueError(f"expected a sampler of {', '.join(STEPS)}, langevin, found {sampler!r}")
         return sampler
 
     def _completion(self, x_0: Tensor, mask: Tensor, how: Filling, rng: Rng) -> Iterator[State]:

@@ -1,0 +1,61 @@
+"""docs/design.md and docs/changes.md are true: rooms, places, and the code that a user's file would hold."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_house import ROOMS
+
+ROOT = Path(__file__).resolve().parents[1]
+DESIGN = (ROOT / "docs" / "design.md").read_text()
+SRC = ROOT / "src" / "lidarsynth"
+
+
+def test_the_rooms_of_the_map_are_those_of_the_test():
+    listed = re.findall(r"^([a-z]+)/ {2,}", DESIGN, re.M)
+    assert tuple(listed) == ROOMS[: len(listed)] and set(ROOMS) - set(listed) == {"__main__"}
+    there = {path.name for path in SRC.iterdir() if path.is_dir() and path.name not in ("__pycache__", "shipped")}
+    assert there <= set(listed)
+
+
+def test_every_place_that_is_named_is_there():
+    places = re.findall(r"\]\((\.\./[^)]+)\)", DESIGN)
+    assert len(places) > 10
+    assert [place for place in places if not (ROOT / "docs" / place).exists()] == []
+
+
+@pytest.mark.parametrize(
+    ("table", "file"),
+    [("STEPS", "diffusion/samplers.py"), ("READERS", "files/formats.py"), ("WRITERS", "files/formats.py"),
+     ("SOURCES", "data/sources.py"), ("SENSORS", "lidar/sensor.py"), ("PRESETS", "experiment/presets.py"),
+     ("SYSTEMS", "systems/table.py"), ("MEASURES", "evaluation/measures.py"),
+     ("PROTOCOLS", "evaluation/protocols.py"), ("VERBS", "cli/main.py")],
+)  # fmt: skip
+def test_every_table_is_a_dict_where_the_map_says(table: str, file: str):
+    assert f"`{table}`" in DESIGN
+    assert re.search(rf"^{table}(: [^=]*)? = {{", (SRC / file).read_text(), re.M)
+
+
+def test_what_moved_is_where_the_list_says():
+    lines = (ROOT / "docs" / "changes.md").read_text().splitlines()
+    cells = [line.split("|")[2] for line in lines if line.count("|") == 3]
+    named = [name for cell in cells for name in re.findall(r"`lidarsynth\.([a-z_.]+)`", cell)]
+    assert len(named) >= 15
+    for name in named:
+        path = SRC / name.replace(".", "/")
+        there = path.is_dir() or any(p.with_suffix(".py").exists() for p in (path, path.parent))
+        assert there, name
+
+
+@pytest.mark.slow
+def test_tables_are_added_to_from_outside(tmp_path: Path):
+    """In a process of its own, as a user's file: tables of this one stay as they are."""
+    (code,) = re.findall(r"```python\n(.*?)```", DESIGN, re.S)
+    (tmp_path / "mine.py").write_text(code + "print(again.sensor.name, int(again.mask.sum()) > 1000)\n")
+    done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=200,
+                          env={**os.environ, "PYTHONPATH": str(ROOT / "src")})  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["mine", "True"]
