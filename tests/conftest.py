@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
+ORACLES = Path(__file__).parent / "oracles"
 SHARED = Path(os.environ.get("LIDARSYNTH_SHARED", REPO_ROOT.parent / "shared"))
 
 torch.set_num_threads(1)  # pytest-xdist runs one process per core
@@ -24,14 +25,16 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def fixture_tensors(shared: Path) -> Callable[[str], dict[str, Tensor]]:
-    """`fixture_tensors("r2dm/ops")` -> the tensors of shared/fixtures/r2dm/ops.safetensors by key; skips if absent."""
+def fixture_tensors() -> Callable[[str], dict[str, Tensor]]:
+    """`fixture_tensors("r2dm/ops")` -> the tensors of r2dm/ops.safetensors by key, from tests/oracles or the shared
+    folder's fixtures; skips where neither has them."""
 
     def load(name: str) -> dict[str, Tensor]:
-        path = shared / "fixtures" / f"{name}.safetensors"
-        if not path.is_file():
-            pytest.skip(f"reference values are not here: {path}")
-        return load_file(path)
+        paths = [folder / f"{name}.safetensors" for folder in (ORACLES, SHARED / "fixtures")]
+        found = next((path for path in paths if path.is_file()), None)
+        if found is None:
+            pytest.skip(f"reference values are not here: {paths[1]}")
+        return load_file(found)
 
     return load
 

@@ -23,8 +23,8 @@ Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
 Method = Annotated[
     Literal["auto", "conditional", "sample", "repaint", "posterior", "inversion", "network", "monte-carlo"],
     arg(
-        help="conditional tells the network what is known, and errs least; sample, of a cascade, is one of many possible "
-        "scans, with the grain of a recorded one; repaint and LiDARGen's posterior need no such network, "
+        help="conditional tells the network what is known, and errs least; sample, of a cascade, is one of many "
+        "possible scans, with the grain of a recorded one; repaint and LiDARGen's posterior need no such network, "
         "and take minutes; inversion is that of GANs; LiDAR-SR has network, one pass, and monte-carlo, many."
     ),
 ]
