@@ -400,14 +400,10 @@ def test_other_files_are_named_as_what_they_are(tmp_path):
     assert "expected a model of lsr, iln, liif_lidar from ILN's repository, found 'edsr'" in refusal(
         official("edsr", {})
     )
-    assert "head.0.conv.weight (64, 1, 3, 3), found (8, 1, 3, 3)" in refusal(
-        official("iln", ILN(1, 2, 8).state_dict())
-    )
+    assert "head.0.conv.weight (64, 1, 3, 3), found (8, 1, 3, 3)" in refusal(official("iln", ILN(1, 2, 8).state_dict()))
     incomplete = ILN().state_dict()
     incomplete.pop("attention.mlp_head.1.bias")
-    assert "expected attention.mlp_head.1.bias (1,), found none; 1 tensors" in refusal(
-        official("iln", incomplete)
-    )
+    assert "expected attention.mlp_head.1.bias (1,), found none; 1 tensors" in refusal(official("iln", incomplete))
     broken = official("iln", ILN().state_dict()) | {"lidar_in": {"channels": 16}}
     assert "expected lidar_in with the numbers channels, points_per_ring" in refusal(broken)
     torch.save(official("iln", ILN().state_dict()), path)
