@@ -5,8 +5,7 @@ python benchmarks/street_classes.py --scans 360 --minutes 15 --judge FOLDER...
 
 The second goes on training the network of street-1 on streets whose sensor stands a few centimetres higher or lower,
 tilts by half a degree, and answers a little brighter or darker, each scan its own; classes differ in brightness from
-scan to scan.
-No real scan is learned from. Judged on folders of labelled scans, as `benchmarks/street.py --classes` reads them.
+scan to scan. No real scan is learned from. Folders are read as `benchmarks/street.py --classes` reads them.
 """
 
 from __future__ import annotations
