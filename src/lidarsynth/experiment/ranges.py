@@ -22,7 +22,8 @@ def check_ranges(record: Any) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool) or not isinstance(number, int | float):
                 continue
-            if not (math.isfinite(number) and least <= number <= most):
+            limit = math.inf if most == FINITE[1] and isinstance(number, float) else most
+            if not (math.isfinite(number) and least <= number <= limit):
                 span = f"at least {_plain(least)}" if most == FINITE[1] else f"{_plain(least)} to {_plain(most)}"
                 raise ValueError(f"{part.name}: expected {span}, found {str(number)[:40]}")
 

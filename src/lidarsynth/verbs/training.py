@@ -181,10 +181,15 @@ def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
     steps = experiment.training.steps
     if replace(found, card=experiment.card, training=replace(found.training, steps=steps)) != experiment:
         theirs, ours = (_flat(e.to_dict()) for e in (found, experiment))
-        key = next(key for key in ours if key.partition(".")[0] != "card" and ours[key] != theirs.get(key))
+        key = next(key for key in ours if _counts(key) and ours[key] != theirs.get(key))
         raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {theirs.get(key)!r:.60}, "
                          f"found {ours[key]!r:.60}; another folder begins a new run")  # fmt: skip
     return found
+
+
+def _counts(key: str) -> bool:
+    """Whether a field makes another run: a card says what was done, and more steps are the same run, longer."""
+    return key != "training.steps" and not key.startswith("card.")
 
 
 def _flat(record: dict) -> dict:
