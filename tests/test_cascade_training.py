@@ -18,7 +18,7 @@ from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
 
 TINY = with_fields(
-    preset("cascade"),
+    preset("default"),
     {"model.base_channels": 16, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1),
      "training.batch_size": 2, "training.steps": 2, "training.warmup": 0, "model.gn_num_groups": 8},
 )  # fmt: skip

@@ -24,7 +24,7 @@ from lidarsynth.systems.table import load_folder as load
 DOC = REPO_ROOT / "docs" / "own-data.md"
 SHOWN = blocks(DOC.read_text())
 SMALLER = (  # besides those of the README
-    (r"train default --from default", "train tiny --from start"),
+    (r"train kitti-streets --from kitti-streets", "train tiny --from start"),
     (r"training\.steps=\d+", "training.steps=2"),
     (r"(train .*)", r"\1 --threads 1 --workers 0 --sample-every 2"),
     (r"(data files .*)", r"\1 --workers 0"),
@@ -86,7 +86,7 @@ def test_what_the_document_says_of_rows_and_columns_is_so():
     beams = {"name": "own", "elevations": [-i / 4 for i in range(192)]}
     for height, width, fits in ((32, 64, True), (64, 104, True), (48, 64, False), (32, 100, False)):
         fields = {"data.sensor": beams, "data.height": height, "data.width": width, "model.base_channels": 8}
-        experiment = with_fields(preset("default"), fields)
+        experiment = with_fields(preset("kitti-streets"), fields)
         if fits:
             build_network(experiment)
         else:

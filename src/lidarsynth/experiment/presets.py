@@ -155,10 +155,10 @@ def r2dm_refinenet() -> Experiment:
     return Experiment("r2dm-refinenet", model=Model(network="refinenet", base_channels=128))
 
 
-def default() -> Experiment:
-    """The shipped model: one small network that generates and completes, on the true beams of the HDL-64E."""
+def kitti_streets() -> Experiment:
+    """One small network that generates and completes scans of one sensor: here the true beams of KITTI's HDL-64E."""
     return Experiment(
-        "default",
+        "kitti-streets",
         data=Data(sensor="hdl-64e-kitti", projection="auto"),
         model=Model(
             network="conditional-unet",
@@ -183,10 +183,10 @@ def default() -> Experiment:
     )
 
 
-def cascade() -> Experiment:
+def default() -> Experiment:
     """A coarse layout, then one step that fills it in: one model for any sensor, from `--data virtual`."""
     return Experiment(
-        "cascade",
+        "default",
         data=Data(sensor="hdl-64e-kitti", projection="auto"),
         model=Model(
             network="cascade",
@@ -210,8 +210,8 @@ def cascade() -> Experiment:
 
 
 def kitti() -> Experiment:
-    """`default` fine-tuned on real scans (`--from default`), for completion first of all."""
-    start = default()
+    """`kitti-streets` fine-tuned on real scans (`--from kitti-streets`), for completion first of all."""
+    start = kitti_streets()
     return replace(
         start,
         name="kitti",
@@ -229,7 +229,7 @@ def kitti() -> Experiment:
         ),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",
-            data="from `default`, on 105 real HDL-64E scans of KITTI (about 75 different views)",
+            data="from `kitti-streets`, on 105 real HDL-64E scans of KITTI (about 75 different views)",
         ),
     )
 
@@ -278,11 +278,11 @@ def tiny() -> Experiment:
 
 
 PRESETS: dict[str, Callable[[], Experiment]] = {
-    "cascade": cascade,
     "default": default,
     "dusty-v1": dusty_v1,
     "dusty-v2": dusty_v2,
     "kitti": kitti,
+    "kitti-streets": kitti_streets,
     "bicubic": upsampling_presets.bicubic,
     "bilinear": upsampling_presets.bilinear,
     "iln": upsampling_presets.iln,

@@ -54,6 +54,7 @@ def complete_scan(
 
     Raises ValueError when no point is in view, or the recipe hides nothing.
     """
+    model = model.suited_to(scan)
     truth = model.image_of(scan)
     if recipe is None:
         filled = model.filled(scan, how, on_step=on_step)
