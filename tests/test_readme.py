@@ -29,7 +29,7 @@ from lidarsynth.lidar.sensor import SENSORS
 REPO_ROOT = Path(__file__).resolve().parents[1]
 README = REPO_ROOT / "README.md"
 SMALLER = ((r"-n +\d+", "-n 1"), (r"--steps +\d+", "--steps 2"))  # in commands
-FEW_STEPS = {"generate", "complete", "upsample"}  # verbs and methods that are given two steps
+FEW_STEPS = {"generate"}  # verbs and methods that are given two steps
 ELSEWHERE = {"demo", "view", "train"}  # minutes, or endless: tests of their own
 LIMIT = 120  # seconds per command
 

@@ -14,6 +14,7 @@ from lidarsynth.cli.arguments import (
     Recipe,
     Resamples,
     Seed,
+    SensorWord,
     Source,
     Steps,
     arg,
@@ -26,6 +27,7 @@ def complete(
     scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
     out: Annotated[Path, arg(help="file to write, as in upsample; a folder where there are several scans; or a bag.")],
     corrupt: Recipe = None,
+    sensor: SensorWord = None,
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -48,7 +50,7 @@ def complete(
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    task = Task("complete", model, device, how, corrupt=corrupt, picture=picture)
+    task = Task("complete", model, device, how, corrupt=corrupt, sensor=sensor, picture=picture)
     results = [result for result in work_through(task, scans, out, many, intensity) if result.errors]
     if len(results) <= PICTURES:
         for result in results:

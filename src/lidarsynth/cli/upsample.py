@@ -31,6 +31,9 @@ def upsample(
     out: Output,
     sensor_in: Annotated[SensorWord, arg(name="from")] = None,
     sensor_out: SensorOut = None,
+    times: Annotated[
+        int | None, arg(metavar="INT", help="as many beams as the scan has, in its own view; default 4 without --to.")
+    ] = None,
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -48,5 +51,5 @@ def upsample(
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    task = Task("upsample", model, device, how, sensor=sensor_in, into=sensor_out, picture=picture)
+    task = Task("upsample", model, device, how, sensor=sensor_in, into=sensor_out, times=times, picture=picture)
     work_through(task, scans, out, many, intensity)

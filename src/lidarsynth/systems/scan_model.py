@@ -47,6 +47,7 @@ class ScanModel(ABC):
     experiment: Experiment
     description: ClassVar[Description]  # what a card says of it
     kind: ClassVar[str] = "one that completes scans"  # said of those that generate nothing
+    any_sensor: ClassVar[bool] = False  # whether `into` takes any
 
     def to(self, device: str | torch.device) -> Self:
         """The same model with its network on another device."""
@@ -182,9 +183,17 @@ class ScanModel(ABC):
         return replace(filled, completed=with_measured(scan, image.mask, filled, projection))
 
     def upsampled(
-        self, scan: Scan | np.ndarray, how: Filling, sensor_in: Sensor | str | None = None, on_step: OnStep = None
+        self,
+        scan: Scan | np.ndarray,
+        how: Filling,
+        sensor_in: Sensor | str | None = None,
+        on_step: OnStep = None,
+        times: int | None = None,
     ) -> RangeImage:
-        """`upsample` of a record."""
+        """`upsample` of a record. Raises ValueError for `times` as many beams of a model that cannot make them."""
+        if times is not None:
+            raise ValueError(f"{self.experiment.name}: expected a model such as default for {times} times as many "
+                             f"beams, found one with images of {self.sensor.name}")  # fmt: skip
         scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
         how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
         sparse, known = sparse_image(scan, sensor_in, self.sensor)
@@ -227,8 +236,10 @@ class ScanModel(ABC):
         """The model that completes this scan in its own sensor's image; here itself, which knows one sensor.
 
         sensor  that made the scan; None = as recognised from the points
+
+        Raises ValueError as `into` does for a sensor that is not the model's.
         """
-        return self
+        return self if sensor in (None, self.sensor, self.sensor.name) else self.into(sensor)  # type: ignore[arg-type]
 
     def at_once(self, batch_size: int) -> int:
         """How many scans to make at once: one on a CPU, where more are no faster and differ by rounding."""

@@ -15,7 +15,9 @@ from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
@@ -35,8 +37,9 @@ class Task:
     model      as `load` takes it; not of project
     how        of complete and upsample
     corrupt    recipe to hide a part first, of complete
-    sensor     that made the scans, None = recognised; of upsample and project
+    sensor     that made the scans, None = recognised
     into       sensor of the result, of upsample
+    times      as many beams as the scan's own, of upsample; None = the model's own number
     projection, width  of project
     transform  (4, 4) that was applied to the points, to be undone in the result, or None
     strict     refuse scans that are not in their sensor's frame
@@ -50,6 +53,7 @@ class Task:
     corrupt: str | None = None
     sensor: str | None = None
     into: str | None = None
+    times: int | None = None
     projection: str = "auto"
     width: int | None = None
     transform: np.ndarray | None = None
@@ -119,7 +123,7 @@ def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Re
     begun = time.perf_counter()
     try:
         loaded = work.item.read()
-        warning = _frame_warning(loaded, task, work)
+        warning = _frame_warning(loaded, task, work) or _sensor_warning(loaded.scan, task, work, model)
         done, note = _made(task, model, work.item.path, loaded.scan, on_step)
         cloud = None
         if work.target is None:
@@ -145,6 +149,17 @@ def _frame_warning(loaded: Loaded, task: Task, work: Work) -> str | None:
     return None if warning is None else f"{work.item.path}: {warning}"
 
 
+def _sensor_warning(scan: Scan, task: Task, work: Work, model: ScanModel | None) -> str | None:
+    """That a model of one sensor is asked to complete another's scan, in one line."""
+    if not work.check or task.verb != "complete" or model is None or model.any_sensor:
+        return None
+    name, _ = recognise(scan, work.item.path)
+    own = model.sensor.name
+    if name is None or name.removesuffix("-kitti") == own.removesuffix("-kitti"):
+        return None
+    return f"{work.item.path}: {task.model} knows {own} alone, and this is a scan of {name}; use --model default"
+
+
 def _made(
     task: Task, model: ScanModel | None, path: Path, scan: Scan, on_step: OnStep
 ) -> tuple[Filled | RangeImage, str]:
@@ -156,9 +171,10 @@ def _made(
         return image, f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
     assert model is not None
     if task.verb == "complete":
-        return complete_scan(model, scan, task.corrupt, task.how, on_step), ""
+        sensor = None if task.sensor is None else get_sensor(task.sensor)
+        return complete_scan(model, scan, task.corrupt, task.how, on_step, sensor), ""
     sensor = named_sensor(scan, path, "--from", task.sensor)
-    filled = upsample_scan(model, scan, sensor, task.how, on_step)
+    filled = upsample_scan(model, scan, sensor, task.how, on_step, task.times)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
 
 

@@ -48,13 +48,20 @@ class Filled:
 
 
 def complete_scan(
-    model: ScanModel, scan: Scan, recipe: str | None = None, how: Filling = DEFAULT, on_step: OnStep = None
+    model: ScanModel,
+    scan: Scan,
+    recipe: str | None = None,
+    how: Filling = DEFAULT,
+    on_step: OnStep = None,
+    sensor: Sensor | None = None,
 ) -> Filled:
     """Fill a scan; with a corruption `recipe` hide part of it first and judge the hidden pixels against it.
 
+    sensor  that made the scan, for a model of any sensor; None = as recognised
+
     Raises ValueError when no point is in view, or the recipe hides nothing.
     """
-    model = model.suited_to(scan)
+    model = model.suited_to(scan, sensor)
     truth = model.image_of(scan)
     if recipe is None:
         filled = model.filled(scan, how, on_step=on_step)
@@ -78,13 +85,18 @@ def judged(filled: RangeImage, before: RangeImage, known: np.ndarray, truth: Ran
 
 
 def upsample_scan(
-    model: ScanModel, scan: Scan, sensor_in: Sensor, how: Filling = DEFAULT, on_step: OnStep = None
+    model: ScanModel,
+    scan: Scan,
+    sensor_in: Sensor,
+    how: Filling = DEFAULT,
+    on_step: OnStep = None,
+    times: int | None = None,
 ) -> Filled:
     """Make a scan of `sensor_in`, which may have other beams than the model's, dense.
 
     Raises ValueError when no point is in the model's view.
     """
-    filled = model.upsampled(scan, how, sensor_in, on_step)
+    filled = model.upsampled(scan, how, sensor_in, on_step, times)
     measured = project(replace(scan, ring=None), filled.sensor, "spherical")
     return Filled(filled, {f"measured, {sensor_in.name}": measured, "upsampled": filled}, {})
 

@@ -65,7 +65,7 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
     return Batch(
-        Crops(Known(*known), rays, *truth, seeds, count),
+        Crops(Known(*known), rays, truth[0], truth[1], seeds, count),
         Grids(*(torch.stack(part) for part in zip(*grids, strict=True))),
     )
 

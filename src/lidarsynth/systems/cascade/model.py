@@ -18,7 +18,7 @@ from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.recognition import recognise
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
@@ -52,6 +52,7 @@ class CascadeModel(ScanModel):
     own: bool = True
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
+    any_sensor: ClassVar[bool] = True
 
     def into(self, sensor: Sensor | str) -> CascadeModel:
         """The same model with images of another sensor."""
@@ -151,7 +152,7 @@ class CascadeModel(ScanModel):
 
     def upsample(
         self,
-        scan: Scan,
+        scan: Scan | np.ndarray,
         sensor_in: Sensor | str | None = None,
         method: str = "auto",
         steps: int | None = None,
@@ -171,7 +172,7 @@ class CascadeModel(ScanModel):
 
     def upsampled(
         self,
-        scan: Scan,
+        scan: Scan | np.ndarray,
         how: Filling,
         sensor_in: Sensor | str | None = None,
         on_step: OnStep = None,
@@ -182,7 +183,7 @@ class CascadeModel(ScanModel):
             if times is not None:
                 raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
             return super().upsampled(scan, how, sensor_in, on_step)
-        times = TIMES if times is None else times
+        scan, times = scan_of(scan) if isinstance(scan, np.ndarray) else scan, TIMES if times is None else times
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
         model = self.into(own.denser(times))
@@ -218,7 +219,10 @@ class CascadeModel(ScanModel):
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
         """Coarse grids (B, 16, 128) as samples of whole images."""
-        shape, grid = (len(metres), self.sensor.height, self.sensor.width), np.ix_(range(len(metres)), rows, columns)
+        shape, grid = (
+            (len(metres), self.sensor.height, self.sensor.width),
+            np.ix_(np.arange(len(metres)), rows, columns),
+        )
         ranges, shades, told = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
         ranges[grid], shades[grid], told[grid] = metres.cpu().numpy(), reflectance.cpu().numpy(), True
         ranges[(ranges < self.sensor.min_range) | (ranges > self.sensor.max_range)] = 0
@@ -311,16 +315,15 @@ class CascadeModel(ScanModel):
 def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, np.ndarray]:
     """A scan's own image as every `times`-th row of a denser sensor's, and which pixels were looked at: those rows."""
     shape = (sensor.height, sensor.width)
-    parts = [np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)]
-    for part, values in zip(parts, (sparse.range, sparse.reflectance, sparse.mask), strict=True):
-        part[::times] = values
+    metres, shade, mask = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
+    metres[::times], shade[::times], mask[::times] = sparse.range, sparse.reflectance, sparse.mask
     known = np.zeros(shape, bool)
     known[::times] = True
     xyz = None
     if sparse.xyz is not None:
         xyz = np.zeros((*shape, 3), np.float32)
         xyz[::times] = sparse.xyz
-    return RangeImage(*parts, sensor, xyz=xyz), known
+    return RangeImage(metres, shade, mask, sensor, xyz=xyz), known
 
 
 def _known(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:

@@ -43,7 +43,7 @@ class FillObjective(nn.Module):
         if n == 0:
             return crops.metres[:0, 0, 0, 0]
         known, rays, metres, reflectance = _part(crops, slice(None, n))
-        shape = (1, *metres.shape[2:])
+        shape = (1, metres.shape[2], metres.shape[3])
         draws = [draw_noise(shape, sample_rng(s, 0, k)) for k in (0, 1) for s in crops.seeds[:n]]
         twice = (type(part)(*(torch.cat([t, t]) for t in part)) for part in (known, rays))
         filled = self.network(*twice, torch.cat(draws).to(metres))
@@ -125,9 +125,9 @@ def energy_score(first: Tensor, second: Tensor, truth: Tensor) -> Tensor:
     total = truth.new_zeros(len(truth))
     for size, weight in (((1, 1), 1.0), ((2, 4), 1.0), ((8, 16), 0.5)):
         total = total + weight * _score(first, second, truth, size)
-    for textures in zip(*map(_differences, (first, second, truth)), strict=True):
+    for a, b, y in zip(*map(_differences, (first, second, truth)), strict=True):
         for size in ((1, 1), (2, 8)):
-            total = total + 0.5 * _score(*textures, size)
+            total = total + 0.5 * _score(a, b, y, size)
     return total
 
 

@@ -41,6 +41,7 @@ class InterpolationModel(ScanModel):
     experiment: Experiment
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "an interpolation"
+    any_sensor: ClassVar[bool] = True
 
     def into(self, sensor: Sensor | str) -> InterpolationModel:
         """The same interpolation in images of another sensor."""

@@ -45,6 +45,7 @@ class UpsamplingModel(ScanModel):
     sensor: Sensor
     experiment: Experiment
     description: ClassVar[Description] = DESCRIPTION
+    any_sensor: ClassVar[bool] = True
 
     def into(self, sensor: Sensor | str) -> UpsamplingModel:
         """The same network with images of another sensor. Raises ValueError where LiDAR-SR cannot have that size."""
