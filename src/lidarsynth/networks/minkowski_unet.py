@@ -80,8 +80,9 @@ class Up(nn.Sequential):
 
     def forward(self, x: Tensor, skip: Tensor, fine: Level) -> Tensor:
         """(N, outputs) at `fine`, of x (M, inputs) at twice its stride and the skip (N, skip)."""
-        first, second = self[1]
-        return second(first(torch.cat([self[0](x, fine), skip], 1), fine), fine)
+        residuals = self[1]
+        assert isinstance(residuals, nn.Sequential)
+        return residuals[1](residuals[0](torch.cat([self[0](x, fine), skip], 1), fine), fine)
 
 
 class Stem(nn.Sequential):
