@@ -7,9 +7,9 @@ until they are asked for, so that a bag of any size passes in the memory of one 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -151,7 +151,7 @@ def typestore(encoding: str) -> Any:
     return _STORES[encoding]
 
 
-def _rosbags(path: Path) -> Iterator[Bag]:
+def _rosbags(path: Path) -> Generator[Bag, None, None]:
     """A ROS 1 `.bag`, a ROS 2 folder or a `.db3`, through rosbags."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
@@ -175,7 +175,7 @@ def _topic(connection: Any, encoding: str) -> Topic:
     return Topic(connection.topic, connection.msgtype, encoding, (kind, text), connection.msgcount, connection.digest)
 
 
-def _mcap(path: Path, files: list[Path]) -> Iterator[Bag]:
+def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
     """MCAP files one after the other: a bare one, or those of a ROS 2 folder."""
     from contextlib import ExitStack
 
@@ -187,17 +187,13 @@ def _mcap(path: Path, files: list[Path]) -> Iterator[Bag]:
             for topic in found.values():
                 before = topics.get(topic.name, topic)
                 more = topic.count if before is not topic else 0
-                topics[topic.name] = Topic(*(*_values(before)[:4], before.count + more, before.digest))
+                topics[topic.name] = replace(before, count=before.count + more)
 
         def messages(names: frozenset[str]) -> Iterator[Message]:
             for stream in streams:
                 yield from _mcap_messages(stream, names, topics)
 
         yield Bag(path, tuple(topics.values()), sum(seconds for _, seconds in parts), messages)
-
-
-def _values(topic: Topic) -> tuple:
-    return topic.name, topic.kind, topic.encoding, topic.schema, topic.count, topic.digest
 
 
 def _mcap_topics(stream: IO[bytes]) -> tuple[dict[int, Topic], float]:

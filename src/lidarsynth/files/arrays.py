@@ -228,5 +228,7 @@ def write_npz(file: BufferedIOBase, scan: Scan | RangeImage) -> None:
         arrays["sensor"] = np.array(json.dumps(scan.sensor.to_dict()))
     else:
         own = {name: getattr(scan, name) for name in ("xyz", "reflectance", "ring", "time", "label")}
-        arrays = {name.replace("/", "_"): values for name, values in scan.extra.items()} | own
-    np.savez_compressed(file, **{name: array for name, array in arrays.items() if array is not None})
+        taken = ("file", "allow_pickle")  # arguments of savez
+        further = {f"file_{n}" if n in taken else n.replace("/", "_"): values for n, values in scan.extra.items()}
+        arrays = further | own
+    np.savez_compressed(file, **{n: array for n, array in arrays.items() if array is not None})  # type: ignore[arg-type]

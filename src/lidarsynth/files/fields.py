@@ -206,8 +206,8 @@ def _training_classes(label: np.ndarray) -> np.ndarray | None:
 
 def _storable(column: np.ndarray) -> np.ndarray:
     """The column in a little-endian type that point files have: no bool, no float16."""
-    plain = {"b": "u1", "f2": "f4"}.get("b" if column.dtype.kind == "b" else column.dtype.str[1:], column.dtype.str[1:])
-    return column.astype("<" + plain)
+    kind = column.dtype.str[1:]
+    return column.astype("<" + {"b1": "u1", "f2": "f4"}.get(kind, kind))
 
 
 def scan_table(scan: Scan) -> np.ndarray:
