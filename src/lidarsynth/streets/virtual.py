@@ -64,7 +64,8 @@ def draw_sensor(rng: np.random.Generator, known_share: float = 0.5) -> VirtualSe
     response of their own; half of them with a carrier that blocks a part of the lower rays.
     """
     mount = float(rng.uniform(1.2, 2.5))
-    tilt = tuple(float(angle) for angle in rng.normal(0, 1.2, 2) * (rng.random() < 0.5))
+    pitch, roll = rng.normal(0, 1.2, 2) * (rng.random() < 0.5)
+    tilt = (float(pitch), float(roll))
     limit = float(np.exp(rng.uniform(np.log(30), np.log(200)))) if rng.random() < 0.5 else float(rng.uniform(80, 200))
     if rng.random() < known_share:
         known = SENSORS[KNOWN[rng.integers(len(KNOWN))]]
