@@ -206,8 +206,9 @@ def _training_classes(label: np.ndarray) -> np.ndarray | None:
 
 def _storable(column: np.ndarray) -> np.ndarray:
     """The column in a little-endian type that point files have: no bool, no float16."""
-    kind = column.dtype.str[1:]
-    return column.astype("<" + {"b1": "u1", "f2": "f4"}.get(kind, kind))
+    kind: str = column.dtype.str[1:]
+    plain: dict[str, str] = {"b1": "u1", "f2": "f4"}
+    return column.astype(f"<{plain.get(kind, kind)}")
 
 
 def scan_table(scan: Scan) -> np.ndarray:
