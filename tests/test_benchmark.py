@@ -456,7 +456,7 @@ GOOD = 'data = "street"\n' + METHODS
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("data = ", "expected a benchmark in TOML"),
+        ("data = ", "expected TOML"),
         ('data = "street"\n', r"expected at least one \[\[method\]\]"),
         ('method = 3\ndata = "street"\n', r"expected at least one \[\[method\]\], found 3"),
         (METHODS, "expected the field data"),

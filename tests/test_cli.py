@@ -424,7 +424,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("project SCAN --out i.npz --width 0", "--width of at least 4"),
         ("info nothing", "nothing: expected"),
         ("info .", "experiment.json"),
-        ("info none.bin", "No such file"),
+        ("info none.bin", "no file or folder of that name"),
         ("info none.toml", "none.toml"),
         ("data files . ", "CACHE"),
         ("data files nowhere cache", "nowhere"),
@@ -496,4 +496,4 @@ def test_a_closed_pipe_ends_quietly():
 def test_refusals_of_a_process(tmp_path: Path):
     process = started("info", tmp_path / "none.bin")
     out, err = process.communicate(timeout=60)
-    refused(Answer(process.returncode, out, err), "none.bin: expected", "No such file")
+    refused(Answer(process.returncode, out, err), "none.bin: expected", "no file or folder of that name")

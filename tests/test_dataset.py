@@ -304,7 +304,10 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
 def test_the_command_line_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for words, expected in (
         (["kitti", str(tmp_path)], "expected data kitti ROOT CACHE, found no CACHE"),
-        (["files", str(tmp_path), str(tmp_path / "cache"), "--workers", "-1"], "found none"),
+        (
+            ["files", str(tmp_path), str(tmp_path / "cache"), "--workers", "-1"],
+            "expected --workers of at least 0, found -1",
+        ),
         (["synthetic", str(tmp_path / "cache"), "--workers", "-1"], "expected --workers of at least 0, found -1"),
         (["synthetic", str(tmp_path / "cache"), "--width", "0"], "expected --width of at least 4, found 0"),
     ):

@@ -82,7 +82,7 @@ CRAFTED = {
     "sparse": lambda: torch.eye(8).to_sparse(),
     "meta": lambda: torch.empty(5, 8, 64, device="meta"),
     "complex": lambda: torch.zeros(5, 8, 64, dtype=torch.complex64),
-    "repeated": lambda: torch.zeros(1, 1, 1).expand(5, 8, 64),
+    "repeated": lambda: torch.zeros(1, 1, 1).expand(5, 8, 1 << 25),
 }
 
 

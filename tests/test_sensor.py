@@ -154,7 +154,7 @@ def test_files_of_another_kind_get_one_line(tmp_path):
         "list.json": r"list: expected .*, found \[1, 2\]",
         "bad.json": "bad.json: expected JSON, found",
         "binary.json": "binary.json: expected text in UTF-8, found invalid start byte",
-        "folder.toml": "folder.toml: expected a readable sensor file, found Is a directory",
+        "folder.toml": "folder.toml: expected a file, found a folder",
         "absent.toml": "absent.toml: expected a readable sensor file, found No such file",
         "sensor.yaml": "sensor.yaml: expected a .toml or .json sensor file, found .yaml",
         "sensor": "sensor: expected a .toml or .json sensor file, found no suffix",

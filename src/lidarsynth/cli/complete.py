@@ -27,7 +27,6 @@ def complete(
     scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
     out: Annotated[Path, arg(help="file to write, as in upsample; a folder where there are several scans; or a bag.")],
     corrupt: Recipe = None,
-    sensor: SensorWord = None,
     model: Source = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -35,6 +34,7 @@ def complete(
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
+    sensor: SensorWord = None,
     picture: Picture = True,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:

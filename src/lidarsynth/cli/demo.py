@@ -12,7 +12,6 @@ from lidarsynth.cli.info import info
 from lidarsynth.cli.project import project
 from lidarsynth.cli.scan_files import read_scan, write_and_say
 from lidarsynth.cli.terminal import say
-from lidarsynth.cli.upsample import upsample
 
 
 def demo(
@@ -28,7 +27,7 @@ def demo(
     generate(4, out / "generated", model, seed=seed)
     complete([street], out / "beams.ply", "beams:4", model, seed=seed)
     complete([street], out / "sector.ply", "sector:90", model, seed=seed)
-    upsample([out / "sixteen_beams.pcd"], out / "dense.ply", model=model, seed=seed)
+    complete([out / "sixteen_beams.pcd"], out / "dense.ply", model=model, seed=seed)
     info(model)
     made = sorted(path for path in out.rglob("*") if path.is_file())
     say("\n".join([f"\n{len(made)} files in {out}/, look at the pictures:", *(f"  {path}" for path in made)]))

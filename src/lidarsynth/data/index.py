@@ -44,7 +44,7 @@ def _check(index: Any, path: Path) -> None:
         lists = [shard.get("frames", []), shard.get("skipped", [])] if isinstance(shard, dict) else [None]
         if not all(isinstance(part, list) for part in lists) or type(shard.get("count")) is not int:
             raise ValueError(f"{path}: expected the shard {name!r:.60} with count and frames, found {shard!r:.60}")
-        rows = [(row, size) for part, size in zip(lists, (2, 3), strict=True) for row in part]
+        rows = [(row, size) for part, size in zip(lists, (2, 3), strict=True) for row in part or ()]
         if wrong := [row for row, size in rows if not _words(row, size)]:
             raise ValueError(f"{path}: expected frames as [sequence, frame] in {name!r:.60}, found {wrong[0]!r:.60}")
         if shard["count"] < 0 or (shard.get("frames") and len(shard["frames"]) != shard["count"]):

@@ -171,6 +171,8 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
         if not (isinstance(values["beams"], int) and 1 <= values["beams"] <= 1024):
             raise ValueError(f"{source}: expected beams of 1 to 1024, found {values['beams']!r}")
         top, bottom = _numbers([values.pop("top"), values.pop("bottom")], source)
+        if not np.isfinite([top, bottom]).all():
+            raise ValueError(f"{source}: expected finite top and bottom, found {top} and {bottom}")
         spaced = np.linspace(top, bottom, values.pop("beams"))
         values.setdefault("elevations", spaced.tolist())
     known = set(Sensor.__dataclass_fields__)

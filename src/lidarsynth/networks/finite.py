@@ -19,7 +19,7 @@ def refuse_not_finite(network: nn.Module, name: str) -> None:
 
 
 def _check(name: str, module: nn.Module, arguments: Any, output: Any) -> None:
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]
         return
     for tensor in _tensors(output):
         if tensor.is_floating_point() and not torch.isfinite(tensor.detach().sum(dtype=torch.float64)):

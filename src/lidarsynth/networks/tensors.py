@@ -13,6 +13,8 @@ from torch import Tensor, nn
 
 from lidarsynth.networks.finite import not_finite
 
+SPREAD = 1 << 28  # bytes that a repeated number may claim
+
 
 def read_pickle(file: str | Path | BinaryIO, where: str, advice: str = "") -> Any:
     """What torch.save wrote, old formats too, read with `weights_only`, on the CPU: tensors and plain containers.
@@ -54,8 +56,9 @@ def plain(content: Any, where: str) -> Any:
 
 
 def _spread(tensor: Tensor) -> bool:
-    """Whether it claims more numbers than its file holds, as one number repeated a billion times does."""
-    return tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes()
+    """Whether it claims far more numbers than its file holds, as one number repeated a billion times does."""
+    claimed = tensor.numel() * tensor.element_size()
+    return claimed > max(tensor.untyped_storage().nbytes(), SPREAD)
 
 
 CONVERT = (  # loading it for good runs what it names, so not here and not at the user's desk

@@ -35,6 +35,7 @@ SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
+ANSWERS = 0.02  # of the rays of a beam
 
 
 @dataclass(frozen=True, repr=False)
@@ -318,7 +319,7 @@ def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, 
     metres, shade, mask = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
     metres[::times], shade[::times], mask[::times] = sparse.range, sparse.reflectance, sparse.mask
     known = np.zeros(shape, bool)
-    known[::times] = True
+    known[::times] = (sparse.mask.mean(1) > ANSWERS)[:, None]  # a beam that hardly answers may not be there
     xyz = None
     if sparse.xyz is not None:
         xyz = np.zeros((*shape, 3), np.float32)

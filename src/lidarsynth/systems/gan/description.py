@@ -8,7 +8,11 @@ from lidarsynth.experiment.record import Adversarial, Experiment
 from lidarsynth.systems.description import About, Description
 from lidarsynth.systems.gan.build import build_discriminator
 
-PAPERS = {"vanilla-gan": "1812.01180", "dusty-v1": "2102.11952", "dusty-v2": "2210.11750"}  # on arXiv
+PAPERS = {
+    "vanilla-gan": "Caccia et al., IROS 2019",
+    "dusty-v1": "Nakashima & Kurazume, IROS 2021",
+    "dusty-v2": "Nakashima et al., WACV 2023, arXiv 2210.11750",
+}
 
 
 def _network(experiment: Experiment) -> str:
@@ -29,7 +33,7 @@ def _about(experiment: Experiment) -> About:
     word = experiment.model.network
     return About(
         f"A generative adversarial network that generates the ranges of LiDAR scans, without reflectance, made with "
-        f"lidarsynth after {word} ([arXiv {PAPERS[word]}](https://arxiv.org/abs/{PAPERS[word]})).",
+        f"lidarsynth after {word} ({PAPERS[word]}).",
         ('model = ls.load("{repo_id}")', "images = model.generate(4, seed=0)",
          'dense = model.complete(ls.read("scan.pcd"))  # by inversion'),
         ("gan",),

@@ -5,7 +5,11 @@ from __future__ import annotations
 from lidarsynth.experiment.record import Experiment, Upsampling
 from lidarsynth.systems.description import About, Description
 
-PAPERS = {"lidar-sr": "2004.05242", "iln": "2205.01343", "liif": "2012.09161"}  # on arXiv
+PAPERS = {
+    "lidar-sr": "Shan et al., Robotics and Autonomous Systems 2020",
+    "iln": "Kwon, Sung & Yoon, ICRA 2022",
+    "liif": "Chen, Liu & Wang, CVPR 2021",
+}
 
 
 def _network(experiment: Experiment) -> str:
@@ -33,7 +37,7 @@ def _about(experiment: Experiment) -> About:
     word = experiment.model.network
     return About(
         f"A network that puts beams between the known ones of a LiDAR scan, without reflectance, made with lidarsynth "
-        f"after {word} ([arXiv {PAPERS[word]}](https://arxiv.org/abs/{PAPERS[word]})). It makes no new scans.",
+        f"after {word} ({PAPERS[word]}). It makes no new scans.",
         ('model = ls.load("{repo_id}")', 'dense = model.upsample(ls.read("scan.pcd"))  # recognises its sensor'),
         ("super-resolution",),
     )
