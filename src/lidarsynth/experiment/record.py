@@ -94,7 +94,9 @@ class Upsampling:
     noise: float = within(0.0, 0)  # standard deviation of what training adds to ranges
     keras: bool = False  # LiDAR-SR's original program: no return is 0 and not 1, dropout of single values
     passes: int = within(50, 1, 100_000)  # of LiDAR-SR under Monte-Carlo dropout
-    threshold: float = 0.03  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
+    threshold: float = within(
+        0.03, -1
+    )  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
     depth: int = within(1, 0, 64)  # layers of ILN's transformer
     queries: int = within(16_384, 1)  # pixels of a scan that a step of ILN or LIIF learns from
 
@@ -117,7 +119,7 @@ class Adversarial:
     r1_every: int = within(16, 1)  # steps
     path_length_weight: float = within(0.0, 0)  # 0 = off
     path_length_every: int = within(4, 1)  # steps
-    augmentation_target: float | None = 0.6  # mean sign of real images' logits; None = no augmentation
+    augmentation_target: float | None = within(0.6, -2, 2)  # mean sign of real images' logits; None = no augmentation
     augmentation_images: int = within(500_000, 1)  # in which its probability can rise from 0 to 1
     augmentation_every: int = within(4, 1)  # steps between its updates
     warmup_images: int = within(200_000, 0)  # in which pixels are dropped before the discriminator, at first half
