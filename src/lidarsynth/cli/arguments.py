@@ -29,7 +29,7 @@ Method = Annotated[
     ),
 ]
 GenerationSteps = Annotated[
-    int | None, arg(metavar="INT", help="of the sampler, per scan; default 32, or 1161 of langevin.")
+    int | None, arg(metavar="INT", help="of the sampler, per scan; default 16 of a cascade, 32, or 1161 of langevin.")
 ]
 Steps = Annotated[
     int | None,
