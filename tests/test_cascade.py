@@ -100,7 +100,7 @@ def test_what_is_not_known_is_never_looked_at(model: CascadeModel):
         model.network.fill(Known(m, m / 50, told, told, told), rays, noise)
         for m in (metres, torch.where(told, metres, 99.0))
     ]
-    for a, b in zip(*outputs, strict=True):
+    for a, b in zip(*(output[:3] for output in outputs), strict=True):
         assert_close(a, b)
 
 
@@ -112,7 +112,7 @@ def test_the_width_is_a_ring(model: CascadeModel):
     known = Known(metres, metres / 50, told, told, told)
     whole = model.network.fill(known, rays, noise)
     turned = model.network.fill(Known(*(part.roll(32, 3) for part in known)), rays, noise.roll(32, 3))
-    for a, b in zip(whole, turned, strict=True):
+    for a, b in zip(whole[:3], turned[:3], strict=True):
         assert_close(a.roll(32, 3), b, atol=2e-5, rtol=1e-4)
 
 

@@ -46,6 +46,7 @@ class Model:
     stem: tuple[int, int] = within((1, 1), 1, 64)  # patch of pixels that becomes channels, (1, 1) = R2DM
     candidates: bool = False  # conditional-unet: chooses among the nearest known values, not only corrects their mean
     around: bool = False  # and the nearest known value in any direction
+    classes: int = within(0, 0, 1000)  # cascade: SemanticKITTI classes that it names for each pixel, 0 = none
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):

@@ -22,7 +22,8 @@ PRIOR = 2.0  # score of the first guess before any training
 class Known(NamedTuple):
     """What is known of B images, (B, 1, H, W) each: metres, reflectance in [0, 1], and three masks.
 
-    told: the pixel is known; returned: it is known and a return; lit: its reflectance is known too.
+    told: the pixel is known; returned: it is known and a return; lit: its reflectance is known too. Returned but not
+    told: the ray meets a surface at that range, and whether it returns is to be found out, as in a simulator's scan.
     """
 
     metres: Tensor
@@ -33,11 +34,15 @@ class Known(NamedTuple):
 
 
 class Filled(NamedTuple):
-    """code: range if the ray returns, in [-1, 1]; reflectance; logit: of returning. (B, 1, H, W) each."""
+    """code: range if the ray returns, in [-1, 1]; reflectance; logit: of returning. (B, 1, H, W) each.
+
+    classes: logits of what the ray meets, (B, classes, H, W), where asked for.
+    """
 
     code: Tensor
     reflectance: Tensor
     logit: Tensor
+    classes: Tensor | None = None
 
 
 class Block(nn.Module):
@@ -86,10 +91,15 @@ class FillUNet(nn.Module):
 
     noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
     the grain of a recorded scan. For each pixel the network chooses among `candidates` by a softmax, corrects the
-    choice, and says whether the ray returns at all.
+    choice, and says whether the ray returns at all; and, if it has learned `classes`, of which class the surface is.
     """
 
-    def __init__(self, widths: tuple[int, ...] = (64, 96, 128, 160), blocks: tuple[int, ...] = (1, 1, 2, 2)):
+    def __init__(
+        self,
+        widths: tuple[int, ...] = (64, 96, 128, 160),
+        blocks: tuple[int, ...] = (1, 1, 2, 2),
+        classes: int = 0,
+    ):
         super().__init__()
         patch = STEM[0] * STEM[1]
         self.stem = Pointwise(INPUTS * patch, widths[0])
@@ -106,8 +116,9 @@ class FillUNet(nn.Module):
         self.out = Pointwise(2 * widths[0], OUTPUTS * patch)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
+        self.classes = Pointwise(2 * widths[0], classes * patch) if classes else None
 
-    def forward(self, known: Known, rays: Rays, noise: Tensor) -> Filled:
+    def forward(self, known: Known, rays: Rays, noise: Tensor, classify: bool = False) -> Filled:
         with torch.no_grad():
             guesses = candidates(known.metres, known.reflectance, known.returned, known.lit, rays)
             x = _to_patches(inputs(known, rays, guesses, noise))
@@ -123,7 +134,12 @@ class FillUNet(nn.Module):
             h = F.interpolate(join(h), scale_factor=2, mode="nearest")
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
-        return _assemble(_to_pixels(self.out(h)), guesses, noise)
+        filled = _assemble(_to_pixels(self.out(h)), guesses, noise)
+        if not classify:
+            return filled
+        if self.classes is None:
+            raise ValueError("expected a network that has learned classes, found one without")
+        return filled._replace(classes=_to_pixels(self.classes(h)))
 
 
 def _through(blocks: nn.Module, h: Tensor) -> Tensor:

@@ -72,6 +72,8 @@ class Optics:
     noise             factor of the range noise
     strength          signal above that sensor's: more of it, fewer drop-outs
     gamma, scale      reported reflectance = scale * reflectance ** gamma, at most 1
+    fade              factor of the signal lost with distance
+    surfaces          per material (signal, spread, grain) as this laser's colour sees it, or () for `materials.TABLE`
     """
 
     loss: tuple[float, ...] = ()
@@ -81,6 +83,15 @@ class Optics:
     strength: float = 0.0
     gamma: float = 1.0
     scale: float = 1.0
+    fade: float = 1.0
+    surfaces: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def table(self) -> np.ndarray:
+        """(materials, 6) float32: `materials.TABLE` as this sensor sees it."""
+        if not self.surfaces:
+            return TABLE
+        return np.concatenate([np.array(self.surfaces, np.float32), TABLE[:, 3:]], 1)
 
     def reported(self, reflectance: np.ndarray) -> np.ndarray:
         """Reflectance (N,) in [0, 1] as this sensor reports it."""
@@ -136,8 +147,8 @@ def sense(
         far = _behind(world, caster, origins[through], rays[through], distance[through], when)
         for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
             mine[through] = theirs
-    optics = TABLE[material]
-    strength = _signal(optics, tint, cosine, distance, lasers)
+    optics = eye.table[material]
+    strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
     doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
@@ -158,14 +169,16 @@ def sense(
     return Returns(*reported, face, first)
 
 
-def _signal(optics: np.ndarray, tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers):
+def _signal(
+    optics: np.ndarray, tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers, fade: float
+) -> np.ndarray:
     """(N,) signal before its noise: material, incidence, distance, and the laser's own loss."""
     cosine = np.maximum(cosine, 0.01)
     slant = np.log(cosine)
     far = np.log(np.maximum(np.minimum(distance, 999) / FADE[2], 1))
     signal = optics[:, 0] + tint * optics[:, 1] + optics[:, 3] * slant
     signal = signal + GRAZING[0] * np.minimum(slant - np.float32(np.log(GRAZING[1])), 0)
-    return signal - far * (FADE[0] + FADE[1] * far) - lasers.loss
+    return signal - np.float32(fade) * far * (FADE[0] + FADE[1] * far) - lasers.loss
 
 
 def _steady(face: np.ndarray, number: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
         raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
                          f"{model.num_residual_blocks}")  # fmt: skip
     coarse = CoarseUNet(width, model.channel_multipliers, model.num_residual_blocks[0])
-    return Cascade(coarse, FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2)))
+    return Cascade(coarse, FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2), classes=model.classes))
 
 
 def model(experiment: Experiment, network: nn.Module) -> CascadeModel:

@@ -293,7 +293,8 @@ class CascadeModel(ScanModel):
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = type(rays)(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
-        return [self._image(*parts) for parts in zip(*self.network.fill(known, rays, noise.to(device)), strict=True)]
+        filled = self.network.fill(known, rays, noise.to(device))
+        return [self._image(*parts) for parts in zip(*filled[:3], strict=True)]
 
     def _image(self, code: Tensor, reflectance: Tensor, logit: Tensor) -> RangeImage:
         """The image of (1, H', W') outputs, without their padding."""
