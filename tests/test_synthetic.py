@@ -12,6 +12,7 @@ from lidarsynth.streets.ground import Ground, Road
 from lidarsynth.streets.materials import MATERIALS, NUMBER, TABLE
 from lidarsynth.streets.objects import library
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.streets.virtual import VirtualStreets
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
@@ -163,3 +164,21 @@ def test_a_sensor_with_one_beam():
 
 
 GOLDEN = [0.8925, 2.3618, 0.2591]  # filled pixels, mean ln range, mean reflectance
+
+
+def test_a_pair_is_the_perfect_scan_and_todays_image():
+    """The image bit by bit; the perfect one lies under it, but for noise, panes, and what was dropped."""
+    for streets in (SyntheticStreets(seed=5, length=4), VirtualStreets(seed=6, length=8)):
+        perfect, seen = streets.pair(2)
+        image = type(streets)(streets.seed, 8).image(2)
+        for name in ("range", "reflectance", "mask", "label"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(image, name))
+        assert perfect.sensor == seen.sensor and perfect.label is not None and seen.label is not None
+        assert not perfect.reflectance.any() and not perfect.range[~perfect.mask].any()
+        assert perfect.mask[seen.mask].mean() > 0.999
+        assert perfect.mask.mean() > seen.mask.mean() + 0.005
+        both = seen.mask & perfect.mask
+        apart = np.abs(perfect.range - seen.range)[both]
+        assert np.median(apart) < 0.04 and (apart < 0.5).mean() > 0.97
+        assert (perfect.label == seen.label)[both].mean() > 0.97
+        assert not perfect.mask[hdl64e.hidden(seen.sensor)].any()

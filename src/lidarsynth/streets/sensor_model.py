@@ -108,7 +108,8 @@ class Returns:
     """What N beams brought back: distance (N,) float32 m along the ray, 0 for none; reflectance and label (N,).
 
     face, first (N,) int32: the triangle of the return, whether it was noticed or not, and the one that the beam met
-    first, which may be a pane before it; -1 for none.
+    first, which may be a pane before it; -1 for none. surface (N,) float32 m, surface_label (N,): exactly where that
+    one is, infinite for none, and its class.
     """
 
     distance: np.ndarray
@@ -116,6 +117,8 @@ class Returns:
     label: np.ndarray
     face: np.ndarray
     first: np.ndarray
+    surface: np.ndarray
+    surface_label: np.ndarray
 
 
 def sense(
@@ -140,6 +143,8 @@ def sense(
     face, distance, cosine = caster.cast(origins, rays, times)
     first = face.copy()
     material, label, tint, depth = _surface(world, face, origins, rays, distance)
+    surface = np.where(face < 0, np.float32(np.inf), distance + depth / np.maximum(cosine, 0.12))
+    surface_label = np.where(face < 0, 0, label)
     steady = _steady(face, lasers.number)
     through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
     if through.any():
@@ -166,7 +171,7 @@ def sense(
     reflectance = eye.reported(reflectance)
     zero = np.float32(0)
     reported = (np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
-    return Returns(*reported, face, first)
+    return Returns(*reported, face, first, surface, surface_label)
 
 
 def _signal(

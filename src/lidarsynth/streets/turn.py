@@ -20,7 +20,8 @@ class Turn:
 
     rays, points (H, W, 3) float32: the beams' directions and where they ended, metres, in the sensor frame of the
     moment each was sent, (0, 0, 0) for none; distance (H, W) float32 m along the ray, 0 for none; reflectance, label
-    (H, W); face, first (H, W) int32: the triangle of the return and the one met first, maybe a pane, -1 for none.
+    (H, W); face, first (H, W) int32: the triangle of the return and the one met first, maybe a pane, -1 for none;
+    surface (H, W) float32 m, surface_label: where exactly that one is within the sensor's limits, 0 for none; its class.
     """
 
     rays: np.ndarray
@@ -30,6 +31,8 @@ class Turn:
     label: np.ndarray
     face: np.ndarray
     first: np.ndarray
+    surface: np.ndarray
+    surface_label: np.ndarray
 
 
 def shoot(
@@ -53,14 +56,18 @@ def shoot(
     when = None if times is None else np.broadcast_to(times, seen.shape)[seen]
     found = sense(world, caster, origins, directions, lasers, rng, sensor.max_range, optics, when)
     kept = found.distance >= sensor.min_range
-    whole = []
-    for values in (found.distance, found.reflectance, found.label):
-        whole.append(np.zeros(seen.shape, values.dtype))
-        whole[-1][seen] = np.where(kept, values, 0)
-    for faces in (found.face, found.first):
-        whole.append(np.full(seen.shape, -1, np.int32))
-        whole[-1][seen] = faces
-    return Turn(rays, local_points(rays, whole[0], sensor), *whole)
+    reported = [_whole(seen, np.where(kept, v, 0), v.dtype) for v in (found.distance, found.reflectance, found.label)]
+    faces = [_whole(seen, values, np.int32, -1) for values in (found.face, found.first)]
+    within = (found.surface >= sensor.min_range) & (found.surface < sensor.max_range)
+    surface = [_whole(seen, np.where(within, v, 0), v.dtype) for v in (found.surface, found.surface_label)]
+    return Turn(rays, local_points(rays, reported[0], sensor), *reported, *faces, *surface)
+
+
+def _whole(seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, empty: int = 0) -> np.ndarray:
+    """(H, W) image of the values (N,) of the rays that are `seen` (H, W) bool."""
+    image = np.full(seen.shape, empty, kind)
+    image[seen] = values
+    return image
 
 
 def world_rays(

@@ -30,7 +30,8 @@ class VirtualSensor:
 
 
 class VirtualStreets:
-    """Streets seen by virtual sensors: `len`, `sensor(i) -> VirtualSensor`, `image(i) -> RangeImage` of that sensor.
+    """Streets seen by virtual sensors: `len`, `sensor(i) -> VirtualSensor`, `image(i) -> RangeImage` of that sensor,
+    and `pair(i)` of it and what a perfect sensor would give.
 
     Four scans in a row share a sensor, sixteen a world. Scan i of a seed depends on nothing else. Raises as
     `SyntheticStreets`.
@@ -50,12 +51,20 @@ class VirtualStreets:
 
     def image(self, index: int) -> RangeImage:
         """(H, W) image of scan `index`, in the sensor of it."""
+        return self._of(index).image(index)
+
+    def pair(self, index: int) -> tuple[RangeImage, RangeImage]:
+        """`(perfect, seen)` of scan `index`, as `SyntheticStreets.pair`."""
+        return self._of(index).pair(index)
+
+    def _of(self, index: int) -> SyntheticStreets:
+        """The streets as the sensor of scan `index` sees them."""
         group = index // SHARING
         if self._streets is None or self._streets[0] != group:
             seen = self.sensor(index)
             streets = SyntheticStreets(self.seed, self.length, seen.sensor, optics=seen.optics, worlds=self._worlds)
             self._streets = (group, streets)
-        return self._streets[1].image(index)
+        return self._streets[1]
 
 
 def draw_sensor(rng: np.random.Generator, known_share: float = 0.5) -> VirtualSensor:
