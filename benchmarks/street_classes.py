@@ -25,7 +25,7 @@ from lidarsynth.metrics.reconstruction import class_iou
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.streets.reader import SyntheticStreets, Worlds
 from lidarsynth.streets.sensor_model import Optics
-from lidarsynth.systems.segmentation.training import Batch, CrossEntropy, confusion
+from lidarsynth.systems.segmentation.training import CrossEntropy, SegmentationBatch, confusion
 from lidarsynth.weights.load import load_parts
 
 PER_WORLD, BATCH, COLUMNS = 6, 4, 512
@@ -47,7 +47,7 @@ def varied(seed: int, count: int) -> Iterator[RangeImage]:
         yield replace(image, reflectance=np.clip(image.reflectance * bright, 0, 0.99).astype(np.float32))
 
 
-def batches(images: list[RangeImage], weights: torch.Tensor, seed: int) -> Iterator[Batch]:
+def batches(images: list[RangeImage], weights: torch.Tensor, seed: int) -> Iterator[SegmentationBatch]:
     """Endless batches of cuts, mirrored and thinned at random."""
     rng = np.random.default_rng(seed)
     while True:
@@ -65,7 +65,7 @@ def batches(images: list[RangeImage], weights: torch.Tensor, seed: int) -> Itera
                 stack[2] *= -1
             pixels.append(stack)
             labels.append(label)
-        yield Batch(torch.from_numpy(np.stack(pixels)), torch.from_numpy(np.stack(labels)), weights)
+        yield SegmentationBatch(torch.from_numpy(np.stack(pixels)), torch.from_numpy(np.stack(labels)), weights)
 
 
 def judged(network: RangeNet, folders: list[Path]) -> str:

@@ -22,7 +22,7 @@ from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.systems.table import build_network, task_of
-from lidarsynth.training.examples import Examples, Learned, Streets, load_batches, open_images
+from lidarsynth.training.examples import Examples, Streets, TrainingImages, load_batches, open_images
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.machine import accelerator_of, workers_of
 from lidarsynth.training.options import Options
@@ -43,7 +43,7 @@ def noise_cache(folder: Path, experiment: Experiment, count: int = 64) -> Cached
     return CachedImages(folder)
 
 
-def loader_speed(experiment: Experiment, images: Learned, workers: int, steps: int) -> float:
+def loader_speed(experiment: Experiment, images: TrainingImages, workers: int, steps: int) -> float:
     """Samples per second of one process's loader when nobody trains."""
     batches = load_batches(Examples(experiment, images, 1, task_of(experiment).draw), 0, range(1), workers)
     next(batches)
@@ -77,7 +77,7 @@ def main() -> None:
         measure(experiment, images, options, args.steps)
 
 
-def measure(experiment: Experiment, images: Learned, options: Options, steps: int) -> None:
+def measure(experiment: Experiment, images: TrainingImages, options: Options, steps: int) -> None:
     """Train for a while and print the table."""
     accelerator = accelerator_of(options)
     on_gpu = accelerator.device.type == "cuda"

@@ -10,7 +10,7 @@ from full_scan import full_scan
 from lidarsynth.data.bag_writer import write_bag
 from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag, typestore
 from lidarsynth.files.fields import FileError, scan_from_fields
-from lidarsynth.verbs.batch import Task, Work, run
+from lidarsynth.verbs.batch import Job, Work, run
 from lidarsynth.verbs.inputs import inputs_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
@@ -141,7 +141,7 @@ def test_a_bag_completed_keeps_every_measured_bit(tmp_path: Path):
     """Through the verb's own work: fields of the message as they were, new points marked, in the message's scales."""
     path = ros1(tmp_path)
     works = (Work(item, None, False) for item in inputs_of([path]).stream())
-    results = list(run(Task("complete", model="bilinear", picture=False), works))
+    results = list(run(Job("complete", model="bilinear", picture=False), works))
     assert [r.error for r in results] == [None] * 3
     with open_bag(path) as bag:
         for result, cloud in zip(results, bag.clouds("/points"), strict=True):

@@ -1,4 +1,4 @@
-"""Training of GANs: what each player sees, its penalties and averages, exact continuation, and that it learns."""
+"""Training of GANs: what each network sees, its penalties and averages, exact continuation, and that it learns."""
 
 import csv
 import math
@@ -24,10 +24,10 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.gan.losses import r1_penalty
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
 from lidarsynth.systems.gan import training as adversarial
-from lidarsynth.systems.gan.batch import Batch, draw, warmup_drop
+from lidarsynth.systems.gan.batch import AdversarialBatch, draw, warmup_drop
 from lidarsynth.systems.gan.build import build_discriminator
 from lidarsynth.systems.gan.model import GanModel
-from lidarsynth.systems.gan.training import ADVERSARIAL, Players
+from lidarsynth.systems.gan.training import ADVERSARIAL, AdversarialNetworks
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.loop import Run, start, train, update_ema
@@ -70,13 +70,13 @@ def started(experiment: Experiment) -> Run:
     return start(experiment, build_network(experiment), task_of(experiment))
 
 
-def players_of(experiment: Experiment) -> Players:
+def networks_of(experiment: Experiment) -> AdversarialNetworks:
     network = started(experiment).network.train()
-    assert isinstance(network, Players)
+    assert isinstance(network, AdversarialNetworks)
     return network
 
 
-def batch_of(experiment: Experiment, step: int = 0, positions: tuple[int, ...] = (0, 1, 2, 3)) -> Batch:
+def batch_of(experiment: Experiment, step: int = 0, positions: tuple[int, ...] = (0, 1, 2, 3)) -> AdversarialBatch:
     return draw(experiment, Flat(), list(positions), step, list(positions))  # type: ignore[arg-type]
 
 
@@ -91,7 +91,7 @@ def test_a_sample_s_randomness_depends_on_seed_step_and_position_only(word):
     for ours, theirs in zip(flat(part), flat(whole), strict=True):
         assert torch.equal(ours, theirs[1::2])
     assert not torch.equal(batch_of(experiment, 6).latents.z, whole.latents.z)
-    assert not torch.equal(whole.latents.z, whole.others.z), "the discriminator's turn has fresh latents"
+    assert not torch.equal(whole.latents.z, whole.fake_latents.z), "the discriminator's phase has fresh latents"
     views = [whole.view, whole.fake_view, whole.real_view, whole.penalty_view]
     assert len({float(view.dice.uniform[0, 0]) for view in views}) == 4
 
@@ -101,45 +101,45 @@ def test_the_warm_up_drops_half_of_the_pixels_and_then_fewer():
     for step, share in ((0, 0.5), (5, 0.25), (10, 0.0), (99, 0.0)):
         batch = batch_of(experiment, step)
         assert 1 - float(batch.real_view.keep.float().mean()) == pytest.approx(share, abs=0.02)
-    players, group = players_of(experiment), experiment.adversarial
-    seen = adversarial.shown(players, plain().adversarial, batch_of(experiment).real, batch_of(experiment).view)  # type: ignore[arg-type]
+    networks, group = networks_of(experiment), experiment.adversarial
+    seen = adversarial.shown(networks, plain().adversarial, batch_of(experiment).real, batch_of(experiment).view)  # type: ignore[arg-type]
     assert float((seen == -1).float().mean()) == pytest.approx(0.5, abs=0.02)
     assert group and group.augmentation_target == 0.6
 
 
 @pytest.mark.parametrize("word", WORDS)
-def test_a_turn_moves_its_own_player_only(word):
+def test_a_phase_moves_its_own_network_only(word):
     experiment = tiny(word, **{"adversarial.path_length_weight": 2.0})
-    players, batch = players_of(experiment), batch_of(experiment)
-    for phase in ADVERSARIAL.phases(experiment, players):
-        own = players.generator if phase.optimizer == "generator" else players.discriminator
+    networks, batch = networks_of(experiment), batch_of(experiment)
+    for phase in ADVERSARIAL.phases(experiment, networks):
+        own = networks.generator if phase.optimizer == "generator" else networks.discriminator
         assert {id(p) for p in phase.objective.parameters()} == {id(p) for p in own.parameters()}
-        players.zero_grad()
+        networks.zero_grad()
         torch.cat([*phase.objective(batch).values()]).mean().backward()
-        for name, parameter in players.named_parameters():
+        for name, parameter in networks.named_parameters():
             mine = name.startswith(phase.optimizer)
             assert (parameter.grad is not None) == mine, f"{type(phase.objective).__name__}: {name}"
-    assert [phase.every for phase in ADVERSARIAL.phases(experiment, players)] == [1, 4, 1, 4]
-    published = ADVERSARIAL.phases(tiny(word), players)
+    assert [phase.every for phase in ADVERSARIAL.phases(experiment, networks)] == [1, 4, 1, 4]
+    published = ADVERSARIAL.phases(tiny(word), networks)
     assert [phase.optimizer for phase in published] == ["generator", "discriminator", "discriminator"]
 
 
 def test_losses_are_those_of_the_papers():
     experiment = plain(**{"adversarial.r1_weight": 3.0, "adversarial.r1_every": 5})
-    players, batch = players_of(experiment), batch_of(experiment)
-    generator, discriminator, penalty = (p.objective(batch) for p in ADVERSARIAL.phases(experiment, players))
+    networks, batch = networks_of(experiment), batch_of(experiment)
+    generator, discriminator, penalty = (p.objective(batch) for p in ADVERSARIAL.phases(experiment, networks))
     with torch.no_grad():
-        fake = players.generator(batch.latents.z, batch.latents.uniform).image
-        others = players.generator(batch.others.z, batch.others.uniform).image
-        logits, real, fakes = (players.discriminator(x).flatten() for x in (fake, batch.real, others))
+        fake = networks.generator(batch.latents.z, batch.latents.uniform).image
+        others = networks.generator(batch.fake_latents.z, batch.fake_latents.uniform).image
+        logits, real, fakes = (networks.discriminator(x).flatten() for x in (fake, batch.real, others))
     assert_close(generator["generator"][0], torch.log1p(torch.exp(-logits)).mean())
     expected = torch.log1p(torch.exp(-real)).mean() + torch.log1p(torch.exp(fakes)).mean()
     assert_close(discriminator["discriminator"][0], expected)
     x = batch.real.clone().requires_grad_()
-    assert_close(penalty["r1"][0], 3.0 / 2 * 5 * r1_penalty(players.discriminator(x), x))
+    assert_close(penalty["r1"][0], 3.0 / 2 * 5 * r1_penalty(networks.discriminator(x), x))
 
 
-def test_lazy_penalties_have_adam_s_factors_and_turns():
+def test_lazy_penalties_have_adam_s_factors_and_intervals():
     experiment = with_fields(preset("tiny-gan"), {"adversarial.r1_every": 16, "training.steps": 3})
     state = started(experiment)
     generator, discriminator = (state.optimizers[name].param_groups[0] for name in ("generator", "discriminator"))
@@ -170,16 +170,16 @@ def test_the_average_halves_its_past_in_a_half_life_and_copies_buffers():
 
 def test_the_augmentation_follows_the_signs_of_real_images():
     experiment = tiny()  # 100 images to one, every 4 steps
-    players, accelerator = players_of(experiment), accelerator_of(Options())
+    networks, accelerator = networks_of(experiment), accelerator_of(Options())
     for sign, expected in ((1.0, 0.16), (1.0, 0.32), (-1.0, 0.16)):
         for step in range(1, 5):
-            players.augmentation.observe(torch.full((4, 1), sign))
-            adversarial.after(experiment, players, step, accelerator)
-        assert float(players.augmentation.p) == pytest.approx(expected)
+            networks.augmentation.observe(torch.full((4, 1), sign))
+            adversarial.after(experiment, networks, step, accelerator)
+        assert float(networks.augmentation.p) == pytest.approx(expected)
     batch = batch_of(experiment, 99)
-    players.augmentation.p.fill_(0.0)
-    adversarial.DiscriminatorTurn(experiment, players)(batch)
-    assert float(players.augmentation.n_pred_cum) == 4, "real logits only"
+    networks.augmentation.p.fill_(0.0)
+    adversarial.DiscriminatorLoss(experiment, networks)(batch)
+    assert float(networks.augmentation.n_pred_cum) == 4, "real logits only"
 
 
 def test_the_groups_of_the_minibatch_deviation_are_the_same_in_two_processes():

@@ -263,7 +263,7 @@ class Said(nn.Module):
 def test_the_objective_is_lidargens(fixture_tensors):
     stored = fixture_tensors("lidargen/loss")
     objective = ScoreMatching(preset("lidargen"), Said(stored["score"] / 2))
-    batch = matching.Batch(2 * stored["samples"] - 1, 1 - stored["labels"] / 231, stored["noise"])
+    batch = matching.ScoreBatch(2 * stored["samples"] - 1, 1 - stored["labels"] / 231, stored["noise"])
     losses = objective(batch)["score"]
     torch.testing.assert_close(losses, stored["per_sample_loss"], rtol=1e-4, atol=0)
     torch.testing.assert_close(losses.mean(), stored["loss"], rtol=1e-4, atol=0)

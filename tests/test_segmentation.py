@@ -18,8 +18,8 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.systems.segmentation.training import (
-    Batch,
     CrossEntropy,
+    SegmentationBatch,
     augment,
     class_shares,
     class_weights,
@@ -162,7 +162,7 @@ def test_the_loss_is_the_weighted_cross_entropy_of_labelled_pixels():
     label = torch.zeros(2, 16, 32, dtype=torch.int64)
     label[0, 3, 4], label[0, 5, 6] = 1, 13
     weights = torch.linspace(1, 3, 20)
-    losses = CrossEntropy(net)(Batch(values, label, weights))["cross_entropy"]
+    losses = CrossEntropy(net)(SegmentationBatch(values, label, weights))["cross_entropy"]
     log = net(net.network_input(values, values[:, :1] > 0)).log_softmax(1)
     expected = -(weights[1] * log[0, 1, 3, 4] + weights[13] * log[0, 13, 5, 6]) / 2
     torch.testing.assert_close(losses, torch.stack([expected, torch.zeros(())]))

@@ -16,7 +16,7 @@ from lidarsynth.experiment.record import Experiment, Training, with_fields
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.diffusion.build import build_denoiser
-from lidarsynth.systems.diffusion.training import Batch, Objective, draw, draw_images, random_known, scaled
+from lidarsynth.systems.diffusion.training import DiffusionBatch, Objective, draw, draw_images, random_known, scaled
 from lidarsynth.systems.diffusion.validation import TIMES, fixed_losses
 from lidarsynth.systems.table import build_network, task_of
 from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
@@ -326,4 +326,4 @@ def test_training_lowers_the_loss_on_fixed_noise():
 def test_batches_travel_through_the_loader_in_order():
     experiment = replace(TINY, training=replace(TINY.training, steps=3))
     batches = list(load_batches(Examples(experiment, Noise(), 2, draw_images), 1, range(2)))  # type: ignore[arg-type]
-    assert len(batches) == 4 and all(isinstance(b, Batch) and len(b.x_0) == 2 for b in batches)
+    assert len(batches) == 4 and all(isinstance(b, DiffusionBatch) and len(b.x_0) == 2 for b in batches)

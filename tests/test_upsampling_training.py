@@ -18,7 +18,7 @@ from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.systems.interpolation.model import interpolated
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.systems.table import load_folder as load
-from lidarsynth.systems.upsampling.training import Asked, Pair, draw_pairs, draw_queries
+from lidarsynth.systems.upsampling.training import PairBatch, QueryBatch, draw_pairs, draw_queries
 from lidarsynth.training.loop import Run, learning_rate, start, train
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run as run_in
@@ -128,8 +128,8 @@ def test_columns_are_thinned_too():
     experiment = tiny("lidar-sr", **{"upsampling.factor": (4, 2)})
     low, high = draw_pairs(experiment, Walls(), [3], 0, [0])
     torch.testing.assert_close(low.flip(2), high.flip(2)[:, :, ::4, ::2], rtol=0, atol=0)
-    asked = draw_queries(tiny("iln", **{"upsampling.factor": (4, 2)}), Walls(), [3], 0, [0])
-    assert asked.low.shape == (1, 1, 4, 32)
+    batch = draw_queries(tiny("iln", **{"upsampling.factor": (4, 2)}), Walls(), [3], 0, [0])
+    assert batch.low.shape == (1, 1, 4, 32)
 
 
 # ---------------------------------------------------------------- losses and rates
@@ -139,16 +139,16 @@ def test_losses_are_those_of_the_papers():
     for keras, scale in ((False, 2), (True, 1)):  # ILN's repository compares in [-1, 1], Keras in [0, 1]
         experiment = tiny("lidar-sr", **{"upsampling.keras": keras})
         run = fresh(experiment)
-        pair = Pair(torch.rand(2, 1, 4, 64), torch.rand(2, 1, 16, 64))
+        batch = PairBatch(torch.rand(2, 1, 4, 64), torch.rand(2, 1, 16, 64))
         (phase,) = task_of(experiment).phases(experiment, run.network.eval())
-        expected = scale * (run.network(pair.low) - pair.high).abs().mean((1, 2, 3))
-        torch.testing.assert_close(phase.objective(pair), {"range": expected})
+        expected = scale * (run.network(batch.low) - batch.high).abs().mean((1, 2, 3))
+        torch.testing.assert_close(phase.objective(batch), {"range": expected})
     experiment = tiny("iln")
     run = fresh(experiment)
-    asked = Asked(torch.rand(2, 1, 4, 64), torch.rand(2, 9, 2) * 2 - 1, torch.rand(2, 9))
+    batch = QueryBatch(torch.rand(2, 1, 4, 64), torch.rand(2, 9, 2) * 2 - 1, torch.rand(2, 9))
     (phase,) = task_of(experiment).phases(experiment, run.network.eval())
-    expected = (run.network(asked.low, asked.queries) - asked.ranges).abs().mean(1)
-    torch.testing.assert_close(phase.objective(asked), {"range": expected})
+    expected = (run.network(batch.low, batch.queries) - batch.ranges).abs().mean(1)
+    torch.testing.assert_close(phase.objective(batch), {"range": expected})
 
 
 def test_rates_are_those_of_the_papers():

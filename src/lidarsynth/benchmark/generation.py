@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidarsynth.benchmark.abilities import generation_evaluations, has_reflectance
 from lidarsynth.benchmark.config import Generation, GenerationMethod, protocols_of
-from lidarsynth.benchmark.contest import Contest
+from lidarsynth.benchmark.evaluation_counts import generation_evaluations
 from lidarsynth.benchmark.published import published
 from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
+from lidarsynth.benchmark.setup import Setup
 from lidarsynth.benchmark.sources import located
 from lidarsynth.benchmark.store import Seconds, Store
 from lidarsynth.evaluation.evaluate import evaluate
@@ -38,7 +38,7 @@ def drawer(method: GenerationMethod, model: ScanModel | None, sensor: Sensor) ->
 
     def draw(seed: int, count: int) -> list[RangeImage]:
         images = model.generate(count, seed=seed, batch_size=count, **given)
-        if has_reflectance(model):
+        if model.experiment.data.reflectance:
             return images
         return [replace(image, reflectance=np.zeros_like(image.reflectance)) for image in images]
 
@@ -52,28 +52,28 @@ def noise(sensor: Sensor, seed: int) -> RangeImage:
 
 
 def generation_row(
-    contest: Contest, config: Generation, group: str, method: GenerationMethod, reference: ImageSet, sensor: Sensor
+    setup: Setup, config: Generation, group: str, method: GenerationMethod, reference: ImageSet, sensor: Sensor
 ) -> Row:
     """Make the scans and judge them; of a method that cannot, a row with the reason."""
-    model, word = contest.model(method.model), method.samples or method.held_out
-    deciding = contest.settings(method, DECIDING) | {"seed": config.seed}
+    model, word = setup.model(method.model), method.samples or method.held_out
+    deciding = setup.settings(method, DECIDING) | {"seed": config.seed}
     if word:
         deciding = {"scans": word, "held out": method.held_out is not None}
     if method.noise:
         deciding |= {"sensor": sensor.to_dict()}
     row = Row(method.name, group, deciding, floor=method.noise or method.held_out is not None)
-    store = contest.store(word or method.model or "noise", deciding)
+    store = setup.store(word or method.model or "noise", deciding)
     count, evaluations = method.count or config.count, None
     image = store.image
     if word:
-        samples = located(word, contest.folder, config.sensor, contest.on_images)
+        samples = located(word, setup.folder, config.sensor, setup.on_images)
         made = image_set(samples)
         own = sensor_of(made.item(0), sensor)
         count, image = len(made), lambda i: made.image(i, own, "auto")
     else:
         try:
             evaluations, _ = timed(lambda: generation_evaluations(model, method) if model else None)
-            _make(contest, method, drawer(method, model, sensor), store, count, config.seed)
+            _make(setup, method, drawer(method, model, sensor), store, count, config.seed)
         except Declined as reason:
             return replace(row, reason=str(reason))
         samples = store.folder
@@ -81,7 +81,7 @@ def generation_row(
     return replace(
         row,
         count=count,
-        reports={name: _judged(contest, config, name, kept, reference, store) for name in protocols_of(config)},
+        reports={name: _judged(setup, config, name, kept, reference, store) for name in protocols_of(config)},
         seconds=() if word or method.noise else store.seconds(count),
         evaluations=evaluations,
         published={name: published(name, method.published, reference.names, "") for name in protocols_of(config)},
@@ -89,18 +89,18 @@ def generation_row(
     )
 
 
-def _make(contest: Contest, method: GenerationMethod, draw: Draw, store: Store, count: int, seed: int) -> None:
+def _make(setup: Setup, method: GenerationMethod, draw: Draw, store: Store, count: int, seed: int) -> None:
     """Scans of any number depend on seed + number only, so that more of them go on where fewer ended."""
 
     def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
         return timed(lambda: draw(seed + numbers.start, len(numbers)))
 
-    batch = 1 if contest.device == "cpu" else contest.batch_size  # on a CPU larger ones are no faster
-    fill_store(store, dict.fromkeys(range(count), ""), make, batch, contest.progress(method.name, count))
+    batch = 1 if setup.device == "cpu" else setup.batch_size  # on a CPU larger ones are no faster
+    fill_store(store, dict.fromkeys(range(count), ""), make, batch, setup.progress(method.name, count))
 
 
 def _judged(
-    contest: Contest,
+    setup: Setup,
     config: Generation,
     name: str,
     samples: Path | Sequence[RangeImage],
@@ -113,7 +113,7 @@ def _judged(
     def judge() -> dict[str, Any]:
         try:
             report = evaluate(samples, reference.source, name, config.sensor, config.seed,
-                              device=contest.device, on_images=contest.on_images)  # fmt: skip
+                              device=setup.device, on_images=setup.on_images)  # fmt: skip
         except ValueError as error:
             return {"reason": str(error)}
         return report.to_dict()

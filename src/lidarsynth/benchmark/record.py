@@ -16,14 +16,14 @@ from typing import Any
 import torch
 
 from lidarsynth.benchmark.config import Generation, Upsampling
-from lidarsynth.benchmark.contest import Contest
 from lidarsynth.benchmark.rows import Row
+from lidarsynth.benchmark.setup import Setup
 
 
 def record_of(
     kind: str,
     config: Upsampling | Generation,
-    contest: Contest,
+    setup: Setup,
     rows: Sequence[Row],
     data: Mapping[str, Any],
     command: str,
@@ -32,11 +32,11 @@ def record_of(
     models = {
         word: {
             "name": model.experiment.name,
-            "fingerprint": contest.prints[word],
+            "fingerprint": setup.fingerprints[word],
             "licence": model.experiment.card.licence,
             "learned from": model.experiment.card.data,
         }
-        for word, model in contest.models.items()
+        for word, model in setup.models.items()
     }
     record = {
         "benchmark": kind,
@@ -54,7 +54,7 @@ def record_of(
             "processor": processor(),
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
-            "device": contest.device,
+            "device": setup.device,
         },
     }
     return json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from lidarsynth.benchmark.config import Generation, Upsampling, protocols_of, read_config, rows
-from lidarsynth.benchmark.contest import Contest, Load, open_contest
 from lidarsynth.benchmark.drawings import plotter, save_scores, side_by_side, with_classes, with_labels_of
 from lidarsynth.benchmark.generation import generation_row
 from lidarsynth.benchmark.published import PUBLISHED, why_not
 from lidarsynth.benchmark.record import record_of
 from lidarsynth.benchmark.rows import Row
+from lidarsynth.benchmark.setup import Load, Setup, open_setup
 from lidarsynth.benchmark.sources import corrupted, located
 from lidarsynth.benchmark.store import write_text
 from lidarsynth.benchmark.tables import page
@@ -77,12 +77,12 @@ def benchmark(
     draws_scores = kind == "generation" and several
     if draws_scores:
         plotter()  # its lack is told now, not after hours
-    contest = open_contest(settings, out, load, classes, device, batch_size, on_images)
+    setup = open_setup(settings, out, load, classes, device, batch_size, on_images)
     out.mkdir(parents=True, exist_ok=True)
-    outcome = upsampling(contest, settings) if isinstance(settings, Upsampling) else generation(contest, settings)
+    outcome = upsampling(setup, settings) if isinstance(settings, Upsampling) else generation(setup, settings)
     names = protocols_of(settings)
     text = page(settings.title, command, outcome.rows, names, outcome.about)
-    write_text(out / RESULTS, record_of(kind, settings, contest, outcome.rows, outcome.data, command))
+    write_text(out / RESULTS, record_of(kind, settings, setup, outcome.rows, outcome.data, command))
     save_png(out / FIGURE, side_by_side(outcome.pictures, settings.title, outcome.note))
     if draws_scores:
         save_scores(out / SCORES, outcome.rows, names, settings.title)
@@ -90,11 +90,11 @@ def benchmark(
     return text
 
 
-def upsampling(contest: Contest, config: Upsampling) -> Outcome:
+def upsampling(setup: Setup, config: Upsampling) -> Outcome:
     """Every method fills the same scans. Raises ValueError for data that cannot be used."""
-    data = corrupted(config, contest.folder, contest.on_images)
-    problem = Problem(config, data, data.stamps(contest.progress("read", len(data))), data.shown(config.figure))
-    found = [upsampling_row(contest, problem, group, method) for group, method in rows(config.method)]
+    data = corrupted(config, setup.folder, setup.on_images)
+    problem = Problem(config, data, data.stamps(setup.progress("read", len(data))), data.shown(config.figure))
+    found = [upsampling_row(setup, problem, group, method) for group, method in rows(config.method)]
     (_, known), sensor = data[problem.shown], data.sensor
     about = {
         "scans": f"{len(data)} of {config.data}, {sensor.name}, {sensor.height} x {sensor.width}",
@@ -106,10 +106,10 @@ def upsampling(contest: Contest, config: Upsampling) -> Outcome:
         about["published"] = told or f"in parentheses, {PUBLISHED[name].source}" if name in PUBLISHED else "none"
     record = {"source": data.images.source, "names": list(data.names), "sensor": sensor.name, "scans": len(data),
               "sha256": sha256("".join(problem.stamps.values()).encode()).hexdigest()}  # fmt: skip
-    return Outcome(found, about, record, *_filled_pictures(contest, problem, found))
+    return Outcome(found, about, record, *_filled_pictures(setup, problem, found))
 
 
-def _filled_pictures(contest: Contest, problem: Problem, found: Sequence[Row]) -> tuple[dict[str, RangeImage], str]:
+def _filled_pictures(setup: Setup, problem: Problem, found: Sequence[Row]) -> tuple[dict[str, RangeImage], str]:
     number = problem.shown
     truth, known = problem.data[number]
     pictures = {f"input, {problem.config.corruption}": truth.keep(known)}
@@ -118,15 +118,15 @@ def _filled_pictures(contest: Contest, problem: Problem, found: Sequence[Row]) -
             image = row.image(number)
             error = reconstruction_errors(image, truth, ~known).range_mae
             pictures[f"{row.name}: hidden range MAE {error:.2f} m"] = image
-    return _coloured(contest, pictures | {"truth": truth}, truth)
+    return _coloured(setup, pictures | {"truth": truth}, truth)
 
 
 def _coloured(
-    contest: Contest, pictures: dict[str, RangeImage], truth: RangeImage | None = None
+    setup: Setup, pictures: dict[str, RangeImage], truth: RangeImage | None = None
 ) -> tuple[dict[str, RangeImage], str]:
     """With the classes that a RangeNet sees, else those of the truth where it has labels, else as they are."""
     width = next(iter(pictures.values())).sensor.width
-    network = classes_of(contest.judges(R2DM_UPSAMPLING.name, width).networks)
+    network = classes_of(setup.judges(R2DM_UPSAMPLING.name, width).networks)
     if network is not None:
         return {caption: with_classes(image, network) for caption, image in pictures.items()}, "classes by RangeNet"
     if truth is not None and truth.label is not None:
@@ -135,12 +135,12 @@ def _coloured(
     return pictures, ""
 
 
-def generation(contest: Contest, config: Generation) -> Outcome:
+def generation(setup: Setup, config: Generation) -> Outcome:
     """Every method's scans meet the same reference. Raises ValueError for a reference that cannot be used."""
-    reference = image_set(located(config.reference, contest.folder, config.sensor, contest.on_images))
+    reference = image_set(located(config.reference, setup.folder, config.sensor, setup.on_images))
     first = get_protocol(protocols_of(config)[0])
     sensor = sensor_of(reference.item(0), get_sensor(config.sensor or first.sensor))
-    found = [generation_row(contest, config, group, method, reference, sensor) for group, method in rows(config.method)]
+    found = [generation_row(setup, config, group, method, reference, sensor) for group, method in rows(config.method)]
     about = {
         "reference": f"{len(reference)} of {config.reference}, {sensor.name}, {sensor.height} x {sensor.width}",
         "seed": str(config.seed),
@@ -149,4 +149,4 @@ def generation(contest: Contest, config: Generation) -> Outcome:
     pictures = {"reference": reference.image(shown, sensor, "auto")}
     pictures |= {r.name: r.image(min(config.figure, r.count - 1)) for r in found if r.image and r.count}
     record = {"source": reference.source, "scans": len(reference), "sensor": sensor.name, "stamp": reference.stamp}
-    return Outcome(found, about, record, *_coloured(contest, pictures))
+    return Outcome(found, about, record, *_coloured(setup, pictures))

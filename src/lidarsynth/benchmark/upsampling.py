@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.benchmark.abilities import completion_evaluations, has_reflectance
 from lidarsynth.benchmark.config import Upsampling, UpsamplingMethod, protocols_of
-from lidarsynth.benchmark.contest import Contest
+from lidarsynth.benchmark.evaluation_counts import completion_evaluations
 from lidarsynth.benchmark.published import published
 from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
+from lidarsynth.benchmark.setup import Setup
 from lidarsynth.benchmark.sources import Corrupted
 from lidarsynth.benchmark.store import Seconds, Store
 from lidarsynth.evaluation.pairs import Pairs, classes_of
@@ -36,7 +36,11 @@ def filler(method: UpsamplingMethod, model: ScanModel | None) -> Fill:
 
     def fill(before: RangeImage, known: np.ndarray, seed: int) -> RangeImage:
         filled = replace(model.complete(before, known, seed=seed, **given), sensor=before.sensor)
-        return filled if has_reflectance(model) else replace(filled, reflectance=np.zeros_like(filled.reflectance))
+        return (
+            filled
+            if model.experiment.data.reflectance
+            else replace(filled, reflectance=np.zeros_like(filled.reflectance))
+        )
 
     return fill
 
@@ -55,13 +59,13 @@ class Problem:
     shown: int
 
 
-def upsampling_row(contest: Contest, problem: Problem, group: str, method: UpsamplingMethod) -> Row:
+def upsampling_row(setup: Setup, problem: Problem, group: str, method: UpsamplingMethod) -> Row:
     """Fill the scans and judge them; of a method that cannot, a row with the reason."""
     config, data, stamps = problem.config, problem.data, problem.stamps
-    model, count = contest.model(method.model), min(method.images or len(data), len(data))
-    deciding = contest.settings(method, DECIDING) | {"corruption": config.corruption, "seed": config.seed}
+    model, count = setup.model(method.model), min(method.images or len(data), len(data))
+    deciding = setup.settings(method, DECIDING) | {"corruption": config.corruption, "seed": config.seed}
     row = Row(method.name, group, deciding)
-    store = contest.store(method.model or method.interpolation or "", deciding)
+    store = setup.store(method.model or method.interpolation or "", deciding)
     fill = filler(method, model)
 
     def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
@@ -73,11 +77,11 @@ def upsampling_row(contest: Contest, problem: Problem, group: str, method: Upsam
     try:
         evaluations, _ = timed(lambda: completion_evaluations(model, method) if model else 0)
         needed = {i: stamp for i, stamp in stamps.items() if i < count or i == problem.shown}
-        fill_store(store, needed, make, on_done=contest.progress(method.name, len(needed)))
+        fill_store(store, needed, make, on_done=setup.progress(method.name, len(needed)))
     except Declined as reason:
         return replace(row, reason=str(reason))
     word = method.published or method.interpolation
-    judged = {name: _judged(contest, name, data, store, list(stamps.values())[:count]) for name in protocols_of(config)}
+    judged = {name: _judged(setup, name, data, store, list(stamps.values())[:count]) for name in protocols_of(config)}
     return replace(
         row,
         count=count,
@@ -91,9 +95,9 @@ def upsampling_row(contest: Contest, problem: Problem, group: str, method: Upsam
     )
 
 
-def _judged(contest: Contest, name: str, data: Corrupted, store: Store, stamps: Sequence[str]) -> dict[str, Any]:
+def _judged(setup: Setup, name: str, data: Corrupted, store: Store, stamps: Sequence[str]) -> dict[str, Any]:
     """A protocol's report, and the errors of each scan."""
-    protocol, judges = get_protocol(name), contest.judges(name, data.sensor.width)
+    protocol, judges = get_protocol(name), setup.judges(name, data.sensor.width)
 
     def judge() -> dict[str, Any]:
         pairs, errors = Pairs(protocol, classes_of(judges.networks)), []
@@ -103,8 +107,8 @@ def _judged(contest: Contest, name: str, data: Corrupted, store: Store, stamps: 
             hidden = reconstruction_errors(store.image(i), truth, ~known)
             errors.append([pairs.errors[-1].range_mae, pairs.errors[-1].reflectance_mae,
                            hidden.range_mae, hidden.reflectance_mae])  # fmt: skip
-            if contest.on_images:
-                contest.on_images("judge", i + 1, len(stamps))
+            if setup.on_images:
+                setup.on_images("judge", i + 1, len(stamps))
         report = pairs.report(judges.missing, judges.weights).to_dict()
         columns = dict(zip(ERRORS, map(list, zip(*errors, strict=True)), strict=True))
         return {"report": report, "errors": {k: v for k, v in columns.items() if pairs.lit or "reflectance" not in k}}

@@ -44,14 +44,14 @@ def complete(
     of the hidden pixels are printed beside those of interpolation.
     """
     from lidarsynth.systems.filling import Filling
-    from lidarsynth.verbs.batch import Task
+    from lidarsynth.verbs.batch import Job
     from lidarsynth.verbs.description import errors_table, mean_table
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    task = Task("complete", model, device, how, corrupt=corrupt, sensor=sensor, picture=picture)
-    results = [result for result in work_through(task, scans, out, many, intensity) if result.errors]
+    job = Job("complete", model, device, how, corrupt=corrupt, sensor=sensor, picture=picture)
+    results = [result for result in work_through(job, scans, out, many, intensity) if result.errors]
     if len(results) <= PICTURES:
         for result in results:
             say(errors_table(result.source.name, result.errors))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from lidarsynth.data.bag_writer import BagWriter
     from lidarsynth.systems.scan_model import ScanModel
-    from lidarsynth.verbs.batch import Result, Task
+    from lidarsynth.verbs.batch import Job, Result
     from lidarsynth.verbs.inputs import Inputs
 
 PICTURES, NAMED = 10, 5  # scans that get a picture unasked; failures that are named one by one
@@ -47,8 +47,8 @@ class Many:
     all_pictures: Annotated[bool, arg(help=f"pictures also of more than {PICTURES} scans.")] = False
 
 
-def work_through(task: Task, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:
-    """Do the task with every scan, say what came of it, and return the results. Raises ValueError where all failed."""
+def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:
+    """Do the job with every scan, say what came of it, and return the results. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
     from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream, read_transform
 
@@ -56,61 +56,61 @@ def work_through(task: Task, paths: list[Path], out: Path, many: Many, intensity
         raise ValueError(f"expected --workers of at least 0, found {many.workers}")
     transform = read_transform(many.transform, many.mount)
     inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform))
-    task = replace(task, transform=transform, strict=many.strict)
+    job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
-        task = replace(task, picture=False)
+        job = replace(job, picture=False)
     if out.suffix.lower() in FORMATS:
-        return _into_bag(task, inputs, paths, out, many)
+        return _into_bag(job, inputs, paths, out, many)
     if many.keep_topics:
         raise ValueError(f"{out}: expected a .mcap or .bag to keep topics in, found another kind of output")
     if inputs.single and not any(is_stream(path) for path in paths) and (out.suffix or out.is_file()):
-        return _one(task, inputs, out)
-    return _into_folder(task, inputs, out, many)
+        return _one(job, inputs, out)
+    return _into_folder(job, inputs, out, many)
 
 
-def _model(task: Task) -> ScanModel | None:
+def _model(job: Job) -> ScanModel | None:
     """The model, its request checked before any work."""
-    if task.verb == "project":
+    if job.verb == "project":
         return None
-    model = load_with_bar(task.model, task.device)
-    model.resolved(task.how)
+    model = load_with_bar(job.model, job.device)
+    model.resolved(job.how)
     return model
 
 
-def _one(task: Task, inputs: Inputs, out: Path) -> list[Result]:
+def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
     from lidarsynth.verbs.batch import run
     from lidarsynth.verbs.output_files import works
 
     work = list(works(inputs, out, "ply"))
-    model = _model(task)
-    calls = 1 if model is None else model.calls(model.resolved(task.how))
+    model = _model(job)
+    calls = 1 if model is None else model.calls(model.resolved(job.how))
     with step_bar(work[0].item.path.name, calls) as on_step:
-        (result,) = run(task, work, model=model, on_step=on_step)
+        (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:
         raise ValueError(_named(result))
-    _tell(result, task.picture)
+    _tell(result, job.picture)
     return [result]
 
 
-def _into_folder(task: Task, inputs: Inputs, out: Path, many: Many) -> list[Result]:
+def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many) -> list[Result]:
     from lidarsynth.verbs.batch import run
     from lidarsynth.verbs.batch_report import merge_shards, parse_shard, report_of, report_path, write_report
     from lidarsynth.verbs.output_files import works
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
-    ending = many.format or ("npz" if task.verb == "project" else "ply")
+    ending = many.format or ("npz" if job.verb == "project" else "ply")
     stream = works(inputs, out, ending, shard, many.skip_existing, skipped)
     first = next(stream, None)
-    model = _model(task) if first is not None else None
+    model = _model(job) if first is not None else None
     count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
     results = []
-    with scan_bar(task.verb, count) as on_scan:
-        for result in run(task, _again(first, stream), many.workers, model):
+    with scan_bar(job.verb, count) as on_scan:
+        for result in run(job, _again(first, stream), many.workers, model):
             results.append(result)
             on_scan()
-            _tell_of_many(result, task.picture, (count or PICTURES + 1) <= PICTURES, len(results))
+            _tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
     seconds = time.perf_counter() - begun
-    settings = {"verb": task.verb, "model": task.model, "out": str(out), "format": ending, "workers": many.workers}
+    settings = {"verb": job.verb, "model": job.model, "out": str(out), "format": ending, "workers": many.workers}
     settings |= {"shard": many.shard} if many.shard else {}
     if all(result.error is not None for result in results) and results:
         _refuse_all(results)
@@ -127,7 +127,7 @@ def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:
         yield from rest
 
 
-def _into_bag(task: Task, inputs: Inputs, paths: list[Path], out: Path, many: Many) -> list[Result]:
+def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many) -> list[Result]:
     from lidarsynth.data.bag_writer import write_bag
     from lidarsynth.data.bags import is_bag
     from lidarsynth.verbs.batch import Work, run
@@ -138,12 +138,12 @@ def _into_bag(task: Task, inputs: Inputs, paths: list[Path], out: Path, many: Ma
                          "takes anything")  # fmt: skip
     if out.exists() and out.samefile(paths[0]):
         raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
-    model, begun, results = _model(task), time.perf_counter(), []
+    model, begun, results = _model(job), time.perf_counter(), []
     out.parent.mkdir(parents=True, exist_ok=True)
-    with write_bag(out) as writer, scan_bar(task.verb, inputs.count) as on_scan:
+    with write_bag(out) as writer, scan_bar(job.verb, inputs.count) as on_scan:
         topic = _copied(paths[0], writer, many)
         stream = (Work(item, None, looked_at(number)) for number, item in enumerate(inputs.stream()))
-        for result in run(replace(task, picture=False), stream, many.workers, model):
+        for result in run(replace(job, picture=False), stream, many.workers, model):
             if result.cloud is not None:
                 writer.write_cloud(topic, result.cloud)
             results.append(replace(result, cloud=None))

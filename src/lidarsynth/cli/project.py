@@ -25,8 +25,8 @@ def project(
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
     """Draw a scan as a range image: .npz with range, reflectance, mask and sensor, and a picture."""
-    from lidarsynth.verbs.batch import Task
+    from lidarsynth.verbs.batch import Job
 
     at_least(4, {"width": width})
-    task = Task("project", sensor=sensor, projection=method, width=width, picture=picture)
-    work_through(task, scans, out, many, intensity)
+    job = Job("project", sensor=sensor, projection=method, width=width, picture=picture)
+    work_through(job, scans, out, many, intensity)

@@ -46,10 +46,10 @@ def upsample(
 ) -> None:
     """Make a scan of a sensor with few beams dense: every measured point stays, bit by bit, and new ones are added."""
     from lidarsynth.systems.filling import Filling
-    from lidarsynth.verbs.batch import Task
+    from lidarsynth.verbs.batch import Job
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    task = Task("upsample", model, device, how, sensor=sensor_in, into=sensor_out, times=times, picture=picture)
-    work_through(task, scans, out, many, intensity)
+    job = Job("upsample", model, device, how, sensor=sensor_in, into=sensor_out, times=times, picture=picture)
+    work_through(job, scans, out, many, intensity)

@@ -44,8 +44,8 @@ def repaint(
     x, index = x_1, 0
     for interval, (start, end) in enumerate(pairwise(times)):
         marks = [torch.lerp(start, end, part / jump) for part in range(jump + 1)]
-        for turn in range(resamples if interval < steps - 1 else 1):
-            if turn > 0:
+        for resample in range(resamples if interval < steps - 1 else 1):
+            if resample > 0:
                 for s, t in pairwise(reversed(marks)):
                     x = renoise(denoiser.schedule, x, s, t, noise_like(x, rng))
             for t, s in pairwise(marks):

@@ -60,32 +60,32 @@ class Frame:
 def check_frame(scan: Scan) -> Frame:
     """In which frame a scan's points are. A scan without rings is only tested for its axes, by the ground."""
     up, has_rings = _upright(scan)
-    turn, words = np.array(AXES[up][0], np.float64), AXES[up][1]
-    tip, height = _tilt_and_height(scan, turn) if has_rings else (np.eye(3), 0.0)
+    rotation, words = np.array(AXES[up][0], np.float64), AXES[up][1]
+    tip, height = _tilt_and_height(scan, rotation) if has_rings else (np.eye(3), 0.0)
     faults, hints = [words] if words else [], []
     tilt = float(np.degrees(np.arccos(np.clip(tip[2, 2], -1, 1))))
     if tilt > TILTED:
         faults.append(f"tilted by {tilt:.1f} degrees")
-        turn = tip @ turn
+        rotation = tip @ rotation
     if abs(height) > RAISED:
         faults.append(f"with the sensor {abs(height):.2f} m {'above' if height > 0 else 'below'} the origin")
     if not faults and road_axis(scan.xyz) < ACROSS:
         hints.append("with the road along y, as if turned by 90 degrees")
-        turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+        rotation = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
     matrix = np.eye(4)
-    matrix[:3, :3] = turn
+    matrix[:3, :3] = rotation
     matrix[2, 3] = -height if abs(height) > RAISED else 0.0
     return Frame(tuple(faults), tuple(hints), matrix)
 
 
-def _tilt_and_height(scan: Scan, turn: np.ndarray) -> tuple[np.ndarray, float]:
-    """The rotation that puts the sensor's axis onto z, after `turn`, and its height in metres above the origin then.
+def _tilt_and_height(scan: Scan, rotation: np.ndarray) -> tuple[np.ndarray, float]:
+    """The rotation that puts the sensor's axis onto z after `rotation`, and its height in metres above the origin then.
 
     Height counts along the sensor's axis. The fit is linear in a tilt, so it is repeated on what it straightened.
     """
     tip, height = np.eye(3), 0.0
     for _ in range(3):
-        xyz = (scan.xyz @ (tip @ turn).T - np.array([0, 0, height])).astype(np.float32)
+        xyz = (scan.xyz @ (tip @ rotation).T - np.array([0, 0, height])).astype(np.float32)
         if (ring := rings_of(scan, xyz)) is None:
             break
         cones = fit_cones(xyz, ring)
@@ -132,9 +132,9 @@ def _known(scan: Scan, up: str) -> bool:
     return recognise(Scan(xyz, scan.reflectance, ring=ring))[0] is not None
 
 
-def _residual(scan: Scan, turn: np.ndarray) -> float | None:
-    """Degrees by which the points miss cones about the axis that `turn` makes z, or None without rings."""
-    xyz = scan.xyz @ turn.T.astype(np.float32)
+def _residual(scan: Scan, rotation: np.ndarray) -> float | None:
+    """Degrees by which the points miss cones about the axis that `rotation` makes z, or None without rings."""
+    xyz = scan.xyz @ rotation.T.astype(np.float32)
     ring = rings_of(scan, xyz)
     try:
         return None if ring is None else fit_cones(xyz, ring).residual

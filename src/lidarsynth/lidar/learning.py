@@ -24,7 +24,7 @@ BLOCKED_ROW = 0.5  # a row must return at least this often elsewhere
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedSensor:
     """A sensor and how well it is known.
 
     sensor    what to write to a file
@@ -40,7 +40,7 @@ class Learned:
     left: tuple[str, ...]
 
 
-def learn_sensor(scans: Iterable[Scan], name: str) -> Learned:
+def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     """The sensor that took the scans: points with a ring field, or ring after ring in the file.
 
     Beams are fitted over all scans, z = tan(e) rho + h, with h = 0 unless heights halve the residual; a row's height is
@@ -78,7 +78,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> Learned:
         tilt=(round(float(ground[1]), 2), round(float(ground[2]), 2)),
         blocked=blocked_runs(returned, len(kept)),
     )
-    return Learned(sensor, tuple(rings), returned, len(kept), tuple(left))
+    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left))
 
 
 def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[str]]:

@@ -27,13 +27,13 @@ def straighten(xyz: np.ndarray, ring: np.ndarray, time: np.ndarray | None = None
     few, many = chosen[:COARSE], chosen[:POINTS]
     if len(many) < 500:
         return xyz
-    turns = [np.mod(azimuth + k / SEAMS, 1) - 0.5 for k in range(SEAMS)]
+    taus = [np.mod(azimuth + k / SEAMS, 1) - 0.5 for k in range(SEAMS)]
     if time is not None and np.ptp(time) > 0:
-        turns.append((time - time.min()) / np.ptp(time) - 0.5)
+        taus.append((time - time.min()) / np.ptp(time) - 0.5)
     before = _at_rest(xyz[many], ring[many])
     if np.degrees(before) < BENT:
         return xyz
-    best = min(turns, key=lambda turn: _fit(xyz[few], ring[few], turn[few])[1])
+    best = min(taus, key=lambda tau: _fit(xyz[few], ring[few], tau[few])[1])
     path, after = _fit(xyz[many], ring[many], best[many])
     if after > BETTER * before:
         return xyz
@@ -46,15 +46,15 @@ def _at_rest(xyz: np.ndarray, ring: np.ndarray) -> float:
     return _within_rings(1 / rho[:, None], xyz[:, 2] / rho, ring)[1]
 
 
-def _fit(xyz: np.ndarray, ring: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, float]:
+def _fit(xyz: np.ndarray, ring: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, float]:
     """((2, 3) p and u in metres, robust residual of z / rho): five Gauss-Newton steps of robust least squares."""
     path, scale = np.zeros((2, 3)), 1.0
     for _ in range(5):
-        x, y, z = (xyz.astype(np.float64) - path[0] - turn[:, None] * path[1]).T
+        x, y, z = (xyz.astype(np.float64) - path[0] - tau[:, None] * path[1]).T
         rho = np.hypot(x, y)
         value = z / rho
         slope = np.stack([-value * x / rho**2, -value * y / rho**2, 1 / rho], axis=1)
-        step, scale = _within_rings(np.concatenate([slope, slope * turn[:, None]], axis=1), value, ring)
+        step, scale = _within_rings(np.concatenate([slope, slope * tau[:, None]], axis=1), value, ring)
         path = path + step.reshape(2, 3)
     return path, scale
 

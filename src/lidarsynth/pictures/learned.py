@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lidarsynth.lidar.learning import Learned
+from lidarsynth.lidar.learning import LearnedSensor
 from lidarsynth.pictures.colours import viridis
 from lidarsynth.pictures.figure import FAINT, INK, PAPER, panel
 
@@ -15,7 +15,7 @@ STRIP = 1200  # pixels
 BLOCKED = (214, 48, 49)
 
 
-def learned_figure(learned: Learned) -> np.ndarray:
+def learned_figure(learned: LearnedSensor) -> np.ndarray:
     """(H', W', 3) uint8: share of returns per ray with blocked ones red, and elevation and residual of every beam."""
     sensor = learned.sensor
     share = np.rint(viridis(learned.returned)).astype(np.uint8)

@@ -15,7 +15,7 @@ from lidarsynth.streets.areas import TODAY, Area, Density
 from lidarsynth.streets.ground import KERB, Ground, Road
 from lidarsynth.streets.layout import draw_area, fill
 from lidarsynth.streets.traffic import STEP, follow
-from lidarsynth.streets.world import REACH, TRAFFIC, WALK, Lot, World, assemble, draw_ground
+from lidarsynth.streets.world import REACH, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground
 
 MARGIN = 120.0  # m of street behind the start and beyond the end
 LONGEST = 4000.0  # m of street in one world
@@ -121,13 +121,13 @@ def _lane(road: Road) -> float:
 
 
 def _furnished(rng: np.random.Generator, ground: Ground, area: Area, lane: float, start: float) -> World:
-    road, lot = ground.roads[0], Lot(rng, ground, area)
+    road, builder = ground.roads[0], WorldBuilder(rng, ground, area)
     s = np.arange(start - 10, road.stop, 2.0)
     path = np.column_stack([s, np.full(s.shape, lane)])
-    fill(lot, path[5:6], path)
+    fill(builder, path[5:6], path)
     x, y, yaw = road.at(path[::5, 0], path[::5, 1])
     zero = np.zeros(len(x))
-    return assemble(lot, np.column_stack([x, y, ground.height(x, y), yaw, zero, zero]))
+    return assemble(builder, np.column_stack([x, y, ground.height(x, y), yaw, zero, zero]))
 
 
 def _set_off(

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarsynth.streets.areas import AREAS, TODAY, Area, Density
 from lidarsynth.streets.ground import KERB, Road
-from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, Lot, World, assemble, draw_ground, draw_poses
+from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground, draw_poses
 
 Array = np.ndarray
 
@@ -22,35 +22,35 @@ def build(rng: np.random.Generator, density: Density = TODAY) -> World:
     area = density.of(draw_area(rng))
     ground = draw_ground(rng, area)
     poses, places = draw_poses(rng, ground)
-    lot = Lot(rng, ground, area)
-    fill(lot, places)
-    return assemble(lot, poses)
+    builder = WorldBuilder(rng, ground, area)
+    fill(builder, places)
+    return assemble(builder, poses)
 
 
-def fill(lot: Lot, places: Array, lane: Array | None = None) -> None:
+def fill(builder: WorldBuilder, places: Array, lane: Array | None = None) -> None:
     """Everything of one world. places (16, 2): (s, d) of the poses on the main road, kept free.
 
     lane  (P, 2): (s, d) kept free of parked vehicles, if others
     """
-    closings(lot)
-    for number, road in enumerate(lot.ground.roads):
+    closings(builder)
+    for number, road in enumerate(builder.ground.roads):
         for side in (-1, 1):
-            fronts(lot, road, side)
-            gardens(lot, road, side)
-            kerbside(lot, road, side, main=number == 0)
-            backdrop(lot, road, side)
-            car_park(lot, road, side)
+            fronts(builder, road, side)
+            gardens(builder, road, side)
+            kerbside(builder, road, side, main=number == 0)
+            backdrop(builder, road, side)
+            car_park(builder, road, side)
             if number == 0:
-                parked(lot, road, side, places if lane is None else lane)
-                moving(lot, road, side, places)
+                parked(builder, road, side, places if lane is None else lane)
+                moving(builder, road, side, places)
 
 
-def _count(lot: Lot, per_100: float, road: Road) -> int:
-    return int(lot.rng.poisson(max(per_100, 0) * (road.stop - road.start) / 100))
+def _count(builder: WorldBuilder, per_100: float, road: Road) -> int:
+    return int(builder.rng.poisson(max(per_100, 0) * (road.stop - road.start) / 100))
 
 
-def _along(lot: Lot, road: Road, count: int) -> Array:
-    return lot.rng.uniform(road.start, road.stop, count)
+def _along(builder: WorldBuilder, road: Road, count: int) -> Array:
+    return builder.rng.uniform(road.start, road.stop, count)
 
 
 def _edge(road: Road) -> float:
@@ -58,9 +58,9 @@ def _edge(road: Road) -> float:
     return road.half + road.walk
 
 
-def fronts(lot: Lot, road: Road, side: int) -> None:
+def fronts(builder: WorldBuilder, road: Road, side: int) -> None:
     """Houses in a row: four walls each, doors and windows by `facades.py`; and what borders their lots."""
-    rng, area = lot.rng, lot.area
+    rng, area = builder.rng, builder.area
     count = int((road.stop - road.start) / (area.house[0] + area.gap[0]) + 2)
     length, gap = rng.uniform(*area.house, count), rng.uniform(*area.gap, count)
     start = road.start + np.cumsum(length + gap) - length
@@ -69,21 +69,28 @@ def fronts(lot: Lot, road: Road, side: int) -> None:
     depth = rng.uniform(8, 13, count)
     keep = (start + length < road.stop) & (rng.random(count) > area.vacant)
     near = _edge(road) + setback
-    _houses(lot, road, side, start[keep], length[keep], near[keep], depth[keep])
+    _houses(builder, road, side, start[keep], length[keep], near[keep], depth[keep])
     if base > 0.8:
-        _borders(lot, road, side, start, length + gap)
+        _borders(builder, road, side, start, length + gap)
     bays = keep & (rng.random(count) < 0.3)
     if bays.any():
         s = start[bays] + length[bays] * rng.uniform(0.1, 0.7, bays.sum())
         out = rng.uniform(0.3, 1.6, bays.sum())
-        _houses(lot, road, side, s, rng.uniform(1.2, 3.5, bays.sum()), near[bays] - out, out + 0.5)
+        _houses(builder, road, side, s, rng.uniform(1.2, 3.5, bays.sum()), near[bays] - out, out + 0.5)
 
 
 def _houses(
-    lot: Lot, road: Road, side: int, s: Array, length: Array, near: Array, depth: Array, across: bool = False
+    builder: WorldBuilder,
+    road: Road,
+    side: int,
+    s: Array,
+    length: Array,
+    near: Array,
+    depth: Array,
+    across: bool = False,
 ) -> None:
     """Boxes from (s, near) to (s + length, near + depth) beside a road; those on a carriageway are left out."""
-    rng, count = lot.rng, len(s)
+    rng, count = builder.rng, len(s)
     if not count:
         return
     far = near + depth
@@ -97,16 +104,16 @@ def _houses(
     fine = (0, 1, 2, 3, 4)
     edge_x = np.concatenate([x + (np.roll(x, -1, 1) - x) * k / 5 for k in fine], axis=1)
     edge_y = np.concatenate([y + (np.roll(y, -1, 1) - y) * k / 5 for k in fine], axis=1)
-    keep = across | (lot.ground.carriageway(edge_x, edge_y) > 0.7).all(axis=1)
+    keep = across | (builder.ground.carriageway(edge_x, edge_y) > 0.7).all(axis=1)
     tall = rng.uniform(5, 14, count)
-    rows = facade_rows(rng, lot.area.shops, count)
+    rows = facade_rows(rng, builder.area.shops, count)
     x, y, tall, rows = x[keep], y[keep], tall[keep], rows[keep]
     if len(x):
-        base = lot.ground.height(x.mean(axis=1), y.mean(axis=1))
-        _walls(lot, x, y, base, tall, rows)
+        base = builder.ground.height(x.mean(axis=1), y.mean(axis=1))
+        _walls(builder, x, y, base, tall, rows)
 
 
-def _walls(lot: Lot, x: Array, y: Array, base: Array, tall: Array, rows: Array) -> None:
+def _walls(builder: WorldBuilder, x: Array, y: Array, base: Array, tall: Array, rows: Array) -> None:
     """Walls around footprints x, y (N, 4); base, tall (N,) metres; rows (N, 12) facade parameters."""
     nx, ny = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
     low, high = np.broadcast_to((base - 2.5)[:, None], x.shape), np.broadcast_to((base + tall)[:, None], x.shape)
@@ -117,7 +124,7 @@ def _walls(lot: Lot, x: Array, y: Array, base: Array, tall: Array, rows: Array) 
     table = np.repeat(rows[:, None], 4, axis=1)
     table[..., 0], table[..., 1], table[..., 4] = x, y, base[:, None]
     table[..., 2], table[..., 3] = (nx - x) / size, (ny - y) / size
-    lot.walls.append((corners, table.reshape(-1, 12).astype(np.float32), "plaster", "building"))
+    builder.walls.append((corners, table.reshape(-1, 12).astype(np.float32), "plaster", "building"))
 
 
 def facade_rows(rng: np.random.Generator, shops: float, count: int) -> Array:
@@ -134,10 +141,10 @@ def facade_rows(rng: np.random.Generator, shops: float, count: int) -> Array:
     return rows
 
 
-def _borders(lot: Lot, road: Road, side: int, start: Array, length: Array) -> None:
+def _borders(builder: WorldBuilder, road: Road, side: int, start: Array, length: Array) -> None:
     """Wall, hedge or fence between the sidewalk and each lot, in pieces of two metres, with gates left open."""
-    rng = lot.rng
-    kind = rng.choice(4, p=np.array(lot.area.borders) / sum(lot.area.borders), size=len(start))
+    rng = builder.rng
+    kind = rng.choice(4, p=np.array(builder.area.borders) / sum(builder.area.borders), size=len(start))
     for code, name in ((0, "garden wall"), (1, "hedge"), (2, "fence")):
         for s0, far in zip(start[kind == code], length[kind == code], strict=True):
             s = np.arange(s0, s0 + far - 1, 2.0)
@@ -147,58 +154,58 @@ def _borders(lot: Lot, road: Road, side: int, start: Array, length: Array) -> No
             x, y, yaw = road.at(s, d)
             first = (int(rng.integers(0, 64)), rng.uniform(0.9, 1.1), rng.normal())
             wild = code == 1 and rng.random() < 0.45
-            lot.put_row("wild hedge" if wild else name, x, y, yaw, first)
+            builder.put_row("wild hedge" if wild else name, x, y, yaw, first)
 
 
-def gardens(lot: Lot, road: Road, side: int) -> None:
+def gardens(builder: WorldBuilder, road: Road, side: int) -> None:
     """Bushes and small trees between sidewalk and fronts, thickets and trees behind."""
-    rng, area = lot.rng, lot.area
+    rng, area = builder.rng, builder.area
     depth = max(area.setback[1], 3.0)
     for kind, share in (("bush", 0.65), ("young tree", 0.2), ("tree", 0.15)):
-        count = _count(lot, share * rng.uniform(*area.garden), road)
-        s = _along(lot, road, count)
+        count = _count(builder, share * rng.uniform(*area.garden), road)
+        s = _along(builder, road, count)
         d = side * (_edge(road) + 0.8 + rng.uniform(0, 1, count) * depth)
         x, y, _ = road.at(s, d)
-        lot.put(kind, x, y, rng.uniform(0, 6.28, count), clear=1.2, size=(0.6, 1.3))
+        builder.put(kind, x, y, rng.uniform(0, 6.28, count), clear=1.2, size=(0.6, 1.3))
 
 
-def backdrop(lot: Lot, road: Road, side: int) -> None:
+def backdrop(builder: WorldBuilder, road: Road, side: int) -> None:
     """What closes the view: thickets, trees and far houses."""
-    rng, area = lot.rng, lot.area
+    rng, area = builder.rng, builder.area
     for kind, share in (("thicket", 0.7), ("tree", 0.3)):
-        count = _count(lot, share * rng.uniform(*area.thicket), road)
+        count = _count(builder, share * rng.uniform(*area.thicket), road)
         x, y, _ = road.at(
-            _along(lot, road, count), side * (_edge(road) + area.setback[0] + 3 + rng.gamma(1.5, 12, count))
+            _along(builder, road, count), side * (_edge(road) + area.setback[0] + 3 + rng.gamma(1.5, 12, count))
         )
-        lot.put(kind, x, y, rng.uniform(0, 6.28, count), clear=3.5, size=(0.7, 1.5))
-    count = _count(lot, 18.0 * area.closed, road)
-    s = _along(lot, road, count)
+        builder.put(kind, x, y, rng.uniform(0, 6.28, count), clear=3.5, size=(0.7, 1.5))
+    count = _count(builder, 18.0 * area.closed, road)
+    s = _along(builder, road, count)
     near = _edge(road) + area.setback[1] + 8 + rng.uniform(0, 45, count)
-    _houses(lot, road, side, s, rng.uniform(10, 35, count), near, rng.uniform(8, 15, count))
+    _houses(builder, road, side, s, rng.uniform(10, 35, count), near, rng.uniform(8, 15, count))
 
 
-def closings(lot: Lot) -> None:
+def closings(builder: WorldBuilder) -> None:
     """What stands at the far ends of roads: a house where the road ends at another, a wood behind a bend."""
-    rng = lot.rng
-    for number, road in enumerate(lot.ground.roads):
+    rng = builder.rng
+    for number, road in enumerate(builder.ground.roads):
         for end in (road.start, road.stop):
             if end == 0:
                 continue
             place = np.sign(end) * rng.uniform(*((82, 125) if number == 0 else (30, 80)))
             place += np.sign(end) * (abs(end) - REACH[0]) if number == 0 else 0.0
-            if rng.random() < lot.area.closed:
+            if rng.random() < builder.area.closed:
                 length = rng.uniform(18, 40)
                 s = np.array([place if end > 0 else place - 12.0])
-                _houses(lot, road, 1, s, np.array([12.0]), np.array([-length / 2]), np.array([length]), across=True)
+                _houses(builder, road, 1, s, np.array([12.0]), np.array([-length / 2]), np.array([length]), across=True)
             elif rng.random() < 0.7:
-                count = round(rng.integers(4, 12) * lot.area.woods)
+                count = round(rng.integers(4, 12) * builder.area.woods)
                 x, y, _ = road.at(place + rng.normal(0, 6, count), rng.normal(0, 14, count))
-                lot.put("thicket", x, y, rng.uniform(0, 6.28, count), clear=None, size=(0.8, 1.5))
+                builder.put("thicket", x, y, rng.uniform(0, 6.28, count), clear=None, size=(0.8, 1.5))
 
 
-def car_park(lot: Lot, road: Road, side: int) -> None:
+def car_park(builder: WorldBuilder, road: Road, side: int) -> None:
     """Cars side by side off the street, and a crash barrier along wide roads."""
-    rng, area = lot.rng, lot.area
+    rng, area = builder.rng, builder.area
     if rng.random() < 0.5 * (area.setback[1] > 6) + 0.08:
         first, count = rng.uniform(road.start, road.stop), rng.integers(4, 18)
         s = first + 2.6 * np.arange(count) + rng.normal(0, 0.1, count)
@@ -206,18 +213,18 @@ def car_park(lot: Lot, road: Road, side: int) -> None:
         if len(s):
             d = side * (_edge(road) + rng.choice([3.2, 9.5])) + rng.normal(0, 0.2, len(s))
             turn = np.where(rng.random(len(s)) < 0.7, np.pi / 2, -np.pi / 2)
-            clear = lot.ground.carriageway(*road.at(s, d)[:2]) > 2.6
-            _vehicles(lot, road, s[clear], d[clear], turn[clear], 0.0)
+            clear = builder.ground.carriageway(*road.at(s, d)[:2]) > 2.6
+            _vehicles(builder, road, s[clear], d[clear], turn[clear], 0.0)
     if area.bank > 0.02 and road.half > 3 and rng.random() < 0.3:
         start = rng.uniform(road.start, 0)
         s = np.arange(start, rng.uniform(start + 20, max(road.stop, start + 20)), 2.0)
         x, y, yaw = road.at(s, np.full(s.shape, side * (road.half + 0.5)))
-        lot.put_row("guard rail", x, y, yaw if side > 0 else yaw + np.pi, (0, 1.0, rng.normal()))
+        builder.put_row("guard rail", x, y, yaw if side > 0 else yaw + np.pi, (0, 1.0, rng.normal()))
 
 
-def kerbside(lot: Lot, road: Road, side: int, main: bool) -> None:
+def kerbside(builder: WorldBuilder, road: Road, side: int, main: bool) -> None:
     """Trees, lamps, signs, bollards, bins, bicycles and people on or beside the sidewalk."""
-    rng, area = lot.rng, lot.area
+    rng, area = builder.rng, builder.area
     up = KERB if road.walk > 0 else 0.0
     strip = max(road.walk, 1.5)
     spacing = rng.uniform(*area.trees)
@@ -226,28 +233,28 @@ def kerbside(lot: Lot, road: Road, side: int, main: bool) -> None:
         s = np.arange(road.start + rng.uniform(0, step), road.stop, step)
         s = s + rng.normal(0, 0.5, len(s))
         x, y, _ = road.at(s, np.full(s.shape, side * (road.half + min(0.8, strip / 2))))
-        lot.put("tree", x, y, rng.uniform(0, 6.28, len(s)), up=up, size=(0.7, 1.2))
+        builder.put("tree", x, y, rng.uniform(0, 6.28, len(s)), up=up, size=(0.7, 1.2))
     for kind, rate, near, far in (
         ("lamp", area.lamps, 0.4, 0.7), ("sign", area.signs, 0.4, 0.9), ("bollard", area.signs * 0.7, 0.3, 0.5),
         ("bin", 1.2, strip * 0.6, strip), ("person", rng.uniform(*area.people), 0.4, strip),
         ("bicycle", rng.uniform(*area.bicycles), strip * 0.6, strip), ("bush", area.kerb_bushes, strip, strip + 1.5),
     ):  # fmt: skip
-        count = _count(lot, rate, road)
-        x, y, yaw = road.at(_along(lot, road, count), side * (road.half + rng.uniform(near, max(far, near), count)))
+        count = _count(builder, rate, road)
+        x, y, yaw = road.at(_along(builder, road, count), side * (road.half + rng.uniform(near, max(far, near), count)))
         if kind == "sign":  # plates look at the traffic of their side
             yaw = yaw + np.where(side < 0, np.pi, 0) + rng.normal(0, 0.25, count)
         elif kind != "bin":
             yaw = yaw + rng.uniform(0, 6.28, count)
-        lot.put(kind, x, y, yaw, up=up, clear=0.15, pace=WALK if kind == "person" else STILL)
+        builder.put(kind, x, y, yaw, up=up, clear=0.15, pace=WALK if kind == "person" else STILL)
     if main:
         count = rng.poisson(area.on_road)
-        x, y, yaw = road.at(_along(lot, road, count), rng.uniform(-road.half, road.half, count))
-        lot.put("person", x, y, rng.uniform(0, 6.28, count), clear=None, pace=WALK)
+        x, y, yaw = road.at(_along(builder, road, count), rng.uniform(-road.half, road.half, count))
+        builder.put("person", x, y, rng.uniform(0, 6.28, count), clear=None, pace=WALK)
 
 
-def parked(lot: Lot, road: Road, side: int, places: Array) -> None:
+def parked(builder: WorldBuilder, road: Road, side: int, places: Array) -> None:
     """Vehicles in the parking lane, bumper to bumper with gaps; sometimes half on the sidewalk where there is none."""
-    rng, area = lot.rng, lot.area
+    rng, area = builder.rng, builder.area
     width = road.parking[0 if side < 0 else 1]
     share = rng.uniform(*area.parked)
     up = 0.0
@@ -261,39 +268,46 @@ def parked(lot: Lot, road: Road, side: int, places: Array) -> None:
     free = np.ones(len(s), bool)
     for place in places:
         free &= (np.abs(s - place[0]) > 4.5) | (np.abs(d - place[1]) > 2.1)
-    free &= lot.ground.carriageway(*road.at(s, d)[:2], skip=0) > 2.5
+    free &= builder.ground.carriageway(*road.at(s, d)[:2], skip=0) > 2.5
     turn = np.where(rng.random(int(free.sum())) < 0.85, 0, np.pi) + (np.pi if side > 0 else 0)
-    _vehicles(lot, road, s[free], d[free], turn, up)
+    _vehicles(builder, road, s[free], d[free], turn, up)
 
 
-def moving(lot: Lot, road: Road, side: int, places: Array) -> None:
+def moving(builder: WorldBuilder, road: Road, side: int, places: Array) -> None:
     """Traffic in the lane of one side, never where a pose is."""
-    rng = lot.rng
-    count = _count(lot, rng.uniform(*lot.area.traffic), road)
+    rng = builder.rng
+    count = _count(builder, rng.uniform(*builder.area.traffic), road)
     lane = road.half - road.parking[0 if side < 0 else 1]
-    s = np.sort(_along(lot, road, count))
+    s = np.sort(_along(builder, road, count))
     s = s[np.diff(s, prepend=-1e9) > 8]
     d = side * lane / 2 + rng.normal(0, 0.2, len(s))
     free = np.ones(len(s), bool)
     for place in places:
         free &= (np.abs(s - place[0]) > 7.5) | (np.abs(d - place[1]) > 2.3)
-    for road_side in lot.ground.roads[1:]:  # poses turn at crossings
+    for road_side in builder.ground.roads[1:]:  # poses turn at crossings
         free &= np.hypot(*(np.array(road.at(s, d)[:2]) - [[road_side.x], [road_side.y]])) > 7
-    _vehicles(lot, road, s[free], d[free], np.full(int(free.sum()), np.pi if side > 0 else 0.0), 0.0, 0.12, TRAFFIC)
+    _vehicles(builder, road, s[free], d[free], np.full(int(free.sum()), np.pi if side > 0 else 0.0), 0.0, 0.12, TRAFFIC)
 
 
 def _vehicles(
-    lot: Lot, road: Road, s: Array, d: Array, turn: Array, up: float, two_wheels: float = 0.0, pace: int = STILL
+    builder: WorldBuilder,
+    road: Road,
+    s: Array,
+    d: Array,
+    heading: Array,
+    up: float,
+    two_wheels: float = 0.0,
+    pace: int = STILL,
 ) -> None:
-    rng = lot.rng
+    rng = builder.rng
     draw = rng.random(len(s))
     x, y, yaw = road.at(s, d)
-    yaw = yaw + turn + rng.normal(0, 0.02, len(s))
+    yaw = yaw + heading + rng.normal(0, 0.02, len(s))
     limits = {"bicyclist": two_wheels * 0.7, "motorcyclist": two_wheels, "bus": two_wheels * 1.4,
               "truck": two_wheels * 1.55 + 0.012, "van": two_wheels * 1.6 + 0.13, "car": 1.1}  # fmt: skip
     low = -1.0
     for kind, high in limits.items():
         chosen = (draw > low) & (draw <= high)
         if chosen.any():
-            lot.put(kind, x[chosen], y[chosen], yaw[chosen], up=up, clear=None, size=(0.96, 1.04), pace=pace)
+            builder.put(kind, x[chosen], y[chosen], yaw[chosen], up=up, clear=None, size=(0.96, 1.04), pace=pace)
         low = high

@@ -16,7 +16,7 @@ GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
 REACH = (150.0, 90.0)  # half size of the world in metres, x and y
 POSES = 16  # scans taken in one world
 STILL, TRAFFIC, WALK = 0, 1, 2  # how a thing moves once time passes
-THINGS = np.dtype([("kind", "U16"), ("variant", "i2"), ("row", "f8", 8), ("pace", "u1")])  # row as in `Lot`
+THINGS = np.dtype([("kind", "U16"), ("variant", "i2"), ("row", "f8", 8), ("pace", "u1")])  # row as in `WorldBuilder`
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class World:
 
 
 @dataclass
-class Lot:
+class WorldBuilder:
     """Collects what is placed: rows of (x, y, z, yaw, length, width, height scales, tint, pace) per kind and
     variant."""
 
@@ -156,25 +156,25 @@ def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndar
     return np.column_stack([x, y, ground.height(x, y), yaw, pitch, roll])
 
 
-def assemble(lot: Lot, poses: np.ndarray) -> World:
+def assemble(builder: WorldBuilder, poses: np.ndarray) -> World:
     """One soup of the ground, the sidewalks, the walls and the things."""
-    bare = ground_mesh(lot.ground, (lot.ground.roads[0].stop, REACH[1]), 4.0)
-    slab, kerb = slab_mesh(lot.ground)
+    bare = ground_mesh(builder.ground, (builder.ground.roads[0].stop, REACH[1]), 4.0)
+    slab, kerb = slab_mesh(builder.ground)
     columns = [_soup(bare, GROUND, "road", "road"), _soup(slab, SLAB, "sidewalk", "sidewalk")]
     columns[1]["material"][kerb] = NUMBER["kerb"]
     fronts = np.zeros((0, 12), np.float32)
-    for corners, rows, material, label in lot.walls:
+    for corners, rows, material, label in builder.walls:
         soup = _soup(corners, FRONT, material, label)
         soup["front"] = (np.repeat(np.arange(len(rows)), len(corners) // len(rows)) + len(fronts)).astype(np.int16)
         soup["tint"] = np.repeat(rows[:, 11], len(corners) // len(rows)).astype(np.float32)
         fronts = np.concatenate([fronts, rows])
         columns.append(soup)
-    placed = {key: np.concatenate(rows) for key, rows in lot.things.items()}
+    placed = {key: np.concatenate(rows) for key, rows in builder.things.items()}
     first = np.cumsum([0, *map(len, placed.values())])
     columns += [_instances(*key, rows, start) for (key, rows), start in zip(placed.items(), first, strict=False)]
     joined = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
     things = [(kind, variant, row[:8], row[8]) for (kind, variant), rows in placed.items() for row in rows]
-    return World(**joined, fronts=fronts, ground=lot.ground, poses=poses, things=np.array(things, THINGS))
+    return World(**joined, fronts=fronts, ground=builder.ground, poses=poses, things=np.array(things, THINGS))
 
 
 def visible(world: World, sensor: Sensor) -> World:

@@ -69,10 +69,10 @@ class Streets:
         return torch.stack([to_x_0(image, codec) for image in self.take(indices)])
 
 
-Learned = CachedImages | SeveralCaches | Streets  # what a network can learn from
+TrainingImages = CachedImages | SeveralCaches | Streets  # what a network can learn from
 
 
-def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> Learned:
+def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> TrainingImages:
     """The images of a cache folder, or streets of `seed` (default the experiment's) for `synthetic` and `virtual`.
 
     Several folders, with commas between them, are seen equally often. Raises ValueError when one is no cache.
@@ -91,7 +91,7 @@ def epoch_order(seed: int, epoch: int, length: int) -> Tensor:
     return torch.randperm(length, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
 
 
-def batch_indices(training: Training, step: int, images: Learned) -> list[int]:
+def batch_indices(training: Training, step: int, images: TrainingImages) -> list[int]:
     """Which images the global batch of step `step` holds: each epoch visits every image of a cache once."""
     if isinstance(images, Streets):
         return images.indices(step, training.batch_size)
@@ -106,7 +106,7 @@ class Examples(Dataset):
     `parts` is processes times passes of gradient accumulation. Raises ValueError unless it divides the batch size.
     """
 
-    def __init__(self, experiment: Experiment, images: Learned, parts: int, draw: Draw):
+    def __init__(self, experiment: Experiment, images: TrainingImages, parts: int, draw: Draw):
         size = experiment.training.batch_size
         if size % parts:
             raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")

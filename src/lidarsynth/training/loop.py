@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from lidarsynth.experiment.record import Experiment, Training
 from lidarsynth.networks.conditional import ConditionalUNet
-from lidarsynth.training.examples import Examples, Learned, Streets, load_batches
+from lidarsynth.training.examples import Examples, Streets, TrainingImages, load_batches
 from lidarsynth.training.machine import accelerator_of, fixed_randomness, workers_of
 from lidarsynth.training.options import Options
 from lidarsynth.training.task import Phase, Task
@@ -114,7 +114,7 @@ def update_ema(ema: nn.Module, network: nn.Module, decay: float, buffers: bool =
 def train(
     experiment: Experiment,
     run: Run,
-    images: Learned,
+    images: TrainingImages,
     options: Options | None = None,
     accelerator: Accelerator | None = None,
 ) -> Iterator[Progress]:
@@ -133,12 +133,12 @@ def train(
     if options.compile:
         # the U-Net only: interpolation of the known pixels has loops that depend on the data
         (run.product.unet if isinstance(run.product, ConditionalUNet) else run.product).compile()
-    turns = _prepare(accelerator, task.phases(experiment, run.network), run.optimizers)
+    phases = _prepare(accelerator, task.phases(experiment, run.network), run.optimizers)
     while run.step < training.steps:
         began = time.perf_counter()
         passes, waited = _fetch(accelerator, batches)
         rate = learning_rate(training, run.step)
-        losses, norm = _step(run.step, turns, passes, rate, training, accelerator, examples)
+        losses, norm = _step(run.step, phases, passes, rate, training, accelerator, examples)
         run.step += 1
         task.after(experiment, run.network, run.step, accelerator)
         if (decay := task.average(training, run.step)) is not None:
@@ -147,7 +147,7 @@ def train(
 
 
 def _batches(
-    experiment: Experiment, images: Learned, run: Run, options: Options, accelerator: Accelerator
+    experiment: Experiment, images: TrainingImages, run: Run, options: Options, accelerator: Accelerator
 ) -> tuple[Iterator[Any], Examples]:
     """This process's batches from the run's step on, one per pass, and what makes them."""
     parts = accelerator.num_processes * accelerator.gradient_accumulation_steps
@@ -158,7 +158,7 @@ def _batches(
     return load_batches(examples, run.step, own, workers, pinned), examples
 
 
-class _Turn(NamedTuple):
+class _PreparedPhase(NamedTuple):
     """A phase, with what accelerate made of its objective and optimiser."""
 
     objective: nn.Module
@@ -168,11 +168,11 @@ class _Turn(NamedTuple):
 
 def _prepare(
     accelerator: Accelerator, phases: Sequence[Phase], optimizers: dict[str, torch.optim.Optimizer]
-) -> list[_Turn]:
+) -> list[_PreparedPhase]:
     prepared = accelerator.prepare(*(phase.objective for phase in phases), *optimizers.values())
     wrapped = dict(zip(optimizers, prepared[len(phases) :], strict=True))
     return [
-        _Turn(objective, wrapped[phase.optimizer], phase.every)
+        _PreparedPhase(objective, wrapped[phase.optimizer], phase.every)
         for phase, objective in zip(phases, prepared[: len(phases)], strict=True)
     ]
 
@@ -189,7 +189,7 @@ def _fetch(accelerator: Accelerator, batches: Iterator[Any]) -> tuple[list[Any],
 
 def _step(
     step: int,
-    turns: list[_Turn],
+    phases: list[_PreparedPhase],
     passes: list[Any],
     rate: float,
     training: Training,
@@ -199,34 +199,34 @@ def _step(
     """All phases that are due, each with its optimiser's step; the sum and the parts of their losses, largest norm."""
     losses, norms = {"loss": 0.0}, []
     with fixed_randomness(training.seed, step, accelerator.process_index):  # of dropout and augmentations
-        for turn in turns:
-            if step % turn.every == 0:
-                found, norm = _turn(accelerator, turn, passes, rate, training.clip_norm)
+        for phase in phases:
+            if step % phase.every == 0:
+                found, norm = _gradients(accelerator, phase, passes, rate, training.clip_norm)
                 _check(step, found["loss"], norm, accelerator, examples)
-                turn.optimizer.step()
+                phase.optimizer.step()
                 losses = {**losses, **found, "loss": losses["loss"] + found["loss"]}
                 norms.append(norm)
     return losses, max(norms)
 
 
-def _turn(
-    accelerator: Accelerator, turn: _Turn, passes: list[Any], rate: float, clip_norm: float | None
+def _gradients(
+    accelerator: Accelerator, phase: _PreparedPhase, passes: list[Any], rate: float, clip_norm: float | None
 ) -> tuple[dict[str, float], float]:
     """Clipped gradients of one phase for one step's global batch; the mean of each part of its loss, and their norm."""
     sums: dict[str, Tensor] = {}
-    for group in turn.optimizer.param_groups:
+    for group in phase.optimizer.param_groups:
         group["lr"] = rate * group.get("factor", 1.0)
-    turn.optimizer.zero_grad()
+    phase.optimizer.zero_grad()
     for batch in passes:
-        with accelerator.accumulate(turn.objective):
-            losses = turn.objective(batch)
+        with accelerator.accumulate(phase.objective):
+            losses = phase.objective(batch)
             accelerator.backward(torch.cat([*losses.values()]).mean())
         for name, values in losses.items():
             part = torch.stack([values.detach().sum(), values.new_tensor(float(len(values)))])
             sums[name] = sums.get(name, 0) + part
     total = accelerator.reduce(torch.stack([*sums.values()]), reduction="sum")
     assert isinstance(total, Tensor)
-    parameters = [p for group in turn.optimizer.param_groups for p in group["params"]]
+    parameters = [p for group in phase.optimizer.param_groups for p in group["params"]]
     limit = math.inf if clip_norm is None else clip_norm
     norm = float(accelerator.clip_grad_norm_(parameters, limit))  # type: ignore[arg-type]
     parts = {name: (float(part[0]), float(part[1])) for name, part in zip(sums, total, strict=True)}

@@ -44,7 +44,7 @@ class Phase:
                is minimised. Its parameters are those that the optimiser changes: other networks it asks are not
                registered in it, so that a distributed wrapper of it is told all of its gradients
     optimizer  the key of the task's optimisers
-    every      steps from one turn to the next, the first at step 0
+    every      steps from one to the next, the first at step 0
     """
 
     objective: nn.Module
@@ -55,7 +55,7 @@ class Phase:
 Draw = Callable[[Experiment, Images, list[int], int, list[int]], Any]
 """(experiment, images, which of them, step, their positions in the global batch) -> a NamedTuple of tensors.
 
-All randomness of a sample is a function of (seed, step, position): `steps.sample_rng`.
+All randomness of a sample is a function of (seed, step, position): `randomness.sample_rng`.
 """
 
 

@@ -30,7 +30,7 @@ FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so m
 
 
 @dataclass(frozen=True)
-class Task:
+class Job:
     """What is done with every scan.
 
     verb       complete, upsample or project
@@ -95,42 +95,42 @@ class Result:
     cloud: Cloud | None = None
 
 
-def run(task: Task, works: Iterable[Work], workers: int = 1, model: ScanModel | None = None,
+def run(job: Job, works: Iterable[Work], workers: int = 1, model: ScanModel | None = None,
         on_step: OnStep = None) -> Iterator[Result]:  # fmt: skip
     """The results in order; a scan that fails comes as its error.
 
     workers  processes, each with a model of its own; below 2 the work is done here, with `model` if it is given
     """
-    yield from in_window(partial(start, task, model if workers < 2 else None, on_step, workers), works, workers)
+    yield from in_window(partial(start, job, model if workers < 2 else None, on_step, workers), works, workers)
 
 
-def start(task: Task, model: ScanModel | None, on_step: OnStep, workers: int) -> Callable[[Work], Result]:
+def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> Callable[[Work], Result]:
     """What one process does with each scan, its model loaded once."""
     if workers > 1:
         import torch
 
         torch.set_num_threads(1)
-    if task.verb != "project":
+    if job.verb != "project":
         if model is None:
             from lidarsynth.weights.load import load
 
-            model = load(task.model, device=task.device)
-        model = model.into(task.into) if task.into else model
-    return partial(_one, task, model, on_step)
+            model = load(job.model, device=job.device)
+        model = model.into(job.into) if job.into else model
+    return partial(_one, job, model, on_step)
 
 
-def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Result:
+def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Result:
     begun = time.perf_counter()
     try:
         loaded = work.item.read()
-        warning = _frame_warning(loaded, task, work) or _sensor_warning(loaded.scan, task, work, model)
-        done, note = _made(task, model, work.item.path, loaded.scan, on_step)
+        warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
+        done, note = _made(job, model, work.item.path, loaded.scan, on_step)
         cloud = None
         if work.target is None:
-            points = _points(done, loaded, task.transform)
+            points = _points(done, loaded, job.transform)
             cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, message_fields(points, loaded.given))
         else:
-            _store(work.target, done, loaded, task)
+            _store(work.target, done, loaded, job)
     except (ValueError, FloatingPointError) as error:
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, str(error))
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
@@ -139,42 +139,42 @@ def _one(task: Task, model: ScanModel | None, on_step: OnStep, work: Work) -> Re
     return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud)
 
 
-def _frame_warning(loaded: Loaded, task: Task, work: Work) -> str | None:
-    if not (work.check or task.strict):
+def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
+    if not (work.check or job.strict):
         return None
     frame = check_frame(loaded.scan)
     warning = frame.warning()
-    if warning is not None and frame.faults and task.strict:
+    if warning is not None and frame.faults and job.strict:
         raise ValueError(f"{work.item.path}: {warning}")
     return None if warning is None else f"{work.item.path}: {warning}"
 
 
-def _sensor_warning(scan: Scan, task: Task, work: Work, model: ScanModel | None) -> str | None:
+def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:
     """That a model of one sensor is asked to complete another's scan, in one line."""
-    if not work.check or task.verb != "complete" or model is None or model.any_sensor:
+    if not work.check or job.verb != "complete" or model is None or model.any_sensor:
         return None
     name, _ = recognise(scan, work.item.path)
     own = model.sensor.name
     if name is None or name.removesuffix("-kitti") == own.removesuffix("-kitti"):
         return None
-    return f"{work.item.path}: {task.model} knows {own} alone, and this is a scan of {name}; use --model default"
+    return f"{work.item.path}: {job.model} knows {own} alone, and this is a scan of {name}; use --model default"
 
 
 def _made(
-    task: Task, model: ScanModel | None, path: Path, scan: Scan, on_step: OnStep
+    job: Job, model: ScanModel | None, path: Path, scan: Scan, on_step: OnStep
 ) -> tuple[Filled | RangeImage, str]:
     """The result, and what was done in words."""
-    if task.verb == "project":
-        image = project(scan, named_sensor(scan, path, "--sensor", task.sensor), task.projection, task.width)
+    if job.verb == "project":
+        image = project(scan, named_sensor(scan, path, "--sensor", job.sensor), job.projection, job.width)
         if not image.mask.any():
             raise ValueError(f"{path}: expected points within {image.sensor.name}'s view, found none of {len(scan)}")
         return image, f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
     assert model is not None
-    if task.verb == "complete":
-        sensor = None if task.sensor is None else get_sensor(task.sensor)
-        return complete_scan(model, scan, task.corrupt, task.how, on_step, sensor), ""
-    sensor = named_sensor(scan, path, "--from", task.sensor)
-    filled = upsample_scan(model, scan, sensor, task.how, on_step, task.times)
+    if job.verb == "complete":
+        sensor = None if job.sensor is None else get_sensor(job.sensor)
+        return complete_scan(model, scan, job.corrupt, job.how, on_step, sensor), ""
+    sensor = named_sensor(scan, path, "--from", job.sensor)
+    filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
 
 
@@ -186,14 +186,14 @@ def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | N
     return back_in_place(done.points, loaded, transform)
 
 
-def _store(target: Path, done: Filled | RangeImage, loaded: Loaded, task: Task) -> None:
+def _store(target: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
         write(target, image)
     elif "new" in done.points.extra:
-        write(target, without_places(back_in_place(done.points, loaded, task.transform)))
+        write(target, without_places(back_in_place(done.points, loaded, job.transform)))
     else:
         write(target, without_places(done.points))
-    if task.picture:
+    if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())

@@ -272,8 +272,8 @@ def _matrix_file(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: expected 4 x 4 numbers, or the upper 3 x 4, found {numbers.size}")
     matrix = np.eye(4)
     matrix.reshape(-1)[: numbers.size] = numbers.reshape(-1)
-    turn = matrix[:3, :3]
-    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0):
+    rotation = matrix[:3, :3]
+    if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0):
         raise ValueError(f"{path}: expected a rotation and a shift, found a matrix that stretches or mirrors")
     return matrix
 

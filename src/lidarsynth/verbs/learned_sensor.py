@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
-from lidarsynth.lidar.learning import Learned, learn_sensor
+from lidarsynth.lidar.learning import LearnedSensor, learn_sensor
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.verbs.inputs import Input, Inputs
@@ -18,7 +18,7 @@ from lidarsynth.verbs.inputs import Input, Inputs
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
-def learn(inputs: Inputs, name: str) -> Learned:
+def learn(inputs: Inputs, name: str) -> LearnedSensor:
     """The sensor of at most ENOUGH of the inputs, evenly chosen. Broken ones are left out; else ValueError."""
     every = max(-(-(inputs.count or ENOUGH) // ENOUGH), 1)
     return learn_sensor(_readable(islice(inputs.stream(), 0, None, every)), name)
@@ -70,7 +70,7 @@ def _listed(key: str, words: list[str]) -> str:
     return f"{key} = [\n  " + ",\n  ".join(rows) + ",\n]"
 
 
-def summary(learned: Learned) -> str:
+def summary(learned: LearnedSensor) -> str:
     """Lines for people: what was found, and how well it fits."""
     sensor = learned.sensor
     residuals = np.array([ring.residual for ring in learned.rings])

@@ -20,7 +20,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import Learned, Streets, open_images
+from lidarsynth.training.examples import Streets, TrainingImages, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
@@ -97,7 +97,7 @@ def run(
 
 def _run(
     experiment: Experiment,
-    images: Learned,
+    images: TrainingImages,
     data: str | Path,
     out: Path,
     weights: str | None,
@@ -127,7 +127,7 @@ def _run(
 
 def _begin(
     experiment: Experiment,
-    images: Learned,
+    images: TrainingImages,
     out: Path,
     weights: str | None,
     resume: bool,
@@ -168,7 +168,7 @@ def _begin(
     return replace(experiment, card=card), state, note
 
 
-def _learned_from(images: Learned) -> str:
+def _learned_from(images: TrainingImages) -> str:
     """What a card says of the images: how many of what, and not where they lie on this disk."""
     count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
     details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]

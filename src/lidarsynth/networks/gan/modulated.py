@@ -58,8 +58,8 @@ class ModulatedConv1x1(nn.Module):
     StyleGAN3's order: normalise weight and style, modulate by 1 + style, demodulate, divide by the running root mean
     square `ema_var` of the input, which a forward pass in training mode updates first.
 
-    Features that all samples share, channels behind those of x, come as `shared` (1,C,H,W), with `turn` to change their
-    weights (B,out,C): one product for the whole batch, and no copy for each sample.
+    Features that all samples share, channels behind those of x, come as `shared` (1,C,H,W), with `rotate` to change
+    their weights (B,out,C): one product for the whole batch, and no copy for each sample.
     """
 
     ema_var: Tensor
@@ -79,7 +79,7 @@ class ModulatedConv1x1(nn.Module):
         x: Tensor | None,
         style: Tensor,
         shared: Tensor | None = None,
-        turn: Callable[[Tensor], Tensor] | None = None,
+        rotate: Callable[[Tensor], Tensor] | None = None,
     ) -> Tensor:
         parts = [part for part in (x, shared) if part is not None]
         channels = self.weight.shape[2]
@@ -93,7 +93,7 @@ class ModulatedConv1x1(nn.Module):
         if x is not None:
             y = weight[..., :own].to(x.dtype) @ x.flatten(2)
         if shared is not None:
-            common = weight[..., own:] if turn is None else turn(weight[..., own:])
+            common = weight[..., own:] if rotate is None else rotate(weight[..., own:])
             y = y + (common.flatten(0, 1).to(shared.dtype) @ shared[0].flatten(1)).unflatten(0, common.shape[:2])
         y = y.unflatten(2, parts[0].shape[2:])
         return y if self.bias is None else y + self.bias
@@ -161,8 +161,8 @@ class SynthesisBlock(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         x = None if h is None else self.resample(h)
         if len(angles) == 1:
-            turn = None if shift is None else partial(self.pe.turned, shift=shift)
-            x = self.conv1(x, styles[0], self.pe(angles), turn)
+            rotate = None if shift is None else partial(self.pe.turned, shift=shift)
+            x = self.conv1(x, styles[0], self.pe(angles), rotate)
         else:
             features = self.pe(angles if shift is None else turned(angles, shift))
             x = self.conv1(features if x is None else torch.cat([x, features.to(x.dtype)], dim=1), styles[0])

@@ -45,14 +45,14 @@ class Grids(NamedTuple):
     standing: Tensor  # (b, 16, 128) radians
 
 
-class Batch(NamedTuple):
+class CascadeBatch(NamedTuple):
     """One process's share of one pass."""
 
     crops: Crops
     grids: Grids
 
 
-def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
+def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> CascadeBatch:
     """The samples at `positions` of step `step`'s global batch: functions of (seed, step, position)."""
     taken, seed = images.take(indices), experiment.training.seed
     samples = generation_count(experiment.training, step)
@@ -64,7 +64,7 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     known, truth = ([torch.cat(part) for part in zip(*(c[i] for c in crops), strict=True)] for i in (0, 2))
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
-    return Batch(
+    return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], seeds, count),
         Grids(*(torch.stack(part) for part in zip(*grids, strict=True))),
     )

@@ -18,7 +18,7 @@ from lidarsynth.networks.coarse_unet import BINS, LOWEST, CoarseUNet
 from lidarsynth.networks.fill_unet import Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
-from lidarsynth.systems.cascade.examples import Batch, Crops, draw, grid
+from lidarsynth.systems.cascade.examples import CascadeBatch, Crops, draw, grid
 from lidarsynth.systems.cascade.model import BOUND, CascadeModel
 from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
@@ -35,7 +35,7 @@ class FillObjective(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
+    def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         n, crops = batch.crops.samples, batch.crops
         return {"sample": self._sample(crops, n), "median": self._median(crops, n)}
 
@@ -65,7 +65,7 @@ class CoarseObjective(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
+    def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         metres, reflectance, rays, standing = batch.grids
         x_0 = self.network.encode(metres, reflectance, standing)
         rngs = [sample_rng(seed, 1, 0) for seed in batch.crops.seeds]

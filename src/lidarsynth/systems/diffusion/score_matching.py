@@ -24,7 +24,7 @@ from lidarsynth.training.task import Images, Phase, Task, ema_due
 PICTURED = 20  # noise levels of the pictures drawn during training
 
 
-class Batch(NamedTuple):
+class ScoreBatch(NamedTuple):
     """One process's share of one pass: b samples."""
 
     x_0: Tensor  # (b, 2, H, W) in [-1, 1], augmented
@@ -40,12 +40,12 @@ class ScoreMatching(nn.Module):
         self.network = network
         self.denoiser = build_denoiser(experiment, network)
 
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
+    def forward(self, batch: ScoreBatch) -> dict[str, Tensor]:
         mean = self.denoiser.loss(batch.x_0, batch.t, batch.eps, gamma=math.inf)  # sigma^2 is this kind's plain weight
         return {"score": 0.5 * batch.x_0[0].numel() * mean}
 
 
-def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> Batch:
+def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> ScoreBatch:
     """The batch of clean images x_0 (b, 2, H, W) that stand at `positions` of step `step`'s global batch.
 
     Levels are drawn uniformly from those of the experiment's score group. Raises ValueError where there is none.
@@ -57,10 +57,12 @@ def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -
         level = torch.randint(score.levels, (), generator=rng)  # 0 = the noisiest
         x = augment(x, rng, data.roll, data.mirror)
         drawn.append((x, 1 - level / (score.levels - 1), torch.randn(x.shape, generator=rng)))
-    return Batch(*map(torch.stack, zip(*drawn, strict=True)))
+    return ScoreBatch(*map(torch.stack, zip(*drawn, strict=True)))
 
 
-def draw_images(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
+def draw_images(
+    experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]
+) -> ScoreBatch:
     """`draw` of images of a cache or of streets."""
     return draw(experiment, images.x_0(indices, experiment.data.codec), step, positions)
 

@@ -27,7 +27,7 @@ from lidarsynth.training.task import Images, Phase, Task
 MIXING, NOISE = 1, 2  # purposes of `sample_rng` and `sample_seed`
 
 
-class Batch(NamedTuple):
+class DiffusionBatch(NamedTuple):
     """One process's share of one pass: b samples, the first `generation` of which learn p(x_0), the rest completion."""
 
     x_0: Tensor  # (b, 2, H, W) in [-1, 1], augmented
@@ -61,7 +61,7 @@ class Objective(nn.Module):
         self.network = network
         self.denoiser = build_denoiser(experiment, network)
 
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
+    def forward(self, batch: DiffusionBatch) -> dict[str, Tensor]:
         n, noise = batch.generation, batch.eps
         losses = {"generation": batch.t[:0], "completion": batch.t[:0]}
         if n:
@@ -120,7 +120,7 @@ def generation_count(training: Training, step: int) -> int:
     return math.floor(wanted * (step + 1) + 1e-9) - math.floor(wanted * step + 1e-9)
 
 
-def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> Batch:
+def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -> DiffusionBatch:
     """The batch of clean images x_0 (b, 2, H, W) that stand at rising `positions` of step `step`'s global batch."""
     count, seed = generation_count(experiment.training, step), experiment.training.seed
     augmented, t, known = _augmented(experiment), torch.empty(len(x_0)), torch.zeros(x_0.shape, dtype=torch.bool)
@@ -136,7 +136,7 @@ def draw(experiment: Experiment, x_0: Tensor, step: int, positions: list[int]) -
         draw_time(sample_rng(seed, step, p), False) for p in range(count if experiment.diffusion.mean_weight else 0)
     ]
     seeds = tuple(sample_seed(seed, step, position, NOISE) for position in positions)
-    return Batch(clean, t, seeds, known, torch.tensor(times), sum(p < count for p in positions))
+    return DiffusionBatch(clean, t, seeds, known, torch.tensor(times), sum(p < count for p in positions))
 
 
 def hide(experiment: Experiment, x_0: Tensor, t: Tensor, known: Tensor, rng: torch.Generator) -> None:
@@ -147,7 +147,9 @@ def hide(experiment: Experiment, x_0: Tensor, t: Tensor, known: Tensor, rng: tor
         known.zero_()[:, ::EVERY] = True
 
 
-def draw_images(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
+def draw_images(
+    experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]
+) -> DiffusionBatch:
     """`draw` of images of a cache or of streets; those that learn completion are mixed by `data.mix`."""
     x_0 = images.x_0(indices, experiment.data.codec)
     if experiment.data.mix:

@@ -22,7 +22,7 @@ class Latents(NamedTuple):
 
     z: Tensor  # (b, Z) unit Gaussian
     uniform: Tensor  # (b, 1, H, W) in [0, 1), of the ray-drop
-    shift: Tensor  # (b,) in [0, 1), turns of DUSty v2's angles
+    shift: Tensor  # (b,) in [0, 1), share of a turn by which DUSty v2's angles are rotated
 
 
 class View(NamedTuple):
@@ -32,13 +32,13 @@ class View(NamedTuple):
     dice: Dice  # of the augmentation
 
 
-class Batch(NamedTuple):
+class AdversarialBatch(NamedTuple):
     """One process's share of one pass: b samples. What a step does not need is there all the same, for order's sake."""
 
     real: Tensor  # (b, 1, H, W) in [-1, 1]
-    latents: Latents  # of the generator's turn
+    latents: Latents  # of the generator's phase
     view: View
-    others: Latents  # of the discriminator's turn
+    fake_latents: Latents  # of the discriminator's phase
     fake_view: View
     real_view: View
     penalty_view: View  # of R1
@@ -50,7 +50,9 @@ def group_of(experiment: Experiment) -> Adversarial:
     return experiment.adversarial or Adversarial()
 
 
-def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Batch:
+def draw(
+    experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]
+) -> AdversarialBatch:
     """The batch of images `indices` that stand at rising `positions` of step `step`'s global batch."""
     x_0, data, group = images.x_0(indices, experiment.data.codec)[:, :1], experiment.data, group_of(experiment)
     drop = warmup_drop(group, step * experiment.training.batch_size)
@@ -61,7 +63,7 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
         first, second = (_latents(experiment, real.shape, rng) for _ in range(2))
         shows = [_view(real.shape, drop, rng) for _ in range(4)]
         noise = torch.randn(real.shape if group.path_length_weight else (1, 1, 1), generator=rng)
-        samples.append(Batch(real, first, shows[0], second, shows[1], shows[2], shows[3], noise))
+        samples.append(AdversarialBatch(real, first, shows[0], second, shows[1], shows[2], shows[3], noise))
     return _stack(samples)
 
 

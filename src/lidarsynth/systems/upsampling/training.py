@@ -29,14 +29,14 @@ from lidarsynth.training.randomness import augment, sample_rng
 from lidarsynth.training.task import Images, Phase, Task
 
 
-class Pair(NamedTuple):
+class PairBatch(NamedTuple):
     """What a step of LiDAR-SR sees: ranges in [0, 1], the lowest beam first."""
 
     low: Tensor  # (b, 1, h, w)
     high: Tensor  # (b, 1, H, W)
 
 
-class Asked(NamedTuple):
+class QueryBatch(NamedTuple):
     """What a step of ILN or LIIF sees: ranges in [-1, 1], the lowest beam first."""
 
     low: Tensor  # (b, 1, h, w)
@@ -44,14 +44,18 @@ class Asked(NamedTuple):
     ranges: Tensor  # (b, Q)
 
 
-def draw_pairs(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Pair:
+def draw_pairs(
+    experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]
+) -> PairBatch:
     """Images at full height, and every `factor`-th row of them."""
     pairs = [_pair(experiment, image, rng) for image, rng in _drawn(experiment, images, indices, step, positions)]
     low, high = zip(*pairs, strict=True)
-    return Pair(torch.stack(low), torch.stack(high))
+    return PairBatch(torch.stack(low), torch.stack(high))
 
 
-def draw_queries(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> Asked:
+def draw_queries(
+    experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]
+) -> QueryBatch:
     """Every `factor`-th row of images, and `queries` of their pixels, none twice."""
     group, sensor = _group(experiment), build_sensor(experiment)
     beams = np.asarray(sensor.elevations)[group.first :: group.factor[0]]
@@ -63,7 +67,7 @@ def draw_queries(experiment: Experiment, images: Images, indices: list[int], ste
         low, high = _pair(experiment, image, rng)
         chosen = torch.randperm(len(queries), generator=rng)[:count]
         drawn.append((2 * low - 1, queries[chosen], 2 * high.flip(1).flatten()[chosen] - 1))
-    return Asked(*map(torch.stack, zip(*drawn, strict=True)))
+    return QueryBatch(*map(torch.stack, zip(*drawn, strict=True)))
 
 
 def _drawn(
@@ -85,27 +89,27 @@ def _pair(experiment: Experiment, image: RangeImage, rng: torch.Generator) -> tu
 
 
 class PairObjective(nn.Module):
-    """`objective(pair)` -> mean absolute error (b,) of all pixels, in [-1, 1] (ILN's repository) or [0, 1] (Keras)."""
+    """`objective(batch)` -> mean absolute error (b,) of all pixels, in [-1, 1] (ILN's repository) or [0, 1] (Keras)."""
 
     def __init__(self, experiment: Experiment, network: LidarSR):
         super().__init__()
         self.network = network
         self.range = 1 if _group(experiment).keras else 2
 
-    def forward(self, pair: Pair) -> dict[str, Tensor]:
-        error = (self.network(pair.low).float() - pair.high).abs()
+    def forward(self, batch: PairBatch) -> dict[str, Tensor]:
+        error = (self.network(batch.low).float() - batch.high).abs()
         return {"range": self.range * error.mean(dim=(1, 2, 3))}
 
 
-class AskedObjective(nn.Module):
-    """`objective(asked)` -> mean absolute error (b,) of the asked pixels, in [-1, 1]."""
+class QueryObjective(nn.Module):
+    """`objective(batch)` -> mean absolute error (b,) of the queried pixels, in [-1, 1]."""
 
     def __init__(self, network: ILN | LIIF):
         super().__init__()
         self.network = network
 
-    def forward(self, asked: Asked) -> dict[str, Tensor]:
-        return {"range": (self.network(asked.low, asked.queries).float() - asked.ranges).abs().mean(dim=1)}
+    def forward(self, batch: QueryBatch) -> dict[str, Tensor]:
+        return {"range": (self.network(batch.low, batch.queries).float() - batch.ranges).abs().mean(dim=1)}
 
 
 def judge(experiment: Experiment, network: nn.Module, images: Sequence[RangeImage]) -> dict[str, float]:
@@ -156,7 +160,7 @@ def _phases(experiment: Experiment, network: nn.Module) -> tuple[Phase]:
     if isinstance(network, LidarSR):
         return (Phase(PairObjective(experiment, network)),)
     assert isinstance(network, ILN | LIIF)
-    return (Phase(AskedObjective(network)),)
+    return (Phase(QueryObjective(network)),)
 
 
 LIDAR_SR = Task(parts=("range",), draw=draw_pairs, phases=_phases, judge=judge, pictures=pictures)

@@ -1,4 +1,4 @@
-"""What all methods of one benchmark share: the folder, the models, the networks that judge, how progress is told."""
+"""The setup of a benchmark, which all of its methods share: folder, models, networks that judge, progress."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ Load = Callable[[str], ScanModel]
 
 
 @dataclass(frozen=True)
-class Contest:
-    """The methods' common ground.
+class Setup:
+    """What all methods of one benchmark share.
 
-    folder       where scans, streets and results go
-    models       word of the benchmark's file -> the model
-    prints       word -> what its weights and settings are, 16 hex digits
-    classes      a RangeNet of the user's own for the classes of pixels, or none
-    batch_size   scans at once, where a GPU makes them
+    folder        where scans, streets and results go
+    models        word of the benchmark's file -> the model
+    fingerprints  word -> what its weights and settings are, 16 hex digits
+    classes       a RangeNet of the user's own for the classes of pixels, or none
+    batch_size    scans at once, where a GPU makes them
     """
 
     folder: Path
     models: Mapping[str, ScanModel]
-    prints: Mapping[str, str]
+    fingerprints: Mapping[str, str]
     classes: Loaded | None = None
     device: str = "cpu"
     batch_size: int = 1
@@ -48,7 +48,7 @@ class Contest:
         """What decides a method's scans: its own settings, the model, the device, the version of the program."""
         told = {key: vars(method)[key] for key in keys if vars(method)[key] not in (None, False)}
         if method.model is not None:
-            told |= {"model": method.model, "fingerprint": self.prints[method.model]}
+            told |= {"model": method.model, "fingerprint": self.fingerprints[method.model]}
         return told | {"device": self.device, "lidarsynth": version("lidarsynth")}
 
     def store(self, word: str, settings: Mapping[str, Any]) -> Store:
@@ -68,7 +68,7 @@ class Contest:
         return replace(loaded, missing={kind: f"no weights of {kind}: --classes names them" for kind in loaded.missing})
 
 
-def open_contest(
+def open_setup(
     config: Upsampling | Generation,
     folder: Path,
     load: Load,
@@ -76,7 +76,7 @@ def open_contest(
     device: str = "cpu",
     batch_size: int = 1,
     on_images: OnImages = None,
-) -> Contest:
+) -> Setup:
     """Load every model once, so that a word that is none is told before the first scan. Raises ValueError."""
     pairs = isinstance(config, Upsampling)
     for name in protocols_of(config):
@@ -85,9 +85,9 @@ def open_contest(
                              f"found {name}")  # fmt: skip
     words = dict.fromkeys(method.model for method in config.method if method.model)
     models = {word: load(word) for word in words}
-    prints = {word: fingerprint(model) for word, model in models.items()}
+    fingerprints = {word: fingerprint(model) for word, model in models.items()}
     judge = None if classes is None else read_classes(classes, device)
-    return Contest(folder, models, prints, judge, device, batch_size, on_images)
+    return Setup(folder, models, fingerprints, judge, device, batch_size, on_images)
 
 
 def read_classes(path: Path, device: str = "cpu") -> Loaded:

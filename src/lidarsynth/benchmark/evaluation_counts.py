@@ -1,14 +1,9 @@
-"""What a benchmark has to know of a model beyond what it makes."""
+"""How often a model evaluates its network for one scan, the cost that the papers compare."""
 
 from __future__ import annotations
 
 from lidarsynth.benchmark.config import GenerationMethod, UpsamplingMethod
 from lidarsynth.systems.scan_model import ScanModel
-
-
-def has_reflectance(model: ScanModel) -> bool:
-    """Whether the reflectance of its scans means anything."""
-    return model.experiment.data.reflectance
 
 
 def completion_evaluations(model: ScanModel, method: UpsamplingMethod) -> int:
