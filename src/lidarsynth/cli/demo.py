@@ -28,6 +28,24 @@ def demo(
     complete([street], out / "beams.ply", "beams:4", model, seed=seed)
     complete([street], out / "sector.ply", "sector:90", model, seed=seed)
     complete([out / "sixteen_beams.pcd"], out / "dense.ply", model=model, seed=seed)
+    say(f"wrote {_view(out, street)}: the four results in the browser")
     info(model)
     made = sorted(path for path in out.rglob("*") if path.is_file())
     say("\n".join([f"\n{len(made)} files in {out}/, look at the pictures:", *(f"  {path}" for path in made)]))
+
+
+def _view(out: Path, street: Path) -> Path:
+    """One page of what was generated and completed, to be opened in any browser."""
+    from lidarsynth.viewer.beside import read_shown
+    from lidarsynth.viewer.page import Entry, write_page
+
+    dense = {"completed": out / "dense.ply", "sixteen beams": out / "sixteen_beams.pcd", "truth": street}
+    stops = [(path.stem, {"generated": path}) for path in sorted((out / "generated").glob("*.ply"))]
+    stops += [
+        ("every fourth beam", {"completed": out / "beams.ply", "truth": street}),
+        ("without a sector", {"completed": out / "sector.ply", "truth": street}),
+        ("sixteen beams", dense),
+    ]
+    path = out / "view.html"
+    write_page(path, "demo", (Entry(name, {c: read_shown(p) for c, p in of.items()}) for name, of in stops))
+    return path

@@ -18,6 +18,7 @@ from lidarsynth.cli.streets import streets
 from lidarsynth.cli.terminal import answer
 from lidarsynth.cli.train import train
 from lidarsynth.cli.upsample import upsample
+from lidarsynth.cli.view import view
 
 VERBS = {
     "demo": demo,
@@ -25,6 +26,7 @@ VERBS = {
     "complete": complete,
     "upsample": upsample,
     "project": project,
+    "view": view,
     "sensor": sensor,
     "data": data,
     "streets": streets,

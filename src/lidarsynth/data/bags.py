@@ -72,12 +72,12 @@ class Bag:
     path: Path
     topics: tuple[Topic, ...]
     seconds: float
-    source: Callable[[frozenset[str]], Iterator[Message]]
+    source: Callable[[frozenset[str], int], Iterator[Message]]
 
-    def messages(self, names: frozenset[str] = frozenset()) -> Iterator[Message]:
-        """Messages in the order of their times. Raises FileError where the bag is broken."""
+    def messages(self, names: frozenset[str] = frozenset(), start: int = 0) -> Iterator[Message]:
+        """Messages in the order of their times, from `start` (nanoseconds) on. Raises FileError for a broken bag."""
         with naming(self.path):
-            yield from self.source(names)
+            yield from self.source(names, start)
 
     def clouds(self, topic: str) -> Iterator[Cloud | FileError]:
         """The point clouds of a topic, one at a time; a broken one comes as its error, and the next follow."""
@@ -160,9 +160,9 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
     with (Reader1 if first else Reader2)(path) as reader:
         topics = {c.id: _topic(c, "ros1" if first else "cdr") for c in reader.connections}
 
-        def messages(names: frozenset[str]) -> Iterator[Message]:
+        def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             chosen = [c for c in reader.connections if not names or c.topic in names]
-            for connection, time, data in reader.messages(connections=chosen):  # type: ignore[arg-type]
+            for connection, time, data in reader.messages(connections=chosen, start=start or None):  # type: ignore[arg-type]
                 yield Message(topics[connection.id], time, bytes(data))
 
         duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
@@ -189,9 +189,9 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
                 more = topic.count if before is not topic else 0
                 topics[topic.name] = replace(before, count=before.count + more)
 
-        def messages(names: frozenset[str]) -> Iterator[Message]:
+        def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             for stream in streams:
-                yield from _mcap_messages(stream, names, topics)
+                yield from _mcap_messages(stream, names, topics, start)
 
         yield Bag(path, tuple(topics.values()), sum(seconds for _, seconds in parts), messages)
 
@@ -225,12 +225,12 @@ def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
     return Topic(channel.topic, kind, channel.message_encoding, text, count)
 
 
-def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, Topic]) -> Iterator[Message]:
+def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
     from mcap.reader import make_reader
 
     stream.seek(0)
     reader = make_reader(stream)
-    for _, channel, message in reader.iter_messages(topics=sorted(names) or None):
+    for _, channel, message in reader.iter_messages(topics=sorted(names) or None, start_time=start or None):
         yield Message(topics[channel.topic], message.log_time, message.data)
 
 

@@ -1,0 +1,79 @@
+"""A scan as the bytes that the page draws: a JSON header, then one block per field, little-endian.
+
+4 bytes "LSV1", uint32 length of the header, the header, then the blocks that it lists by name, type and count.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.viewer.rows import rows_of
+
+MAGIC = b"LSV1"
+FINE = 0.01  # metres: positions are whole numbers of 16 bits while their step is below this
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the page shows of one scan.
+
+    boxes  records with kind, centre, size, yaw and, where known, velocity, as `lidarsynth streets` writes them
+    notes  lines of what the viewer should say about it
+    """
+
+    scan: Scan
+    boxes: Sequence[Mapping[str, Any]] = ()
+    notes: tuple[str, ...] = ()
+
+
+def packed(shown: Shown) -> bytes:
+    """The scan's bytes: xyz in steps of 1/32767 of the farthest coordinate (under 1 cm), fields of one byte a point."""
+    scan, rows = shown.scan, rows_of(shown.scan)
+    xyz, step = _positions(scan.xyz)
+    blocks = {"xyz": xyz, "row": rows.row.astype("<i2"), **_fields(scan)}
+    header = {
+        "points": len(scan),
+        "step": step,
+        "strip": {"height": rows.height, "width": rows.width, "origin": rows.origin},
+        "blocks": [{"name": name, "type": values.dtype.str[1:], "count": values.size}
+                   for name, values in blocks.items()],
+        "boxes": list(shown.boxes),
+        "notes": list(shown.notes),
+    }  # fmt: skip
+    text = json.dumps(header, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    padded = (values.tobytes() + b"\0" * (-values.nbytes % 4) for values in blocks.values())
+    return b"".join([MAGIC, struct.pack("<I", len(text)), text, *padded])
+
+
+def _positions(xyz: np.ndarray) -> tuple[np.ndarray, float]:
+    farthest = float(np.abs(xyz).max(initial=0.0))
+    step = max(farthest, 1.0) / 32767
+    if step > FINE:
+        return xyz.astype("<f4"), 1.0
+    return np.rint(xyz / np.float64(step)).astype("<i2"), step
+
+
+def _fields(scan: Scan) -> dict[str, np.ndarray]:
+    """The fields that colours are made of: reflectance and confidence in 255 steps, class, and new as 0 or 1."""
+    fields: dict[str, np.ndarray] = {}
+    if scan.reflectance.any():
+        fields["reflectance"] = _in_255(scan.reflectance)
+    if scan.label is not None:
+        fields["label"] = scan.label.astype(np.uint8)
+    if (new := scan.extra.get("new")) is not None:
+        fields["new"] = (np.asarray(new) > 0).astype(np.uint8)
+    if (confidence := scan.extra.get("confidence")) is not None:
+        fields["confidence"] = _in_255(confidence)
+    return fields
+
+
+def _in_255(values: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1) * 255).astype(np.uint8)

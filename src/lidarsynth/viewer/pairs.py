@@ -1,0 +1,62 @@
+"""A scan and what it is compared with: series whose scan i belong together, and the stops of the page made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from lidarsynth.verbs.inputs import Reading
+from lidarsynth.viewer.page import Entry
+from lidarsynth.viewer.series import Files, Series, series_of
+
+MOST = 48  # scans in one file; every one is about a megabyte
+
+
+def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dict[str, Series]:
+    """Series by caption: the scans, and those of `other`, joined by name where all have a partner, else by number.
+
+    Raises ValueError where there is nothing to show, or the two differ in number.
+    """
+    scans = series_of(paths, reading)
+    if other is None:
+        return {_caption(paths): scans}
+    partners = series_of([other], reading)
+    if isinstance(scans, Files) and isinstance(partners, Files):
+        partners = _by_name(scans, partners)
+    if None not in (scans.count, partners.count) and scans.count != partners.count:
+        raise ValueError(
+            f"{other}: expected {scans.count} scans to compare, or one of each name, found {partners.count}"
+        )
+    first, second = _caption(paths), _caption([other])
+    return {first: scans, second if second != first else str(other): partners}
+
+
+def _caption(paths: Sequence[Path]) -> str:
+    return paths[0].absolute().name if len(paths) == 1 else f"{len(paths)} scans"
+
+
+def _by_name(scans: Files, partners: Files) -> Files:
+    """The partners in the scans' order, where every scan has one of its name; else as they are."""
+    place = {name: i for i, name in enumerate(partners.names)}
+    if not all(name in place for name in scans.names):
+        return partners
+    order = [place[name] for name in scans.names]
+    return Files(scans.names, [partners.paths[i] for i in order], partners.reading)
+
+
+def entries(series: Mapping[str, Series]) -> Iterator[Entry]:
+    """Every stop with its scans. Raises ValueError beyond MOST scans, and what reading one does."""
+    first = next(iter(series.values()))
+    if (first.count or 0) * len(series) > MOST:
+        raise ValueError(f"expected at most {MOST} scans for one file, found {(first.count or 0) * len(series)}; name "
+                         "fewer, or leave out --out")  # fmt: skip
+    number = 0
+    while first.count is None or number < first.count:
+        try:
+            versions = {caption: scans[number] for caption, scans in series.items()}
+        except IndexError:
+            return
+        number += 1
+        if number * len(series) > MOST:
+            raise ValueError(f"expected at most {MOST} scans for one file, found more; name fewer, or leave out --out")
+        yield Entry(first.names[number - 1], versions)

@@ -1,0 +1,133 @@
+"""Scans by number, read when asked for: files of a folder, messages of a bag, turns of a capture."""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+from lidarsynth.data.bags import is_bag, open_bag
+from lidarsynth.data.folder import scan_files
+from lidarsynth.lidar.frame import transformed
+from lidarsynth.verbs.inputs import Input, MessageInput, Reading, inputs_of, is_stream
+from lidarsynth.viewer.beside import read_shown
+from lidarsynth.viewer.packing import Shown
+
+SCAN_FOLDERS = ("velodyne", "LIDAR_TOP")  # of data sets that have other files of the same ending beside their scans
+
+
+class Series(Protocol):
+    """Scans by number: `series[i] -> Shown`, IndexError behind the last; ValueError where that scan is broken.
+
+    names  of those known so far; count: how many there are, or None where only reading tells
+    """
+
+    @property
+    def names(self) -> Sequence[str]: ...
+    @property
+    def count(self) -> int | None: ...
+    def __getitem__(self, index: int, /) -> Shown: ...
+
+
+class Files:
+    """Scan files, with what lies beside them."""
+
+    def __init__(self, names: Sequence[str], paths: Sequence[Path], reading: Reading):
+        self.names, self.paths, self.reading = list(names), list(paths), reading
+
+    @property
+    def count(self) -> int:
+        """How many files."""
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> Shown:
+        shown = read_shown(self.paths[index], self.reading.intensity)
+        if self.reading.transform is None:
+            return shown
+        moved = transformed(shown.scan.xyz, self.reading.transform)
+        notes = (*shown.notes, "boxes left out: they belong to the frame before --transform") if shown.boxes else ()
+        return replace(shown, scan=replace(shown.scan, xyz=moved), boxes=(), notes=notes or shown.notes)
+
+
+Opener = Callable[[int, int], Iterator[tuple[int, Input]]]
+
+
+class Stream:
+    """Scans that come one after the other, one held at a time; going back starts again at a mark on the way.
+
+    open_at  (mark, number) -> (mark, scan) of all scans from that mark on, the first of which is scan `number`; marks
+             never fall: times of messages, or all 0 where one must start anew
+    count    how many there are, or None
+    """
+
+    def __init__(self, open_at: Opener, count: int | None):
+        self.open_at, self.count = open_at, count
+        self.names: list[str] = []
+        self._marks: list[int] = []
+        self._lock = threading.Lock()
+        self._stream: Iterator[tuple[int, Input]] | None = None
+        self._next = 0  # what the stream gives next
+
+    def __getitem__(self, index: int) -> Shown:
+        with self._lock:
+            item = self._at(index)
+        loaded = item.read()
+        dropped = (f"{loaded.dropped} points without a return or not finite were dropped",) if loaded.dropped else ()
+        return Shown(loaded.scan, notes=dropped)
+
+    def _at(self, index: int) -> Input:
+        if index < 0:
+            raise IndexError(index)
+        mark = self._marks[min(index, len(self._marks) - 1)] if self._marks else 0
+        start = bisect_left(self._marks, mark)  # the first scan of that mark
+        if self._stream is None or index < self._next or start > self._next:
+            self._stream, self._next = self.open_at(mark, start), start
+        for mark, item in self._stream:
+            if self._next == len(self._marks):
+                self._marks.append(mark)
+                self.names.append(item.name)
+            self._next += 1
+            if self._next == index + 1:
+                return item
+        self.count, self._stream = len(self._marks), None
+        raise IndexError(index)
+
+
+def series_of(paths: Sequence[Path], reading: Reading) -> Series:
+    """The scans of files, folders, globs, bags and captures. Raises ValueError where there is nothing to show."""
+    if len(paths) == 1 and is_bag(paths[0]):
+        return _bag(paths[0], reading)
+    inputs = inputs_of([found for path in paths for found in _scans_only(path)], reading)
+    if any(is_stream(path) for path in paths) or inputs.count is None:
+        return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count)
+    items = list(inputs.stream())
+    if any(is_stream(item.path) for item in items):
+        return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count)
+    return Files([item.name for item in items], [item.path for item in items], reading)
+
+
+def _scans_only(path: Path) -> list[Path]:
+    """A data set's scans without its other files of the same ending, by name; any other path as it is."""
+    if not path.is_dir() or is_bag(path):
+        return [path]
+    try:
+        found = [p for p in scan_files(path) if p.parent.name in SCAN_FOLDERS]
+    except ValueError:
+        return [path]  # a folder of bags, or of nothing
+    return sorted(found, key=lambda p: (p.parent.parent if p.parent.name == "velodyne" else path, p.name)) or [path]
+
+
+def _bag(path: Path, reading: Reading) -> Stream:
+    with open_bag(path) as bag:
+        topic = bag.point_topic(reading.topic)
+        count = sum(t.count for t in bag.topics if t.name == topic) or None
+
+    def open_at(mark: int, number: int) -> Iterator[tuple[int, Input]]:
+        with open_bag(path) as bag:
+            for place, message in enumerate(bag.messages(frozenset([topic]), mark), number):
+                yield message.time, MessageInput(f"{path.stem}/{place:06d}", path, reading, message)
+
+    return Stream(open_at, count)

@@ -1,0 +1,56 @@
+// Where scans come from: the local server, or elements of this very file. Both give the same bytes.
+
+const KEPT = 6; // scans that stay decoded, so that going back and forth is instant
+
+class Source {
+  constructor(settings) {
+    this.entries = settings.entries || null;
+    this.names = settings.names || this.entries.map((entry) => entry.name);
+    this.count = this.entries ? this.entries.length : settings.count; // null: only reading tells
+    this.both = settings.captions;
+    this.kept = new Map();
+  }
+
+  captions(number) { return this.entries ? this.entries[number].captions : this.both; }
+  name(number) { return this.names[number] || `scan ${number}`; }
+
+  // How far the slider may go as far as is known.
+  reach(number) { return this.count === null ? Math.max(this.names.length, number + 2) : this.count; }
+
+  async load(number, version) {
+    const key = `${number}/${version}`;
+    if (!this.kept.has(key)) this.kept.set(key, this.read(number, version));
+    const scan = this.kept.get(key);
+    this.kept.delete(key);
+    this.kept.set(key, scan); // the last used is the last to go
+    while (this.kept.size > 2 * KEPT) this.kept.delete(this.kept.keys().next().value);
+    try {
+      return await scan;
+    } catch (error) {
+      this.kept.delete(key);
+      throw error;
+    }
+  }
+
+  async read(number, version) {
+    return decode(await (this.entries ? this.inside(number, version) : this.served(number, version)));
+  }
+
+  async inside(number, version) {
+    const text = document.getElementById(`scan-${number}-${version}`).textContent;
+    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+  }
+
+  async served(number, version) {
+    const response = await fetch(`scan/${number}/${version}`);
+    if (response.status === 404 && number > 0) {
+      this.count = number;
+      throw new End();
+    }
+    if (!response.ok) throw new Error(await response.text());
+    return response.arrayBuffer();
+  }
+}
+
+class End extends Error {}
