@@ -20,6 +20,7 @@ from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.metrics.sharpness import Sharpness
 from lidarsynth.pictures.colours import label_colours
 from lidarsynth.pictures.figure import compare as figure
 from lidarsynth.pictures.figure import panel
@@ -69,15 +70,12 @@ def bird_eye(images: list[RangeImage]) -> np.ndarray:
     return counts
 
 
-def steps(images: list[RangeImage], axis: int) -> np.ndarray:
-    """(40,) histogram of |ln r - ln r'| between measured neighbours: axis 0 from beam to beam, 1 along a ring."""
-    counts = np.zeros(40)
+def steps(images: list[RangeImage], kind: str) -> np.ndarray:
+    """(40,) histogram of |ln r - ln r'| between measured neighbours: `along` a ring, or `down` from beam to beam."""
+    sharpness = Sharpness()
     for image in images:
-        log = np.log(np.maximum(image.range, 1e-3))
-        pair = [np.take(log, range(k, log.shape[axis] - 1 + k), axis) for k in (0, 1)]
-        both = np.logical_and(*(np.take(image.mask, range(k, log.shape[axis] - 1 + k), axis) for k in (0, 1)))
-        counts += np.histogram(np.log10(np.abs(pair[0] - pair[1])[both] + 1e-4), bins=40, range=(-4, 1))[0]
-    return counts
+        sharpness.update(image)
+    return sharpness.counts[kind]
 
 
 def ranges(images: list[RangeImage]) -> np.ndarray:
@@ -99,8 +97,8 @@ MEASURES: dict[str, Callable[[list[RangeImage]], np.ndarray]] = {
     "reflectance, all": lambda images: reflectances(images).sum(axis=0),
     "reflectance, per beam": reflectances,
     "bird's-eye view": bird_eye,
-    "range steps along a ring": lambda images: steps(images, 1),
-    "range steps from beam to beam": lambda images: steps(images, 0),
+    "range steps along a ring": lambda images: steps(images, "along"),
+    "range steps from beam to beam": lambda images: steps(images, "down"),
 }
 
 

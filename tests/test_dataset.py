@@ -456,3 +456,24 @@ def test_the_width_is_the_given_one_else_that_of_one_s_own_sensor(tmp_path: Path
         folder = tmp_path / f"cache-{expected}"
         list(cache_source("files", tmp_path / "scans", folder, sensor=word, width=given, intensity="none"))
         assert CachedImages(folder).sensor.width == expected
+
+
+def test_a_sensor_that_sees_200_metres_keeps_them(tmp_path: Path):
+    """Ranges beyond 131 m were cut silently; the step is in the index now, and an index without one means 2 mm."""
+    sensor = replace(SENSOR, max_range=250.0)
+    far = RangeImage(*(np.full((8, 32), v, np.float32) for v in (249.9, 0.5)), np.ones((8, 32), bool), sensor)
+    list(write_cache(tmp_path, lambda i: far, 1, sensor, WHAT))
+    assert read_index(tmp_path)["step"] == 0.004
+    assert abs(CachedImages(tmp_path)[0].range - 249.9).max() <= 0.002
+    x_0 = CachedImages(tmp_path).x_0([0])
+    assert abs(x_0[0, 0] - to_x_0(far, "log")[0]).max() < 1e-4
+    index = json.loads((tmp_path / "index.json").read_text())
+    del index["step"]
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    assert abs(CachedImages(tmp_path)[0].range - 249.9 / 2).max() < 0.01
+
+
+def test_a_range_that_does_not_fit_is_refused():
+    far = RangeImage(*(np.full((8, 32), v, np.float32) for v in (140.0, 0.5)), np.ones((8, 32), bool), SENSOR)
+    with pytest.raises(ValueError, match=r"expected ranges up to 131.07 m, found 140"):
+        cache.pack(far)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.index import close_index, open_index, whole, write_index
+from lidarsynth.data.index import close_index, open_index, stored_step, whole, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 
-RANGE_STEP = 0.002  # metres per unit of the stored uint16; 0 = nothing returned, up to 131 m
+RANGE_STEP = 0.002  # metres per unit of the stored uint16, 0 = nothing returned; of sensors that see beyond 131 m more
 NO_LABEL = 255  # in every pixel of an image without labels
 SHARD = 64  # images per shard
 INDEX_EVERY = 2.0  # seconds between two writings of the index: what a kill can cost
@@ -26,15 +27,25 @@ Namer = Callable[[int], Sequence[str]]  # image number -> (..., sequence, frame)
 
 
 def record_type(sensor: Sensor) -> np.dtype:
-    """One stored image: range in steps of 2 mm, reflectance in steps of 1/255, SemanticKITTI class or NO_LABEL."""
+    """One stored image: range in the index's steps, reflectance in steps of 1/255, SemanticKITTI class or NO_LABEL."""
     shape = (sensor.height, sensor.width)
     return np.dtype([("range", "<u2", shape), ("reflectance", "u1", shape), ("label", "u1", shape)])
 
 
-def pack(image: RangeImage) -> np.ndarray:
-    """RangeImage -> one record (); measured pixels never become 0, empty ones always are."""
+def range_step(sensor: Sensor) -> float:
+    """Metres per stored unit for this sensor: 2 mm, or as many whole millimetres as its furthest range needs."""
+    return max(RANGE_STEP, math.ceil(sensor.max_range / 65.535) / 1000)
+
+
+def pack(image: RangeImage, step: float = RANGE_STEP) -> np.ndarray:
+    """RangeImage -> one record () with ranges in `step` metres; measured pixels never become 0, empty ones always are.
+
+    Raises ValueError for a range that does not fit.
+    """
     record = np.zeros((), record_type(image.sensor))
-    steps = np.clip(np.round(image.range / RANGE_STEP), 1, 65535)
+    steps = np.maximum(np.round(image.range / step), 1)
+    if (furthest := float(steps.max(initial=0, where=image.mask))) > 65535:
+        raise ValueError(f"expected ranges up to {65535 * step:.2f} m, found {furthest * step:.2f} m")
     record["range"] = np.where(image.mask, steps, 0)
     record["reflectance"] = np.round(np.clip(image.reflectance, 0, 1) * 255)
     record["label"] = NO_LABEL if image.label is None else image.label
@@ -61,8 +72,9 @@ def write_cache(
     Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
     when the folder holds something else or no scan can be read, OSError of one line when the disk is full.
     """
-    folder, task = Path(folder), _Task(Path(folder), image, name, count)
-    index = open_index(folder, sensor, source, count)
+    folder = Path(folder)
+    index = open_index(folder, sensor, source, count, range_step(sensor))
+    task = _Task(folder, image, name, count, stored_step(index))
     firsts = range(0, count, SHARD)
     todo = [first for first in firsts if not _is_stored(index, task, record_type(sensor), first, check)]
     done = count - sum(len(task.numbers(first)) for first in todo)
@@ -91,6 +103,7 @@ class _Task:
     image: Callable[[int], RangeImage]
     name: Namer | None
     count: int
+    step: float
 
     def numbers(self, first: int) -> range:
         return range(first, min(first + SHARD, self.count))
@@ -104,7 +117,7 @@ class _Task:
         records, frames, skipped = [], [], []
         for i in self.numbers(first):
             try:
-                records.append(pack(self.image(i)))
+                records.append(pack(self.image(i), self.step))
                 frames.append(self.frame(i))
             except ValueError as error:
                 skipped.append([*self.frame(i), str(error)])

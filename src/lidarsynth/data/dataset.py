@@ -20,7 +20,7 @@ from lidarsynth.data.cache import (
     write_cache,
 )
 from lidarsynth.data.frames import Name
-from lidarsynth.data.index import INDEX, REPORT, read_index
+from lidarsynth.data.index import INDEX, REPORT, read_index, stored_step
 from lidarsynth.lidar import sensor as sensors
 from lidarsynth.lidar.depth import encode
 from lidarsynth.lidar.scan import RangeImage
@@ -46,6 +46,7 @@ class CachedImages:
         shards = [(name, entry) for name, entry in sorted(index["shards"].items()) if entry["count"]]
         if not shards:
             raise ValueError(f"{folder}: expected a cache with at least one shard, found none")
+        self._step = stored_step(index)
         self._type = record_type(self.sensor)
         self._paths = [str(Path(folder) / name) for name, _ in shards]
         self._offsets = [_offset(Path(folder) / name, self._type, entry["count"]) for name, entry in shards]
@@ -77,7 +78,7 @@ class CachedImages:
 
     def __getitem__(self, i: int) -> RangeImage:
         record = self.record(i)
-        distance = record["range"].astype(np.float32) * np.float32(RANGE_STEP)
+        distance = record["range"].astype(np.float32) * np.float32(self._step)
         reflectance = record["reflectance"].astype(np.float32) / 255
         label = None if record["label"][0, 0] == NO_LABEL else record["label"].astype(np.int64)
         return RangeImage(distance, reflectance, distance > 0, self.sensor, label)
@@ -89,7 +90,7 @@ class CachedImages:
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]: range code and reflectance of the images, as `to_x_0` makes them."""
         if codec not in self._tables:
-            self._tables[codec] = _tables(self.sensor, codec)
+            self._tables[codec] = _tables(self.sensor, codec, self._step)
         code, reflectance = self._tables[codec]
         x_0 = np.empty((len(indices), 2, self.sensor.height, self.sensor.width), np.float32)
         for sample, i in zip(x_0, indices, strict=True):
@@ -148,9 +149,9 @@ class SeveralCaches:
         return torch.cat([part.x_0([place], codec) for part, place in map(self._place, indices)])
 
 
-def _tables(sensor: sensors.Sensor, codec: str) -> tuple[np.ndarray, np.ndarray]:
+def _tables(sensor: sensors.Sensor, codec: str, step: float) -> tuple[np.ndarray, np.ndarray]:
     """x_0 of every stored range (65536,) and of every stored reflectance (256,), float32: logarithms are taken once."""
-    distance = torch.arange(1 << 16, dtype=torch.float32) * RANGE_STEP
+    distance = torch.arange(1 << 16, dtype=torch.float32) * step
     reflectance = torch.arange(256, dtype=torch.float32) / 255
     return (2 * encode(distance, sensor, codec) - 1).numpy(), (2 * reflectance - 1).numpy()
 

@@ -38,6 +38,10 @@ def _check(index: Any, path: Path) -> None:
     for key, kind in KINDS.items():
         if type(index[key]) is not kind:
             raise ValueError(f"{path}: expected {key} as {kind.__name__}, found {index[key]!r:.60}")
+    if isinstance(index.get("step", 0.002), bool) or not isinstance(index.get("step", 0.002), (int, float)):
+        raise ValueError(f"{path}: expected step in metres, found {index['step']!r:.60}")
+    if not 0 < index.get("step", 0.002) < 1:
+        raise ValueError(f"{path}: expected a step of 0 to 1 m, found {index['step']}")
     if not isinstance(index["source"].get("name", ""), str) or not isinstance(index["source"].get("missing", []), list):
         raise ValueError(f"{path}: expected a source with a name, found {index['source']!r:.60}")
     for name, shard in index["shards"].items():
@@ -55,10 +59,16 @@ def _words(row: Any, size: int) -> bool:
     return isinstance(row, list) and len(row) == size and all(isinstance(word, str) for word in row)
 
 
-def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int) -> dict[str, Any]:
-    """The index to go on with, or a new one in a folder that is made for it."""
+def stored_step(index: dict[str, Any]) -> float:
+    """Metres per unit of the ranges of a cache; 2 mm where its index is older than this field."""
+    return float(index.get("step", 0.002))
+
+
+def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int, step: float) -> dict[str, Any]:
+    """The index to go on with, or a new one, with ranges in `step` metres, in a folder that is made for it."""
     folder.mkdir(parents=True, exist_ok=True)
-    head = json.loads(json.dumps({"source": source, "sensor": sensor.to_dict(), "count": count, "shards": {}}))
+    head = {"source": source, "sensor": sensor.to_dict(), "count": count, "step": step, "shards": {}}
+    head = json.loads(json.dumps(head))
     if not (folder / INDEX).exists():
         return head
     index = read_index(folder)

@@ -21,6 +21,7 @@ from lidarsynth.metrics.neighbours import (
 from lidarsynth.metrics.occupancy import Occupancy, cells_along, minimum_matching, total_variation
 from lidarsynth.metrics.point_sets import earth_movers_distance, sphere_counts
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
+from lidarsynth.metrics.sharpness import KINDS
 
 
 def _frechet(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
@@ -65,6 +66,13 @@ def _beams(samples: Statistics, real: Statistics) -> BeamReport:
     if not samples.beams or not real.beams:
         raise ValueError(f"{samples.protocol.title} does not count beams")
     return compare_beams(samples.beams, real.beams)
+
+
+def _sharpness(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    assert samples.sharpness and real.sharpness
+    kind = row.measure.removeprefix("sharp-")
+    counts = samples.sharpness.counts[kind], real.sharpness.counts[kind]
+    return jensen_shannon_distance(*counts) ** 2 if all(c.any() for c in counts) else math.nan
 
 
 def _sets_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
@@ -139,4 +147,5 @@ MEASURES: dict[str, Callable[[Row, Statistics, Statistics, int], float]] = {
     "sets-coverage": _sets_coverage,
     "sets-mmd": _sets_mmd,
     "sets-1nna": _sets_1nna,
+    **{f"sharp-{kind}": _sharpness for kind in KINDS},
 }

@@ -175,6 +175,21 @@ STREET_1 = EvaluationProtocol(
     notes=("all images of both sides count; compare scores of the same counts only",),
 )
 
+_STEPS = "Jensen-Shannon divergence, natural logarithm, of |ln r - ln r'| of neighbours in 40 logarithmic bins"
+_OFF = "Jensen-Shannon divergence of metres from a point to the line through its neighbours on the ring"
+STREET_2 = replace(
+    STREET_1,
+    name="street-2",
+    rows=(
+        *STREET_1.rows,
+        Row("steps along a ring x1e3", "sharp-along", _STEPS, scale=1e3),
+        Row("steps from beam to beam x1e3", "sharp-down", _STEPS, scale=1e3),
+        Row("thickness of the ground x1e3", "sharp-ground", _OFF, scale=1e3),
+        Row("thickness of walls x1e3", "sharp-walls", _OFF, scale=1e3),
+    ),
+    notes=(*STREET_1.notes, "the FRD does not see range noise of 0.2 m; the rows of steps and thickness do"),
+)
+
 STREET_UPSAMPLING_1 = replace(
     R2DM_UPSAMPLING,
     name="street-upsampling-1",
@@ -184,7 +199,9 @@ STREET_UPSAMPLING_1 = replace(
 )
 
 _PUBLISHED = (R2DM, LIDARGEN, LIDM, R2FLOW, R3DPA, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, LIDM_RECONSTRUCTION)
-PROTOCOLS: dict[str, EvaluationProtocol] = {p.name: p for p in (*_PUBLISHED, BEV_1, STREET_1, STREET_UPSAMPLING_1)}
+PROTOCOLS: dict[str, EvaluationProtocol] = {
+    p.name: p for p in (*_PUBLISHED, BEV_1, STREET_1, STREET_2, STREET_UPSAMPLING_1)
+}
 
 
 def get_protocol(name: str) -> EvaluationProtocol:

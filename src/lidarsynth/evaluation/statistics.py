@@ -28,6 +28,7 @@ from lidarsynth.metrics.distributions import Array, Moments
 from lidarsynth.metrics.occupancy import Occupancy
 from lidarsynth.metrics.point_sets import farthest_points
 from lidarsynth.metrics.sensor_report import BeamCounts
+from lidarsynth.metrics.sharpness import Sharpness
 
 FORMAT = "lidarsynth statistics 1"
 Networks = Mapping[str, nn.Module]  # kind -> a network in evaluation mode; those a protocol names and that are there
@@ -67,6 +68,8 @@ class Statistics:
         far = min(protocol.far, sensor.max_range)  # so that sensors of other limits compare
         counted = {row.measure for row in protocol.rows} & {"drop-rate", "beam-range"}
         self.beams = BeamCounts(replace(sensor, min_range=0.0, max_range=far), protocol.beam_step) if counted else None
+        sharp = any(row.measure.startswith("sharp-") for row in protocol.rows)
+        self.sharpness = Sharpness() if sharp else None
         c = protocol.clouds
         self.occupancy = Occupancy(c.cell, c.matching, c.extent) if c else None
 
@@ -161,6 +164,9 @@ class Statistics:
             self.bev.update(xyz.reshape(len(images), -1, 3))
         if self.beams:
             self.beams.update(np.stack([image.range for image in images]), masks)
+        if self.sharpness:
+            for image, mask in zip(images, masks, strict=True):
+                self.sharpness.update(image, mask)
 
     def update_sets(self, images: Sequence[RangeImage]) -> None:
         """Take in images for the measures of point sets only."""
@@ -194,6 +200,8 @@ class Statistics:
             self.bev.merge(other.bev)
         if self.beams and other.beams:
             self.beams.merge(other.beams)
+        if self.sharpness and other.sharpness:
+            self.sharpness.merge(other.sharpness)
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything counted, by name."""
@@ -208,6 +216,8 @@ class Statistics:
         if self.beams:
             state["beams.pixels"] = torch.from_numpy(self.beams.pixels)
             state["beams.histogram"] = torch.from_numpy(self.beams.histogram)
+        if self.sharpness:
+            state |= {f"sharpness.{kind}": torch.from_numpy(counts) for kind, counts in self.sharpness.counts.items()}
         if self.protocol.sets:
             state["sets"] = torch.from_numpy(self.sets())
         return {name: value.contiguous() for name, value in state.items()}
@@ -226,6 +236,8 @@ class Statistics:
         if self.beams:
             self.beams.pixels += state["beams.pixels"].numpy()
             self.beams.histogram += state["beams.histogram"].numpy()
+        if self.sharpness:
+            self.sharpness.counts = {kind: v.numpy().copy() for kind, v in _under(state, "sharpness.").items()}
         if self.protocol.sets:
             self._sets = [state["sets"]]
 
