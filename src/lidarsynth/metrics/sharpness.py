@@ -7,8 +7,9 @@ import numpy as np
 from lidarsynth.lidar.scan import RangeImage
 
 BINS = 40
-STEPS = np.linspace(-4, 1, BINS + 1)  # log10 of (|ln r - ln r'| + 1e-4)
-THICKNESS = np.linspace(-4, 1, BINS + 1)  # log10 of metres, from 0.1 mm to 10 m
+# Bins of log10: what is finer than a sensor's own noise and the 2 mm of caches falls into the first one.
+STEPS = np.linspace(-3, 1, BINS + 1)  # of |ln r - ln r'|
+THICKNESS = np.linspace(-2.3, 1, BINS + 1)  # of metres: 5 mm to 10 m
 TOGETHER = 1.0  # metres between a point and its neighbours on the ring at most: one surface
 ABOVE = 0.5  # metres above the flat ground under the sensor from where on a point counts as of a wall
 KINDS = ("along", "down", "ground", "walls")
@@ -29,8 +30,8 @@ class Sharpness:
         """Take in an image (H, W); `mask` (H, W) bool leaves out pixels, None = all that returned."""
         mask = image.mask if mask is None else mask
         log = np.log(np.maximum(image.range, 1e-3))
-        self.counts["along"] += _histogram(log[:, 1:] - log[:, :-1], mask[:, 1:] & mask[:, :-1])
-        self.counts["down"] += _histogram(log[1:] - log[:-1], mask[1:] & mask[:-1])
+        self.counts["along"] += _histogram((log[:, 1:] - log[:, :-1])[mask[:, 1:] & mask[:, :-1]], STEPS)
+        self.counts["down"] += _histogram((log[1:] - log[:-1])[mask[1:] & mask[:-1]], STEPS)
         xyz = image.points().astype(np.float64)
         before, after = np.roll(xyz, 1, 1), np.roll(xyz, -1, 1)
         near = [np.linalg.norm(other - xyz, axis=-1) < TOGETHER for other in (before, after)]
@@ -38,7 +39,7 @@ class Sharpness:
         off = _off_line(xyz[together], before[together], after[together])
         low = xyz[together][:, 2] < ABOVE - image.sensor.mount
         for kind, chosen in (("ground", off[low]), ("walls", off[~low])):
-            self.counts[kind] += np.histogram(np.log10(np.clip(chosen, 1e-4, 9.99)), bins=THICKNESS)[0]
+            self.counts[kind] += _histogram(chosen, THICKNESS)
 
     def merge(self, other: Sharpness) -> None:
         """Take in all that `other` has seen; it stays as it is."""
@@ -46,8 +47,10 @@ class Sharpness:
             self.counts[kind] += counts
 
 
-def _histogram(steps: np.ndarray, both: np.ndarray) -> np.ndarray:
-    return np.histogram(np.log10(np.minimum(np.abs(steps[both]) + 1e-4, 9.99)), bins=STEPS)[0]
+def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(40,) counts of values (N,) by their size; what lies beyond the ends counts in the last bins."""
+    low, high = 10 ** edges[0], 10 ** edges[-1]
+    return np.histogram(np.log10(np.clip(np.abs(values), low * 1.001, high * 0.999)), bins=edges)[0]
 
 
 def _off_line(xyz: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
