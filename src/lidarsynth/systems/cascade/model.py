@@ -35,6 +35,9 @@ SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
+# Of the noise that training draws: its energy scores leave samples rougher than streets are. Chosen by street-2 among
+# 0.25, 0.4 and 1 on grids of true streets (docs/training-default.md).
+GRAIN = 0.4
 ANSWERS = 0.02  # of the rays of a beam
 
 
@@ -289,7 +292,7 @@ class CascadeModel(ScanModel):
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
-            noise = torch.cat([draw_noise((1, height, width), generator) for generator in rng])
+            noise = GRAIN * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = type(rays)(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))

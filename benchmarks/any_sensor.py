@@ -1,0 +1,143 @@
+"""What a model for any sensor does with other sensors' scans: errors, phantoms, the shadow of KITTI's car, VLP-16 x 4.
+
+python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of real scans, against the best interpolation
+python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
+python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
+python benchmarks/any_sensor.py dense [--sensor vlp-16]   held-out streets in four times as many beams
+Each takes --models (words or folders).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+import lidarsynth as ls
+from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.streets.reader import SyntheticStreets
+
+RIVALS = ("nearest", "bilinear", "bicubic")
+NEAR, FREE = 5.0, 1.25  # metres; a truth so many times as far, or none, proves a near point wrong
+HELD_OUT = 777_001  # a seed that nothing was trained on
+loaded = cache(ls.load)
+
+
+def own_image(path: Path) -> RangeImage:
+    """A scan in the rays of the sensor that made it."""
+    scan = ls.read(path)
+    sensor, reason = recognise(scan)
+    if sensor is None:
+        raise ValueError(f"{path}: {reason}")
+    return loaded("nearest").into(sensor).image_of(scan)
+
+
+def every(image: RangeImage, step: int) -> np.ndarray:
+    """(H, W) bool: the pixels of every `step`-th beam."""
+    known = np.zeros(image.shape, bool)
+    known[::step] = True
+    return known
+
+
+def completed(word: str, image: RangeImage, known: np.ndarray) -> RangeImage:
+    """The image of its known pixels only, filled by a model in the same rays."""
+    model = loaded(word)
+    model = model.into(image.sensor) if model.any_sensor else model
+    if model.sensor.elevations != image.sensor.elevations:
+        raise ValueError(f"expected a model of any sensor, or one of {image.sensor.name}, found {word}")
+    return model.complete(image.keep(known), known)
+
+
+def mean_errors(filled: RangeImage, image: RangeImage, known: np.ndarray) -> np.ndarray:
+    """(2,) metres and reflectance, over hidden pixels; empty ones count as 0."""
+    pairs = ((filled.range, image.range), (filled.reflectance, image.reflectance))
+    return np.array([np.abs(a - b)[~known].mean() for a, b in pairs])
+
+
+def errors(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+    """Metres / reflectance of each, and of the last model against the best of the interpolations."""
+    yield "| scan, beams kept | " + " | ".join((*RIVALS, *models)) + " | against the best |"
+    yield "|---" * (len(RIVALS) + len(models) + 2) + "|"
+    for image, name in ((own_image(path), path.name) for path in paths):
+        for step in (2, 4):
+            known = every(image, step)
+            cells = [mean_errors(completed(word, image, known), image, known) for word in (*RIVALS, *models)]
+            gain = 100 * (cells[-1] / np.min(cells[: len(RIVALS)], 0) - 1)
+            shown = " | ".join(f"{a:.3f} / {b:.4f}" for a, b in cells)
+            yield f"| {name} 1/{step} | {shown} | {gain[0]:+.0f} %, {gain[1]:+.0f} % |"
+
+
+def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+    """Hidden pixels filled nearer than 5 m where the truth is empty, or where it is a quarter farther."""
+    counts: dict[str, list[tuple[int, int]]] = {word: [] for word in ("bilinear", *models)}
+    for image in map(own_image, paths):
+        known = every(image, 4)
+        for word, found in counts.items():
+            filled = completed(word, image, known)
+            near = filled.mask & (filled.range < NEAR) & ~known
+            farther = near & image.mask & (image.range > FREE * filled.range)
+            found.append((int((near & ~image.mask).sum()), int(farther.sum())))
+    yield "| model | pixels nearer than 5 m per scan: where nothing returned | where the truth is farther |"
+    yield "|---|---|---|"
+    for word, found in counts.items():
+        empty, far = np.mean(found, 0)
+        yield f"| {word} | {empty:.0f} | {far:.0f} |"
+
+
+def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+    """Of unknown pixels that KITTI's car would hide, and of others of the same beams: the share that stays empty."""
+    kitti = ls.get_sensor("hdl-64e-kitti")
+    mask, elevations = hidden(kitti), np.asarray(kitti.elevations)
+    yield "| scan | model | empty where KITTI's car stands | truly so | elsewhere in these beams | truly so |"
+    yield "|---" * 6 + "|"
+    for image, name in ((own_image(path), path.name) for path in paths):
+        row = np.abs(np.asarray(image.sensor.elevations)[:, None] - elevations).argmin(1)
+        column = (np.arange(image.shape[1]) * kitti.width / image.shape[1]).astype(int)
+        car, known = mask[np.ix_(row, column)], every(image, 4)
+        beams = car.any(1)[:, None] & ~known
+        for word in models:
+            filled = completed(word, image, known)
+            places = [(chosen, part) for chosen in (beams & car, beams & ~car) for part in (filled, image)]
+            shares = " | ".join(f"{100 * (~part.mask[chosen]).mean():.0f} %" for chosen, part in places)
+            yield f"| {name} | {word} | {shares} |"
+
+
+def dense(name: str, models: Sequence[str], count: int = 24) -> Iterator[str]:
+    """Streets that nothing was trained on, cast in four times the beams of a sensor; its own ones are known."""
+    reader = SyntheticStreets(HELD_OUT, 1 << 20, ls.get_sensor(name).denser(4))
+    totals = {word: np.zeros(2) for word in (*RIVALS, *models)}
+    for image in (reader.image(16 * i + 5) for i in range(count)):
+        known = every(image, 4)
+        for word, total in totals.items():
+            total += mean_errors(completed(word, image, known), image, known) / count
+    yield f"| {name} x 4, {count} held-out streets | range (m) | reflectance |"
+    yield "|---|---|---|"
+    yield from (f"| {word} | {a:.3f} | {b:.4f} |" for word, (a, b) in totals.items())
+
+
+REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str]], Iterator[str]]] = {
+    "errors": errors,
+    "phantoms": phantoms,
+    "shadow": shadow,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=(*REPORTS, "dense"))
+    parser.add_argument("scans", nargs="*", type=Path)
+    parser.add_argument("--models", nargs="+", default=["default"])
+    parser.add_argument("--sensor", default="vlp-16")
+    args = parser.parse_args()
+    lines = dense(args.sensor, args.models) if args.what == "dense" else REPORTS[args.what](args.scans, args.models)
+    for line in lines:
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
