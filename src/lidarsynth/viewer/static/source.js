@@ -12,7 +12,7 @@ class Source {
   }
 
   captions(number) { return this.entries ? this.entries[number].captions : this.both; }
-  name(number) { return this.names[number] || `scan ${number}`; }
+  name(number) { return this.names[number] || String(number).padStart(6, "0"); }
 
   // How far the slider may go as far as is known.
   reach(number) { return this.count === null ? Math.max(this.names.length, number + 2) : this.count; }
