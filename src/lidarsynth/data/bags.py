@@ -230,7 +230,7 @@ def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, T
 
     stream.seek(0)
     reader = make_reader(stream)
-    for _, channel, message in reader.iter_messages(topics=sorted(names) or None, start_time=start or None):
+    for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
         yield Message(topics[channel.topic], message.log_time, message.data)
 
 

@@ -96,10 +96,9 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             content = packed(series[version][number])
         except IndexError:
-            return self._answer(HTTPStatus.NOT_FOUND, b"expected the number of a scan, found one behind the last\n")
-        except (ValueError, OSError, ImportError) as error:
-            text = " ".join(str(error).split()).encode(errors="replace")
-            return self._answer(HTTPStatus.UNPROCESSABLE_ENTITY, text)
+            return self._answer(HTTPStatus.NO_CONTENT, b"")  # behind the last
+        except (ValueError, OSError, ImportError) as error:  # words instead of a scan: the page says them
+            return self._answer(HTTPStatus.OK, " ".join(str(error).split()).encode(errors="replace"))
         self._answer(HTTPStatus.OK, content, "application/octet-stream")
 
     def _ours(self) -> bool:

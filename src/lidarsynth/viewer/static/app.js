@@ -10,7 +10,7 @@ const KEYS = { v: "behind", a: "above", d: "driver", e: "side" };
 const TURN = 100; // milliseconds between scans while playing, a turn of most sensors
 
 const state = { number: 0, version: 0, word: "range", scan: null, rgba: null, pixels: null, playing: 0, mark: null };
-const camera = new Camera();
+const camera = new Camera(colourings.range.high);
 let scene, motion;
 
 function show(text) {
@@ -33,7 +33,7 @@ async function go(number, version = state.version) {
     show(error.message);
   }
   refresh();
-  if (state.number + 1 < source.reach(state.number)) source.load(state.number + 1, state.version).catch(() => {});
+  if (state.number + 1 < source.reach(state.number)) source.load(state.number + 1, state.version).catch(paintBar);
 }
 
 function refresh() {
@@ -156,6 +156,7 @@ function look(word) {
 
 function toggleStrips() {
   $("strips").hidden = !$("strips").hidden;
+  $("strips-on").setAttribute("aria-pressed", String(!$("strips").hidden));
   motion.redraw();
 }
 
@@ -185,7 +186,8 @@ function onKey(event) {
   };
   const act = acts[key] || (KEYS[key] && (() => look(KEYS[key]))) ||
     (words[Number(key) - 1] && (() => { state.word = words[Number(key) - 1]; recolour(); }));
-  if (!act || (event.target.id === "size" && key.startsWith("arrow"))) return;
+  const own = event.target.id === "size" ? key.startsWith("arrow") : key === " " && event.target.matches("button, summary, input");
+  if (!act || own) return; // what has the focus knows what to do with it
   event.preventDefault();
   act();
 }

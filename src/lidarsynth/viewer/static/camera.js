@@ -7,14 +7,19 @@ const VIEWS = {
   side: { target: [4, 0, -1], distance: 42, turn: -Math.PI / 2, rise: 0.3 },
 };
 const FIELD = 0.9; // radians from the upper to the lower border, or from left to right where that is less
+const STREET = 80; // metres for which the views are made
 const NEAR = 0.2, FAR = 1500;
 
 class Camera {
-  constructor() { this.view("behind"); }
+  // far: metres that most points lie within; in a room one looks from nearer than on a street
+  constructor(far) {
+    this.scale = Math.min(Math.sqrt(far / STREET), 1);
+    this.view("behind");
+  }
 
   view(word) {
-    const { target, ...rest } = VIEWS[word];
-    Object.assign(this, rest, { target: [...target] });
+    const { target, distance, ...rest } = VIEWS[word];
+    Object.assign(this, rest, { target: target.map((value) => value * this.scale), distance: distance * this.scale });
   }
 
   orbit(dx, dy) {

@@ -1,4 +1,4 @@
-// A scan's bytes (packing.py) to arrays, its points in an order of which every beginning is an even sample.
+// A scan's bytes (packing.py) to arrays.
 
 const ARRAYS = { i2: Int16Array, u1: Uint8Array, f4: Float32Array };
 
@@ -16,29 +16,26 @@ function decode(buffer) {
   return spread(header, blocks);
 }
 
-// The same points, each step of the way nearly the golden section of the whole: no part comes twice before all were met.
+// Sixteen passes over the points, each every sixteenth of them in their own order: neighbours stay near each other, as
+// memory likes it, and the first passes are an even sample.
+const PASSES = [0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15];
+
 function spread(header, blocks) {
-  const n = header.points;
-  const step = coprime(n, Math.round(n * 0.61803398875));
+  const n = header.points, names = Object.keys(blocks).filter((name) => name !== "xyz" && name !== "row");
   const scan = { n, boxes: header.boxes, notes: header.notes, strip: header.strip, fields: {} };
   scan.xyz = new Float32Array(n * 3);
   scan.range = new Float32Array(n);
   scan.row = new Int16Array(n);
-  const names = Object.keys(blocks).filter((name) => name !== "xyz" && name !== "row");
   for (const name of names) scan.fields[name] = new Uint8Array(n);
-  for (let i = 0, j = 0; i < n; i++, j = (j + step) % n) {
-    const x = blocks.xyz[3 * j] * header.step, y = blocks.xyz[3 * j + 1] * header.step, z = blocks.xyz[3 * j + 2] * header.step;
-    scan.xyz[3 * i] = x; scan.xyz[3 * i + 1] = y; scan.xyz[3 * i + 2] = z;
-    scan.range[i] = Math.hypot(x, y, z);
-    scan.row[i] = blocks.row[j];
-    for (const name of names) scan.fields[name][i] = blocks[name][j];
+  let i = 0;
+  for (const first of PASSES) {
+    for (let j = first; j < n; j += PASSES.length, i++) {
+      const x = blocks.xyz[3 * j] * header.step, y = blocks.xyz[3 * j + 1] * header.step, z = blocks.xyz[3 * j + 2] * header.step;
+      scan.xyz[3 * i] = x; scan.xyz[3 * i + 1] = y; scan.xyz[3 * i + 2] = z;
+      scan.range[i] = Math.hypot(x, y, z);
+      scan.row[i] = blocks.row[j];
+      for (const name of names) scan.fields[name][i] = blocks[name][j];
+    }
   }
   return scan;
-}
-
-function coprime(n, near) {
-  const common = (a, b) => (b ? common(b, a % b) : a);
-  let step = Math.max(near, 1);
-  while (n > 1 && common(n, step) !== 1) step++;
-  return step;
 }

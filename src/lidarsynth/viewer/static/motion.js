@@ -1,7 +1,7 @@
 // When to draw: on a change, once; while the camera moves, as many points as the machine draws 60 times a second.
 
 const SMOOTH = 1000 / 60, STILL = 160; // milliseconds: of a frame, and until the camera counts as standing still
-const FEWEST = 0.15; // share of the points
+const FEWEST = 1 / PASSES.length; // share of the points
 
 class Motion {
   constructor(scene, camera) {
@@ -26,7 +26,7 @@ class Motion {
     this.asked = false;
     if (this.moving && this.last) this.adapt(now - this.last);
     this.last = this.moving ? now : 0;
-    this.paint(this.moving ? this.share : 1);
+    this.paint(this.moving ? this.whole() : 1);
   }
 
   // Fewer points after a slow frame, more after frames in time.
@@ -35,6 +35,9 @@ class Motion {
     const factor = took > 1.35 * SMOOTH ? 0.82 : took < 1.1 * SMOOTH ? 1.06 : 1;
     this.share = Math.min(Math.max(this.share * factor, FEWEST), 1);
   }
+
+  // The share in whole passes: part of one would be the upper beams only.
+  whole() { return Math.ceil(this.share * PASSES.length) / PASSES.length; }
 
   paint(share) {
     this.scene.draw(this.camera, Number($("size").value), share);
@@ -48,7 +51,7 @@ class Motion {
     for (let k = 0; k < frames; k++) {
       await new Promise((done) => requestAnimationFrame(done));
       this.camera.turn += 0.01;
-      this.paint(share ?? this.share);
+      this.paint(share ?? this.whole());
       this.scene.finish();
       const now = performance.now();
       if (share === null) this.adapt(now - before);

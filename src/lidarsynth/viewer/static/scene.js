@@ -1,11 +1,12 @@
 // The graphics card draws: WebGL 2. `Splat` (splat.js) has the same methods, for machines without a card.
 
 const BACKGROUND = [11, 13, 17];
-const LARGEST = 9; // pixels of a point
+const LARGEST = 6; // pixels of a point
 const DISTANCE = 16; // metres at which a point has the chosen size, on a view 720 pixels tall
 
+// What makes a point's size in pixels when divided by the root of its distance: near points grow, but not over all.
 function pointScale(pixels, height, share) {
-  return (pixels * DISTANCE * height) / 720 / Math.sqrt(share);
+  return (pixels * Math.sqrt(DISTANCE / share) * height) / 720;
 }
 
 const POINT_SHADER = `#version 300 es
@@ -16,7 +17,7 @@ uniform float size;
 flat out vec3 shade;
 void main() {
   gl_Position = matrix * vec4(place, 1);
-  gl_PointSize = clamp(size / gl_Position.w, 1.0, ${LARGEST}.0);
+  gl_PointSize = clamp(size * inversesqrt(gl_Position.w), 1.0, ${LARGEST}.0);
   shade = colour;
 }`;
 const PAINT_SHADER = `#version 300 es

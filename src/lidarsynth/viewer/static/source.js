@@ -12,7 +12,7 @@ class Source {
   }
 
   captions(number) { return this.entries ? this.entries[number].captions : this.both; }
-  name(number) { return this.names[number] || `scan ${number}`; }
+  name(number) { return this.names[number] || String(number).padStart(6, "0"); }
 
   // How far the slider may go as far as is known.
   reach(number) { return this.count === null ? Math.max(this.names.length, number + 2) : this.count; }
@@ -44,11 +44,11 @@ class Source {
 
   async served(number, version) {
     const response = await fetch(`scan/${number}/${version}`);
-    if (response.status === 404 && number > 0) {
+    if (response.status === 204) { // behind the last, of those that are counted as they are read
       this.count = number;
       throw new End();
     }
-    if (!response.ok) throw new Error(await response.text());
+    if (response.headers.get("Content-Type") !== "application/octet-stream") throw new Error(await response.text());
     return response.arrayBuffer();
   }
 }

@@ -38,6 +38,7 @@ function word([r, g, b]) { return (255 << 24 | b << 16 | g << 8 | r) >>> 0; }
 function splatPoints({ image, depth, out, xyz, colours }, m, scale, count) {
   const { width, height } = image, halfWidth = width / 2, halfHeight = height / 2;
   const [a0, a1, , a3, b0, b1, , b3, c0, c1, , c3, d0, d1, , d3] = m; // constants of the loop
+  const single = (1.5 / scale) ** 2; // one over the distance from which on a point is one pixel
   for (let i = 0, k = 0; i < count; i++, k += 3) {
     const x = xyz[k], y = xyz[k + 1], z = xyz[k + 2];
     const w = a3 * x + b3 * y + c3 * z + d3;
@@ -46,13 +47,13 @@ function splatPoints({ image, depth, out, xyz, colours }, m, scale, count) {
     const px = ((a0 * x + b0 * y + c0 * z + d0) * near + 1) * halfWidth;
     const py = (1 - (a1 * x + b1 * y + c1 * z + d1) * near) * halfHeight;
     if (!(px >= 0 && py >= 0 && px < width && py < height)) continue;
-    const size = scale * near, colour = colours[i];
-    if (size < 1.5) {
+    const colour = colours[i];
+    if (near < single) {
       const at = (py | 0) * width + (px | 0);
       if (near > depth[at]) { depth[at] = near; out[at] = colour; }
       continue;
     }
-    const side = size > LARGEST ? LARGEST : (size + 0.5) | 0;
+    const side = Math.min((scale * Math.sqrt(near) + 0.5) | 0, LARGEST);
     const left = Math.max((px - side / 2 + 0.5) | 0, 0), top = Math.max((py - side / 2 + 0.5) | 0, 0);
     const right = Math.min(left + side, width), bottom = Math.min(top + side, height);
     for (let row = top * width; row < bottom * width; row += width) {

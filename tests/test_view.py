@@ -1,0 +1,389 @@
+"""The viewer without a browser: bytes, rows, what lies beside, scans by number, the server's doors, the file."""
+
+import http.client
+import json
+import re
+import socket
+import struct
+import threading
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from lidarsynth.cli.main import main
+from lidarsynth.data.bag_writer import write_bag
+from lidarsynth.data.bags import Cloud
+from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.verbs.inputs import Loaded, Reading
+from lidarsynth.viewer.beside import read_shown
+from lidarsynth.viewer.colouring import colourings
+from lidarsynth.viewer.packing import Shown, packed
+from lidarsynth.viewer.pairs import compared
+from lidarsynth.viewer.rows import rows_of
+from lidarsynth.viewer.series import Stream, series_of
+from lidarsynth.viewer.server import Show, address, serve
+
+BOX = {"kind": "car", "centre": [10.0, -3.0, -1.0], "size": [4.2, 1.8, 1.5], "yaw": 0.3}
+
+
+def turn(sensor: str = "vlp-16", far: float = 20.0) -> Scan:
+    """A full turn of a sensor in a round room, ring by ring, its points told apart by their reflectance."""
+    unit = SENSORS[sensor].resized(width=256)
+    xyz = unit.points(np.full((unit.height, 256), far, np.float32)).reshape(-1, 3)
+    ring = np.repeat(np.arange(unit.height), 256)
+    return Scan(xyz, np.linspace(0.01, 1, len(xyz), dtype=np.float32), ring=ring)
+
+
+def unpacked(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """As decode.js."""
+    assert data[:4] == b"LSV1"
+    length = struct.unpack("<I", data[4:8])[0]
+    header, place, blocks = json.loads(data[8 : 8 + length]), 8 + length, {}
+    assert place % 4 == 0
+    for block in header["blocks"]:
+        blocks[block["name"]] = np.frombuffer(data, "<" + block["type"], block["count"], place)
+        place += -(-blocks[block["name"]].nbytes // 4) * 4
+    assert place == len(data)
+    return header, blocks
+
+
+@pytest.mark.parametrize(("far", "kind", "step"), [(20.0, "i2", 7e-4), (250.0, "i2", 0.008), (4000.0, "f4", 1.0)])
+def test_positions_come_back_within_half_a_step(far: float, kind: str, step: float):
+    scan = turn(far=far)
+    header, blocks = unpacked(packed(Shown(scan)))
+    assert header["points"] == len(scan) and header["blocks"][0]["type"] == kind and header["step"] <= step
+    tolerance = header["step"] / 2 * 1.001 if kind == "i2" else 0
+    found = blocks["xyz"].reshape(-1, 3) * header["step"]
+    np.testing.assert_allclose(found, scan.xyz, rtol=0, atol=tolerance)
+
+
+def test_fields_come_back_and_absent_ones_do_not():
+    scan = turn()
+    n = len(scan)
+    label, new = np.arange(n) % 20, np.arange(n) % 2
+    full = Scan(scan.xyz, scan.reflectance, scan.ring, None, label, {"new": new, "confidence": np.linspace(-1, 2, n)})
+    header, blocks = unpacked(packed(Shown(full, (BOX,), ("a note",))))
+    assert header["boxes"] == [BOX] and header["notes"] == ["a note"]
+    np.testing.assert_array_equal(blocks["label"], label)
+    np.testing.assert_array_equal(blocks["new"], new)
+    np.testing.assert_allclose(blocks["reflectance"] / 255, scan.reflectance, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(blocks["confidence"] / 255, np.clip(np.linspace(-1, 2, n), 0, 1), atol=0.5 / 255 + 1e-6)
+    assert set(unpacked(packed(Shown(Scan(scan.xyz))))[1]) == {"xyz", "row"}
+
+
+def test_rows_are_the_beams_however_they_are_told():
+    scan = turn("hdl-32e")
+    shuffled = np.random.default_rng(0).permutation(len(scan))
+    told = {
+        "beams by the ring field": scan,
+        "beams by the order of the points": Scan(scan.xyz),
+        "beams of hdl-32e, recognised": Scan(scan.xyz[shuffled]),
+    }
+    assert scan.ring is not None
+    for origin, of in told.items():
+        rows = rows_of(of)
+        expected = scan.ring[shuffled] if "recognised" in origin else scan.ring
+        np.testing.assert_array_equal(rows.row, expected)
+        assert (rows.height, rows.width, rows.origin) == (32, 512, origin)
+    cloud = Scan(np.random.default_rng(1).normal(size=(5000, 3)).astype(np.float32))
+    even = rows_of(cloud)
+    assert even.height == 64 and "does not tell" in even.origin
+    elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(*cloud.xyz[:, :2].T))
+    inside = even.row >= 0
+    assert inside.mean() > 0.98 and (np.diff(even.row[inside][np.argsort(-elevation[inside])]) >= 0).all()
+
+
+@pytest.mark.parametrize("scan", [Scan(np.zeros((0, 3), np.float32)), Scan(np.ones((1, 3), np.float32))])
+def test_a_scan_of_nothing_or_one_point_is_no_fault(scan: Scan):
+    assert unpacked(packed(Shown(scan)))[0]["points"] == len(scan)
+    assert colourings(scan)["range"]["low"] < colourings(scan)["range"]["high"]
+
+
+def test_labels_boxes_and_marks_lie_beside(tmp_path: Path):
+    scan = turn()
+    root = tmp_path / "sequences" / "00"
+    for folder in ("velodyne", "labels", "boxes", "rings"):
+        (root / folder).mkdir(parents=True)
+    path = root / "velodyne" / "000000.bin"
+    write(path, scan)
+    (root / "rings" / "000000.bin").write_bytes(b"\1\0" * len(scan))
+    (root / "labels" / "000000.label").write_bytes(np.full(len(scan), 40, "<u4").tobytes())
+    (root / "boxes" / "000000.json").write_text(json.dumps({"boxes": [BOX | {"occlusion": 0.5}]}))
+    path.with_suffix(".new").write_bytes(b"\1" * len(scan))
+    (shown,) = [series_of([tmp_path], Reading())[0]]
+    assert shown.scan.label is not None and set(shown.scan.label.tolist()) == {9}  # road
+    assert list(shown.boxes) == [BOX] and shown.notes == ()
+    np.testing.assert_array_equal(shown.scan.extra["new"], np.ones(len(scan)))
+    assert series_of([tmp_path], Reading()).count == 1, "rings/*.bin are no scans"
+
+
+@pytest.mark.parametrize("boxes", [
+    "[]", '{"boxes": 3}', '{"boxes": [{"kind": "car"}]}', "not json",
+    '{"boxes": [{"kind": "car", "centre": [0, 0, NaN], "size": [1, 1, 1], "yaw": 0}]}',
+])  # fmt: skip
+def test_what_does_not_fit_is_left_out_and_said(boxes: str, tmp_path: Path):
+    path = tmp_path / "a.bin"
+    write(path, turn())
+    path.with_suffix(".json").write_text(boxes)
+    path.with_suffix(".label").write_bytes(b"\0" * 12)
+    path.with_suffix(".new").write_bytes(b"\0" * 12)
+    shown = read_shown(path)
+    assert shown.boxes == [] and shown.scan.label is None and "new" not in shown.scan.extra
+    labels, marks = shown.notes
+    assert re.search(r"labels left out: .*expected 16384 bytes.*found 12", labels)
+    assert re.search(r"a.new left out: expected 4096 bytes, found 12", marks)
+
+
+def bag(path: Path, times: list[int]) -> Path:
+    """A bag whose i-th cloud is i + 10 metres away."""
+    with write_bag(path) as writer:
+        for i, time in enumerate(times):
+            scan = turn(far=10.0 + i)
+            fields = {axis: scan.xyz[:, k].copy() for k, axis in enumerate("xyz")} | {"intensity": scan.reflectance}
+            writer.write_cloud("/points", Cloud(time, "lidar", time, fields))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_a_bag_by_number_in_any_order(suffix: str, tmp_path: Path):
+    pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
+    path = bag(tmp_path / f"drive{suffix}", [10**18 + t * 10**8 for t in (0, 1, 2, 2, 3, 4)])
+    series = series_of([path], Reading())
+    assert series.count == 6
+    for number in (0, 3, 1, 2, 5, 4, 0, 3):
+        distance = np.linalg.norm(series[number].scan.xyz, axis=1)
+        np.testing.assert_allclose(distance, 10 + number, rtol=1e-4)
+    assert list(series.names) == [f"drive/{i:06d}" for i in range(6)]
+    with pytest.raises(IndexError):
+        series[6]
+
+
+def test_going_back_starts_at_the_mark_and_nothing_is_held():
+    """Of a stream with times: a jump back reads from that time on, not from the start."""
+    read_at: list[int] = []
+    alive: list[weakref.ref] = []
+
+    class Item:
+        def __init__(self, number: int):
+            self.name, self.path = f"item {number}", Path()
+            alive.append(weakref.ref(self))
+
+        def read(self) -> Loaded:
+            return Loaded(Scan(np.full((1, 3), int(self.name[5:]) + 1, np.float32)), {}, 0)
+
+    def open_at(mark: int, number: int) -> Iterator[tuple[int, Item]]:
+        assert mark == 7 * number
+        for k in range(number, 100):
+            read_at.append(k)
+            yield 7 * k, Item(k)
+
+    stream = Stream(open_at, None)
+    assert stream[50].scan.xyz[0, 0] == 51 and read_at == list(range(51))
+    assert sum(item() is not None for item in alive) <= 1
+    read_at.clear()
+    assert [stream[k].scan.xyz[0, 0] for k in (51, 20, 21, 49)] == [52, 21, 22, 50]
+    assert read_at == [51, 20, 21, 49], "forth to what was seen goes by the mark, too"
+    with pytest.raises(IndexError):
+        stream[100]
+    assert stream.count == 100 == len(stream.names)
+
+
+def test_partners_are_found_by_name_else_by_number(tmp_path: Path):
+    for folder, names in (("a", "xyz"), ("b", "zyxw"), ("c", "123")):
+        (tmp_path / folder).mkdir()
+        for i, name in enumerate(names):
+            write(tmp_path / folder / f"{name}.npy", turn(far=10.0 + i))
+
+    def distances(other: str) -> list[float]:
+        series = compared([tmp_path / "a"], tmp_path / other, Reading())[other]
+        return [float(np.linalg.norm(series[i].scan.xyz[0]).round(2)) for i in range(3)]
+
+    assert distances("b") == [12, 11, 10]
+    assert distances("c") == [10, 11, 12]
+    with pytest.raises(ValueError, match=r"a: expected 4 scans to compare, or one of each name, found 3"):
+        compared([tmp_path / "b"], tmp_path / "a", Reading())
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[str, str, Path]]:
+    """(host:port, token, folder) of a server over two scans and a broken one."""
+    for i in range(3):
+        write(tmp_path / f"{i}.npy", turn(far=10.0 + i))
+    (tmp_path / "2.npy").write_bytes(b"\x93NUMPY")
+    (tmp_path / "secret.txt").write_text("secret")
+    show = Show("scans", compared([tmp_path], None, Reading()))
+    with serve(show) as server:
+        assert server.server_address[0] == "127.0.0.1"
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        yield urlsplit(address(server, show)).netloc, show.token, tmp_path
+        server.shutdown()
+        thread.join()
+
+
+def ask(host: str, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes, http.client.HTTPMessage]:
+    connection = http.client.HTTPConnection(host, timeout=30)
+    connection.putrequest(method, path, skip_host="Host" in headers, skip_accept_encoding=True)
+    for name, value in headers.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer.status, content, answer.headers
+
+
+def test_the_page_and_the_scans_are_served(served: tuple[str, str, Path]):
+    host, token, folder = served
+    status, content, headers = ask(host, f"/{token}/")
+    assert status == 200 and b"<canvas" in content
+    assert not re.search(rb"https?://|src=|@import|url\(", content), "the page needs nothing from elsewhere"
+    policy = headers["Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'") and "connect-src 'self'" in policy and "unsafe" not in policy
+    assert headers["Cache-Control"] == "no-store" and headers["X-Frame-Options"] == "DENY"
+    assert headers["Access-Control-Allow-Origin"] is None
+    status, content, headers = ask(host, f"/{token}/scan/1/0", Origin=f"http://{host}", Sec_Fetch_Site="same-origin")
+    assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
+    assert content == packed(read_shown(folder / "1.npy"))
+    assert ask(host, f"/{token}/scan/3/0")[:2] == (204, b"")
+    status, content, headers = ask(host, f"/{token}/scan/2/0")
+    assert status == 200 and headers["Content-Type"].startswith("text/plain")
+    assert re.search(rb"2\.npy: expected .*found", content)
+
+
+@pytest.mark.parametrize("headers", [
+    {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "https://{host}"}, {"Host": "evil.example"},
+    {"Host": "evil.example:{port}"}, {"Host": "127.0.0.1"}, {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "cors"},
+    {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"}, {"Host": "127.0.0.1:{port}@evil.example"},
+])  # fmt: skip
+def test_others_are_refused_even_with_the_token(served: tuple[str, str, Path], headers: dict[str, str]):
+    host, token, _ = served
+    filled = {name: value.format(host=host, port=host.split(":")[1]) for name, value in headers.items()}
+    for path in (f"/{token}/", f"/{token}/scan/0/0"):
+        status, content, _ = ask(host, path, **filled)
+        assert status == 403 and len(content) < 100
+
+
+@pytest.mark.parametrize("path", [
+    "/", "/scan/0/0", "/wrong/", "/{part}/", "/{token}x/scan/0/0", "//{token}/", "/%2e/{token}/", "/?{token}", "*",
+    "http://evil.example/{token}/",
+])  # fmt: skip
+def test_a_wrong_address_is_refused(served: tuple[str, str, Path], path: str):
+    host, token, _ = served
+    status, content, _ = ask(host, path.format(token=token, part=token[:-1]))
+    assert status == 403 or (path.startswith("//") and status == 200), "a doubled first slash is the same address"
+    assert token.encode() not in content
+
+
+@pytest.mark.parametrize("path", [
+    "..", "../", "../secret.txt", "secret.txt", "scan/../secret.txt", "scan/0/../../../etc/passwd", "scan/%2e%2e/0",
+    "scan/..%2f..%2fetc", "scan/-1/0", "scan/0", "scan/0/0/", "scan/0/0/0", "scan/1e0/0", "scan/٣/0",
+    "scan/9999999999/0", "/etc/passwd", "scan//etc/passwd", "scan/0/0%00", "static/app.js", "?a=/etc/passwd",
+    "scan/0/0?x=../../secret.txt",
+])  # fmt: skip
+def test_no_path_leads_anywhere_else(served: tuple[str, str, Path], path: str):
+    host, token, _ = served
+    status, content, _ = raw(host, f"/{token}/{path}")
+    assert status in (400, 404) and b"secret" not in content and b"root:" not in content
+
+
+def raw(host: str, path: str) -> tuple[int, bytes, bytes]:
+    """A request whose path no client has cleaned."""
+    name, _, port = host.partition(":")
+    with socket.create_connection((name, int(port)), timeout=30) as connection:
+        connection.sendall(f"GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split()[1]), body, head
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"])
+def test_nothing_can_be_sent(served: tuple[str, str, Path], method: str):
+    host, token, _ = served
+    assert ask(host, f"/{token}/", method)[0] == 501
+
+
+def test_many_ask_at_once_and_a_dead_one_holds_nobody_up(served: tuple[str, str, Path]):
+    host, token, folder = served
+    name, _, port = host.partition(":")
+    idle = socket.create_connection((name, int(port)))  # says nothing
+    found: list[bytes] = []
+    threads = [threading.Thread(target=lambda: found.append(ask(host, f"/{token}/scan/0/0")[1])) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    idle.close()
+    assert found == [packed(read_shown(folder / "0.npy"))] * 8
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main(["view", *arguments])
+    assert end.value.code == 2
+    return capsys.readouterr().err.strip()
+
+
+def test_a_file_to_send(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Whole, alone, and a name cannot end an element of the page."""
+    name = "</script><script>alert(1)<!--"
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    write(folder / "a.npy", turn())
+    path = tmp_path / "out" / "view.html"
+    main(["view", str(folder / "a.npy"), "--with", str(folder), "--out", str(path)])
+    text = path.read_text()
+    assert re.fullmatch(
+        r"wrote .*view.html, 0\.\d MB: open it in any browser, without a network\n", capsys.readouterr().out
+    )
+    assert not re.search(r"https?://|src=|@import|url\(", text)
+    assert "connect-src" not in text and text.count('id="scan-') == 2
+    assert [p.name for p in path.parent.iterdir()] == ["view.html"]
+    hostile = folder / f"{name.replace('/', '_')}.npy"
+    write(hostile, turn())
+    main(["view", str(hostile), "--out", str(path)])
+    assert "<script>alert" not in path.read_text()
+
+
+def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    write(tmp_path / "a.npy", turn())
+    (tmp_path / "others").mkdir()
+    (tmp_path / "broken.npy").write_bytes(b"nothing")
+    old = tmp_path / "old.html"
+    old.write_text("old")
+    a = str(tmp_path / "a.npy")
+    assert "expected a name that ends in .html, found 'x.ply'" in refused(capsys, a, "--out", "x.ply")
+    assert "broken.npy: expected" in refused(capsys, str(tmp_path / "broken.npy"), "--out", str(old))
+    assert "broken.npy: expected" in refused(capsys, str(tmp_path / "broken.npy"))
+    write(tmp_path / "others" / "b.npy", turn())
+    write(tmp_path / "others" / "c.npy", turn())
+    assert "others: expected 1 scans to compare" in refused(capsys, a, "--with", str(tmp_path / "others"))
+    assert "expected --port of at least 0" in refused(capsys, a, "--port", "-1")
+    assert "expected a free port of 127.0.0.1, found 99999" in refused(capsys, a, "--port", "99999", "--no-browser")
+    assert old.read_text() == "old"
+
+
+def test_too_many_for_a_file_are_refused_before_any_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for i in range(49):
+        (tmp_path / f"{i}.npy").write_bytes(b"never read")
+    line = refused(capsys, str(tmp_path), "--out", str(tmp_path / "view.html"))
+    assert "expected at most 48 scans for one file, found 49" in line
+
+
+def test_colours_fit_the_first_scan():
+    near, far = (colourings(turn(far=distance))["range"]["high"] for distance in (15.0, 100.0))
+    assert (near, far) == (20, 120)
+
+
+def test_a_range_image_is_shown_as_its_points(tmp_path: Path):
+    from lidarsynth.lidar.projection import project
+
+    image = project(turn(), SENSORS["vlp-16"], width=256)
+    write(tmp_path / "a.npz", image)
+    np.testing.assert_allclose(read_shown(tmp_path / "a.npz").scan.xyz, read(tmp_path / "a.npz").xyz)
