@@ -23,7 +23,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     Points come row by row, each row from behind over the left; those above or below the view come last, and only
     without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
     the scan stays with its points; new ones have 0 there, the label of their pixel, and the time of the points measured
-    in their direction. `extra["new"]` is 1 for new points.
+    in their direction. `extra["new"]` is 1 for new points; `extra["confidence"]`, where the image has it, 1 for measured.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row = row_of_points(scan, filled.sensor, projection)
@@ -43,7 +43,8 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
         time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
         label=_labels(scan, new),
         extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)]) for name, values in scan.extra.items()}
-        | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])},
+        | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])}
+        | {name: np.concatenate([np.ones(len(scan), np.float32), values]) for name, values in new.extra.items()},
     )
     return both[order]
 
