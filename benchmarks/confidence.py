@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.data.folder import scan_files
 from lidarsynth.experiment.folder import RECORD
 from lidarsynth.files.formats import read
-from lidarsynth.data.folder import scan_files
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.systems.cascade.calibration import calibrated, held_out, judged, with_confidence
 from lidarsynth.systems.cascade.confidence import reliability
@@ -25,8 +25,8 @@ from lidarsynth.weights.load import load
 
 
 def scans_of(paths: list[Path], model: CascadeModel, recipe: str) -> Iterator[tuple[RangeImage, str]]:
-    for path in [file for path in paths for file in (scan_files(path) if path.is_dir() else [path])]:
-        scan = read(path)
+    for file in [file for path in paths for file in (scan_files(path) if path.is_dir() else [path])]:
+        scan = read(file)
         yield model.suited_to(scan).image_of(scan), recipe
 
 
@@ -38,7 +38,10 @@ def table(stated: np.ndarray, right: np.ndarray, off: np.ndarray, bins: int) -> 
         median = f"{np.median(off[place == k]):.2f} m" if share else ""
         rows.append(f"| {low:.1f} to {high:.1f} | {share:.1%} | {said:.2f} | {hits:.2f} | {median} |")
     apart = sum(share * abs(said - hits) for _, _, share, said, hits in reliability(stated, right, bins) if share)
-    rows += ["", f"{len(stated):,} new points, {right.mean():.1%} right; said and right are {apart:.3f} apart on average"]
+    rows += [
+        "",
+        f"{len(stated):,} new points, {right.mean():.1%} right; said and right are {apart:.3f} apart on average",
+    ]
     for least in (0.5, 0.8, 0.9):
         kept = stated >= least
         rows.append(f"of {least} or more: {kept.mean():.1%} of the points, {right[kept].mean():.1%} of them right")

@@ -86,7 +86,7 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def read_image(path: str | Path) -> RangeImage:
-    """A range image that `write` saved as `.npz`: range, reflectance, mask, sensor, and label, xyz, confidence where it had them.
+    """A range image that `write` saved as `.npz`: range, reflectance, mask, sensor, and what else it had of it.
 
     Raises FileError as `read`.
     """
@@ -101,8 +101,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
 
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
     points. `.bin` and `.npy` hold x y z reflectance only, and of a filled scan `new` beside them in a `.new` file, a
-    byte a point, and `confidence` in a `.confidence` file, a float32 a point; the others hold ring, time, label and every further field too. The file appears whole
-    or not at all: it is written beside its place under another name, then renamed. Raises FileError.
+    byte a point, and `confidence` in a `.confidence` file, a float32 a point; the others hold ring, time, label and
+    every further field too. The file appears whole or not at all: it is written beside its place under another name, then renamed. Raises FileError.
     """
     path = Path(path)
     if path.name.lower().endswith(".pcd.bin"):

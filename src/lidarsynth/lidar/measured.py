@@ -23,7 +23,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     Points come row by row, each row from behind over the left; those above or below the view come last, and only
     without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
     the scan stays with its points; new ones have 0 there, the label of their pixel, and the time of the points measured
-    in their direction. `extra["new"]` is 1 for new points; `extra["confidence"]`, where the image has it, 1 for measured.
+    in their direction. `extra["new"]` is 1 for new points; where the image has `confidence`, measured points have 1.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row = row_of_points(scan, filled.sensor, projection)

@@ -1,4 +1,4 @@
-"""How sure the new points of a cascade are: a chance by what the network shows of its choice, fitted on held-out streets.
+"""How sure the new points of a cascade are: a chance by what the network shows, fitted on held-out streets.
 
 A new point is right when its ray returns, and from within 0.3 m + 2 % of where the point was put.
 """
