@@ -179,7 +179,7 @@ IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least an
 
 
 def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
-    """The range image of our own npz: range, reflectance, mask, sensor (JSON text); label, xyz, confidence where present."""
+    """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and what else of IMAGE it has."""
     if missing := {"range", "reflectance", "mask", "sensor"} - arrays.keys():
         raise FileError(f"expected a saved range image, found no {', '.join(sorted(missing))} in {', '.join(arrays)}")
     for name, (kinds, low, high) in IMAGE.items():

@@ -102,7 +102,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
     points. `.bin` and `.npy` hold x y z reflectance only, and of a filled scan `new` beside them in a `.new` file, a
     byte a point, and `confidence` in a `.confidence` file, a float32 a point; the others hold ring, time, label and
-    every further field too. The file appears whole or not at all: it is written beside its place under another name, then renamed. Raises FileError.
+    every further field too. The file appears whole or not at all: it is written beside its place, then
+    renamed. Raises FileError.
     """
     path = Path(path)
     if path.name.lower().endswith(".pcd.bin"):

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from lidarsynth.lidar.projection import project, row_of_points
+from lidarsynth.lidar.projection import occupied, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 
 
 def rays_with_points(scan: Scan, sensor: Sensor, projection: str) -> np.ndarray:
     """(H, W) bool: pixels that any point falls into, at whatever range: nothing is to be put before it."""
-    return project(scan, replace(sensor, min_range=0.0, max_range=math.inf), projection).mask
+    return occupied(scan, sensor, projection)
 
 
 def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projection: str) -> Scan:

@@ -12,6 +12,7 @@ from lidarsynth.lidar.sensor import SENSORS, Sensor
 FAR = 3.0  # metres: nearer points show the beam's origin off the sensor's centre more than its elevation
 UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by this much (HDL-64E units do)
 SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams only; chance gives 0.25
+ENOUGH = 256  # points of a ring, evenly from all of it: their median is the ring's to a few thousandths of a degree
 POINTWISE = 0.6  # of points within a tenth of the spacing of some beam, for scans without rings; chance gives 0.2
 
 
@@ -59,8 +60,8 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
 
 
 def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
-    beams = [_far(xyz[ring == k]) for k in np.unique(ring)]
-    beams = [points for points in beams if len(points) >= 5]
+    beams = [_far(points) for points in _split(xyz, ring) if len(points) >= 5]
+    beams = [points[:: max(1, len(points) // ENOUGH)] for points in beams]
     if len(beams) < 2:
         return None, f"{len(beams)} rings of at least 5 points"
     beams.sort(key=lambda points: -np.median(elevations_of(points)))
@@ -75,6 +76,12 @@ def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
         name = min(shares, key=lambda n: shares[n])
         return name, f"{found}, on {len(beams)} of the {SENSORS[name].height} beams of {name}"
     return None, found
+
+
+def _split(xyz: np.ndarray, ring: np.ndarray) -> list[np.ndarray]:
+    """The points of each ring, in the order of the rings' numbers."""
+    order = np.argsort(ring, kind="stable")
+    return np.split(xyz[order], np.flatnonzero(np.diff(ring[order])) + 1)
 
 
 def _far(points: np.ndarray) -> np.ndarray:

@@ -64,10 +64,10 @@ def complete_scan(
     Raises ValueError when no point is in view, the recipe hides nothing, or `least` meets a model without confidences.
     """
     model = model.suited_to(scan, sensor)
-    truth = model.image_of(scan)
     if recipe is None:
         filled = _sure(model.filled(scan, how, on_step=on_step), least)
-        return Filled(filled, {"measured": truth, "completed": filled}, {})
+        return Filled(filled, {"measured": _measured(model, scan, filled), "completed": filled}, {})
+    truth = model.image_of(scan)
     if not truth.mask.any():
         raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
     known = corrupt(truth, recipe, how.seed)
@@ -95,6 +95,13 @@ def check_confident(model: ScanModel, how: Filling, least: float | None) -> None
 
 def _sure(filled: RangeImage, least: float | None) -> RangeImage:
     return filled if least is None else filled.surer_than(least)
+
+
+def _measured(model: ScanModel, scan: Scan, filled: RangeImage) -> RangeImage:
+    """The scan's own image: the pixels of a filled one that hold measured points, where it says which."""
+    if filled.xyz is None:
+        return model.image_of(scan)
+    return filled.keep(np.any(filled.xyz != 0, axis=-1))
 
 
 def judged(filled: RangeImage, before: RangeImage, known: np.ndarray, truth: RangeImage) -> dict[str, Errors]:

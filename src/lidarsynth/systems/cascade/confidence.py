@@ -61,7 +61,7 @@ def _angle(near: Tensor, rays: Rays) -> Tensor:
     pixels = 1 / near.clamp_min(1e-4) - 1
     vertical = pixels[:, :2] * torch.maximum(rays.up, rays.down)
     horizontal = pixels[:, 2:] * rays.across
-    return torch.cat([vertical, horizontal], 1).amin(1, keepdim=True).clamp(0, FARTHEST)
+    return torch.cat([vertical, horizontal], 1).amin(1, keepdim=True).clamp(0.0, FARTHEST)
 
 
 def confidence(filled: Filled, rays: Rays, weights: Confidence) -> Tensor:
