@@ -34,7 +34,8 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     assert new.ring is not None
     xyz = np.concatenate([scan.xyz, new.xyz])
     ring = np.concatenate([np.where(row < 0, filled.sensor.height, row), new.ring])
-    order = np.lexsort((-np.arctan2(xyz[:, 1], xyz[:, 0]), ring))
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    order = np.argsort(10.0 * ring - azimuth, kind="stable")  # by ring, then azimuth: a turn is less than 10
     both = Scan(
         xyz,
         np.concatenate([reflectance, new.reflectance]),
