@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-EXTRAS := synthetic,train,data,ros,metrics,viz,hub,test
+EXTRAS := synthetic,train,data,ros,metrics,viz,hub,onnx,test
 
 MINUTES ?= 10
 SEED   ?= 0

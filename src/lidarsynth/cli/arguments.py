@@ -39,6 +39,10 @@ Steps = Annotated[
     ),
 ]
 Resamples = Annotated[int | None, arg(metavar="INT", help="passes over each step of repaint; default 10.")]
+Least = Annotated[
+    float | None,
+    arg(metavar="P", help="leave out new points that are right with less than this chance, 0 to 1; see docs/files.md."),
+]
 Intensity = Annotated[
     Literal["auto", "unit", "byte", "uint16", "none"],
     arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),

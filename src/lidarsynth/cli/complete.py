@@ -8,6 +8,7 @@ from typing import Annotated
 from lidarsynth.cli.arguments import (
     Device,
     Intensity,
+    Least,
     Method,
     Picture,
     Positional,
@@ -31,6 +32,7 @@ def complete(
     method: Method = "auto",
     steps: Steps = None,
     resamples: Resamples = None,
+    min_confidence: Least = None,
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
@@ -50,7 +52,7 @@ def complete(
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    job = Job("complete", model, device, how, corrupt=corrupt, sensor=sensor, picture=picture)
+    job = Job("complete", model, device, how, corrupt=corrupt, sensor=sensor, picture=picture, least=min_confidence)
     results = [result for result in work_through(job, scans, out, many, intensity) if result.errors]
     if len(results) <= PICTURES:
         for result in results:

@@ -10,6 +10,7 @@ from lidarsynth.cli.complete import complete
 from lidarsynth.cli.data import data
 from lidarsynth.cli.demo import demo
 from lidarsynth.cli.evaluate import evaluate
+from lidarsynth.cli.export import export
 from lidarsynth.cli.generate import generate
 from lidarsynth.cli.info import info
 from lidarsynth.cli.project import project
@@ -33,6 +34,7 @@ VERBS = {
     "train": train,
     "evaluate": evaluate,
     "benchmark": benchmark,
+    "export": export,
     "info": info,
 }
 

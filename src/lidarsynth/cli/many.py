@@ -70,10 +70,13 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
 
 def _model(job: Job) -> ScanModel | None:
     """The model, its request checked before any work."""
+    from lidarsynth.verbs.completion import check_confident
+
     if job.verb == "project":
         return None
     model = load_with_bar(job.model, job.device)
     model.resolved(job.how)
+    check_confident(model, job.how, job.least)
     return model
 
 

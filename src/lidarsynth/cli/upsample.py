@@ -8,6 +8,7 @@ from typing import Annotated
 from lidarsynth.cli.arguments import (
     Device,
     Intensity,
+    Least,
     Method,
     Output,
     Picture,
@@ -38,6 +39,7 @@ def upsample(
     method: Method = "auto",
     steps: Steps = None,
     resamples: Resamples = None,
+    min_confidence: Least = None,
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
@@ -51,5 +53,15 @@ def upsample(
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    job = Job("upsample", model, device, how, sensor=sensor_in, into=sensor_out, times=times, picture=picture)
+    job = Job(
+        "upsample",
+        model,
+        device,
+        how,
+        sensor=sensor_in,
+        into=sensor_out,
+        times=times,
+        picture=picture,
+        least=min_confidence,
+    )
     work_through(job, scans, out, many, intensity)

@@ -142,6 +142,25 @@ class Segmentation:
 
 
 @dataclass(frozen=True)
+class Confidence:
+    """How sure a trained cascade's new points are: the logarithm of the odds, linear in what the network shows.
+
+    Fitted after the training, on streets it has not seen (`systems.cascade.confidence`). Each is monotone by its sign.
+    """
+
+    spread: float = within(0.0, -1000, 0)  # of the candidates among which it chose
+    angle: float = within(0.0, -1000, 0)  # to the nearest known return
+    answer: float = within(0.0, 0, 1000)  # how likely the ray returns at all
+    rows: float = within(0.0, -1000, 0)  # steps in range to the pixels above and below
+    columns: float = within(0.0, -1000, 0)  # and to the left and right
+    range: float = within(0.0, -1000, 0)
+    constant: float = within(0.0, -1000, 1000)
+
+    def __post_init__(self):
+        check_ranges(self)
+
+
+@dataclass(frozen=True)
 class Training:
     """The optimiser and its budget; defaults are R2DM's."""
 
@@ -189,6 +208,7 @@ class Experiment:
     upsampling: Upsampling | None = None  # of networks that put beams between known ones
     adversarial: Adversarial | None = None  # of GANs
     segmentation: Segmentation | None = None  # of networks that classify pixels
+    confidence: Confidence | None = None  # of cascades that were asked after the training
 
     def to_dict(self) -> dict:
         """Plain tables, lists and numbers, the inverse of `from_dict`; without the groups that are None."""

@@ -174,11 +174,12 @@ IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least an
     "mask": ("b", 0, 1),
     "label": ("iu", 0, 19),
     "xyz": ("f", -MAX_METRES, MAX_METRES),
+    "confidence": ("f", 0, 1),
 }
 
 
 def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
-    """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and label, xyz where present."""
+    """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and what else of IMAGE it has."""
     if missing := {"range", "reflectance", "mask", "sensor"} - arrays.keys():
         raise FileError(f"expected a saved range image, found no {', '.join(sorted(missing))} in {', '.join(arrays)}")
     for name, (kinds, low, high) in IMAGE.items():
@@ -192,8 +193,9 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
             raise FileError("expected a sensor with elevations in the range image, found another JSON text")
         label = arrays["label"].astype(np.int32) if "label" in arrays else None
         xyz = arrays["xyz"].astype(np.float32) if "xyz" in arrays else None
+        sure = arrays["confidence"].astype(np.float32) if "confidence" in arrays else None
         numbers = arrays["range"].astype(np.float32), arrays["reflectance"].astype(np.float32)
-        return RangeImage(*numbers, arrays["mask"], from_dict(values), label, xyz)
+        return RangeImage(*numbers, arrays["mask"], from_dict(values), label, xyz, confidence=sure)
     except FileError:
         raise
     except (ValueError, TypeError, RecursionError) as error:
@@ -224,7 +226,7 @@ def _table(scan: Scan) -> np.ndarray:
 def write_npz(file: BufferedIOBase, scan: Scan | RangeImage) -> None:
     """Every array of the scan or image under its own name, compressed; the sensor of an image as JSON text."""
     if isinstance(scan, RangeImage):
-        arrays = {name: getattr(scan, name) for name in ("range", "reflectance", "mask", "label", "xyz")}
+        arrays = {name: getattr(scan, name) for name in IMAGE}
         arrays["sensor"] = np.array(json.dumps(scan.sensor.to_dict()))
     else:
         own = {name: getattr(scan, name) for name in ("xyz", "reflectance", "ring", "time", "label")}

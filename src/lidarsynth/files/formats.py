@@ -35,6 +35,7 @@ READERS: dict[str, Callable[[bytes], Fields]] = {
     ".pts": text.read_text,
 }
 BARE = (".bin", ".npy")  # without a place for further fields
+BESIDE = {"new": np.dtype("u1"), "confidence": np.dtype("<f4")}  # which get a file of their own beside those
 NAMED_ONLY = (".csv", ".txt")  # in a folder they may be anything, such as KITTI's times.txt: read where they are named
 
 WRITERS: dict[str, Callable[[BufferedIOBase, Any], None]] = {  # a Scan; .npz also takes a RangeImage
@@ -85,7 +86,7 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def read_image(path: str | Path) -> RangeImage:
-    """A range image that `write` saved as `.npz`: range, reflectance, mask, sensor, and label, xyz where it had them.
+    """A range image that `write` saved as `.npz`: range, reflectance, mask, sensor, and what else it had of it.
 
     Raises FileError as `read`.
     """
@@ -99,21 +100,24 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given.
 
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
-    points. `.bin` and `.npy` hold x y z reflectance only, and a filled scan's `new` beside them in a `.new` file, a
-    byte a point; the others hold ring, time, label and every further field too. The file appears whole
-    or not at all: it is written beside its place under another name, then renamed. Raises FileError.
+    points. `.bin` and `.npy` hold x y z reflectance only, and of a filled scan `new` beside them in a `.new` file, a
+    byte a point, and `confidence` in a `.confidence` file, a float32 a point; the others hold ring, time, label and
+    every further field too. The file appears whole or not at all: it is written beside its place, then
+    renamed. Raises FileError.
     """
     path = Path(path)
     if path.name.lower().endswith(".pcd.bin"):
         raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found .pcd.bin")
     suffix = _suffix(path, WRITERS, "write")
     content = scan.to_scan() if isinstance(scan, RangeImage) and suffix != ".npz" else scan
-    marks = content.extra.get("new") if isinstance(content, Scan) and suffix in BARE else None
     if path.is_dir():
         raise FileError(f"{path}: expected the name of a file to write, found a folder")
     _put(path, lambda file: WRITERS[suffix](file, content))
-    if marks is not None:
-        _put(path.with_suffix(".new"), lambda file: file.write(marks.astype(np.uint8).tobytes()))
+    if isinstance(content, Scan) and suffix in BARE:
+        for name, kind in BESIDE.items():
+            if name in content.extra:
+                values = content.extra[name].astype(kind).tobytes()
+                _put(path.with_suffix(f".{name}"), lambda file, values=values: file.write(values))
 
 
 def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from lidarsynth.lidar.projection import project, row_of_points
+from lidarsynth.lidar.projection import occupied, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 
 
 def rays_with_points(scan: Scan, sensor: Sensor, projection: str) -> np.ndarray:
     """(H, W) bool: pixels that any point falls into, at whatever range: nothing is to be put before it."""
-    return project(scan, replace(sensor, min_range=0.0, max_range=math.inf), projection).mask
+    return occupied(scan, sensor, projection)
 
 
 def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projection: str) -> Scan:
@@ -23,7 +22,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     Points come row by row, each row from behind over the left; those above or below the view come last, and only
     without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
     the scan stays with its points; new ones have 0 there, the label of their pixel, and the time of the points measured
-    in their direction. `extra["new"]` is 1 for new points.
+    in their direction. `extra["new"]` is 1 for new points; where the image has `confidence`, measured points have 1.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row = row_of_points(scan, filled.sensor, projection)
@@ -35,7 +34,8 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     assert new.ring is not None
     xyz = np.concatenate([scan.xyz, new.xyz])
     ring = np.concatenate([np.where(row < 0, filled.sensor.height, row), new.ring])
-    order = np.lexsort((-np.arctan2(xyz[:, 1], xyz[:, 0]), ring))
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    order = np.argsort(10.0 * ring - azimuth, kind="stable")  # by ring, then azimuth: a turn is less than 10
     both = Scan(
         xyz,
         np.concatenate([reflectance, new.reflectance]),
@@ -43,7 +43,8 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
         time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
         label=_labels(scan, new),
         extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)]) for name, values in scan.extra.items()}
-        | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])},
+        | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])}
+        | {name: np.concatenate([np.ones(len(scan), np.float32), values]) for name, values in new.extra.items()},
     )
     return both[order]
 

@@ -33,6 +33,15 @@ def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int |
     return _draw(scan, sensor, depth, pixel, row >= 0)
 
 
+def occupied(scan: Scan, sensor: Sensor, method: str) -> np.ndarray:
+    """(H, W) bool: pixels that any point falls into, at whatever range; methods as in `project`."""
+    row = row_of_points(scan, sensor, method)
+    inside = (row >= 0) & (_length(*scan.xyz.T) > 0)
+    hit = np.zeros((sensor.height, sensor.width), bool)
+    hit[row[inside], _columns(scan.xyz[inside], sensor.width)] = True
+    return hit
+
+
 def thin(image: RangeImage, height: int | None = None, width: int | None = None) -> RangeImage:
     """The image at fewer columns and rows, every pixel one of the old ones: ray-drop stays ray-drop, nothing is mixed.
 

@@ -12,6 +12,7 @@ from lidarsynth.lidar.sensor import SENSORS, Sensor
 FAR = 3.0  # metres: nearer points show the beam's origin off the sensor's centre more than its elevation
 UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by this much (HDL-64E units do)
 SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams only; chance gives 0.25
+ENOUGH = 256  # points of a ring, evenly from all of it: their median is the ring's to a few thousandths of a degree
 POINTWISE = 0.6  # of points within a tenth of the spacing of some beam, for scans without rings; chance gives 0.2
 
 
@@ -59,12 +60,13 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
 
 
 def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
-    beams = [_far(xyz[ring == k]) for k in np.unique(ring)]
-    beams = [points for points in beams if len(points) >= 5]
-    if len(beams) < 2:
-        return None, f"{len(beams)} rings of at least 5 points"
-    beams.sort(key=lambda points: -np.median(elevations_of(points)))
-    middle = np.array([np.median(elevations_of(points)) for points in beams])
+    rings = [_far(points) for points in _split(xyz, ring) if len(points) >= 5]
+    if len(rings) < 2:
+        return None, f"{len(rings)} rings of at least 5 points"
+    beams = np.stack([points[np.linspace(0, len(points) - 1, ENOUGH).astype(int)] for points in rings])
+    middle = _elevation(beams, 0.0)
+    order = np.argsort(-middle, kind="stable")
+    beams, middle = beams[order], middle[order]
     found = f"{len(beams)} rings from {middle[0]:+.1f} to {middle[-1]:+.1f} degrees"
     errors = {name: e for name, s in SENSORS.items() if (e := _whole_error(beams, s)) is not None and e < UNIT}
     if errors:
@@ -77,28 +79,29 @@ def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
     return None, found
 
 
+def _split(xyz: np.ndarray, ring: np.ndarray) -> list[np.ndarray]:
+    """The points of each ring, in the order of the rings' numbers."""
+    order = np.argsort(ring, kind="stable")
+    return np.split(xyz[order], np.flatnonzero(np.diff(ring[order])) + 1)
+
+
 def _far(points: np.ndarray) -> np.ndarray:
     """The points beyond FAR, or all where those are too few: the lowest beams of a small robot's sensor."""
     far = points[np.hypot(points[:, 0], points[:, 1]) > FAR]
     return far if len(far) >= 5 else points
 
 
-def _whole_error(beams: list[np.ndarray], sensor: Sensor) -> float | None:
+def _whole_error(beams: np.ndarray, sensor: Sensor) -> float | None:
     """Median distance in degrees of the rings from the sensor's beams, taken in order; the sky may hide a few beams."""
     spare = sensor.height - len(beams)
     if not 0 <= spare <= 0.1 * sensor.height:
         return None
-    offsets = sensor.offsets or (0.0,) * sensor.height
-    return min(
-        float(np.median([
-            abs(_elevation(points, offsets[row]) - sensor.elevations[row])
-            for row, points in enumerate(beams, start=first)
-        ]))
-        for first in range(spare + 1)
-    )  # fmt: skip
+    offsets, table = np.array(sensor.offsets or (0.0,) * sensor.height), np.array(sensor.elevations)
+    places = [slice(first, first + len(beams)) for first in range(spare + 1)]
+    return min(float(np.median(np.abs(_elevation(beams, offsets[rows]) - table[rows]))) for rows in places)
 
 
-def _subset_error(beams: list[np.ndarray], sensor: Sensor) -> float | None:
+def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:
     """Mean distance of the rings from the nearest beams, in units of the spacing there; None if two meet one beam."""
     if len(beams) >= 0.9 * sensor.height or sensor.height < 32:
         return None
@@ -106,18 +109,19 @@ def _subset_error(beams: list[np.ndarray], sensor: Sensor) -> float | None:
     offsets = sensor.offsets or (0.0,) * sensor.height
     rows, errors = set(), []
     for points in beams:
-        plain = _elevation(points, 0.0)
+        plain = float(_elevation(points, 0.0))
         near = np.argsort(np.abs(table - plain))[:16]  # an offset of 0.2 m moves a near ring by a few beams
-        distance = {int(row): abs(_elevation(points, offsets[row]) - table[row]) / spacing[row] for row in near}
+        distance = {int(row): float(abs(_elevation(points, offsets[row]) - table[row])) / spacing[row] for row in near}
         row = min(distance, key=lambda r: distance[r])
         rows.add(row)
         errors.append(min(distance[row], 1.0))
     return float(np.mean(errors)) if len(rows) == len(beams) else None
 
 
-def _elevation(points: np.ndarray, offset: float) -> float:
-    """Median elevation in degrees of a ring's points, seen from a beam's origin `offset` metres above the sensor's."""
-    return float(np.median(elevations_of(points - np.array([0, 0, offset], points.dtype))))
+def _elevation(points: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
+    """(...) median elevations in degrees of rings (..., N, 3), seen from `offset` metres above the sensor's origin."""
+    height = points[..., 2] - np.asarray(offset, points.dtype)[..., None]
+    return np.median(np.degrees(np.arctan2(height, np.hypot(points[..., 0], points[..., 1]))), axis=-1)
 
 
 def _spacing(sensor: Sensor) -> np.ndarray:

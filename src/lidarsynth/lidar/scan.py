@@ -22,7 +22,7 @@ class Scan:
     time         (N,)   float, seconds relative to any fixed instant, or None
     label        (N,)   int, SemanticKITTI training class 0-19, or None
     extra        further fields of the file by name, each (N,), such as ambient or return_type; `new` is 1 for a point
-                 that was filled in, 0 for a measured one
+                 that was filled in, 0 for a measured one; `confidence` as in `RangeImage`, 1 for a measured one
 
     Raises ValueError when a shape does not fit.
     """
@@ -85,6 +85,8 @@ class RangeImage:
     label        (H, W) int, SemanticKITTI training class, 0 where nothing returned, or None
     xyz          (H, W, 3) float32, metres: the measured points themselves where the image came from a scan, or None
     completed    every point of the scan that was completed to this image, bit by bit, with the new ones, or None
+    confidence   (H, W) float32 in [0, 1]: of a filled pixel the estimated chance that its ray returns, and from no
+                 farther than 0.3 m + 2 % from the pixel's range; 1 where measured. None where the model gives none
 
     Raises ValueError when a shape does not fit.
     """
@@ -96,10 +98,11 @@ class RangeImage:
     label: np.ndarray | None = None
     xyz: np.ndarray | None = None
     completed: Scan | None = None
+    confidence: np.ndarray | None = None
 
     def __post_init__(self):
         shape = (self.sensor.height, self.sensor.width)
-        for name in ("range", "reflectance", "mask", "label"):
+        for name in ("range", "reflectance", "mask", "label", "confidence"):
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} must be {shape}, the sensor's beams and columns, got {value.shape}")
@@ -123,7 +126,22 @@ class RangeImage:
             return self.completed
         rows = np.broadcast_to(np.arange(self.shape[0])[:, None], self.shape)
         label = None if self.label is None else self.label[self.mask]
-        return Scan(self.points()[self.mask], self.reflectance[self.mask], ring=rows[self.mask], label=label)
+        extra = {} if self.confidence is None else {"confidence": self.confidence[self.mask]}
+        return Scan(self.points()[self.mask], self.reflectance[self.mask], rows[self.mask], None, label, extra)
+
+    def surer_than(self, least: float) -> RangeImage:
+        """The same image without the filled pixels, and `completed` without the new points, below a confidence.
+
+        Raises ValueError for a `least` outside 0 to 1, and where the model gave no confidence.
+        """
+        if not 0 <= least <= 1:
+            raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
+        if self.confidence is None:
+            raise ValueError("expected a completion with confidences, such as default's, found one without")
+        points = self.completed
+        if points is not None:
+            points = points[points.extra["confidence"] >= least]
+        return replace(self.keep(self.confidence >= least), completed=points)
 
     def keep(self, known: np.ndarray) -> RangeImage:
         """The same image with every pixel outside `known` (H, W) bool emptied."""

@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from lidarsynth.networks.rays import Rays, encode_range
+from lidarsynth.networks.running import running_max, size_of
 
 # The mean of the four sides by nearness; between the beams above and below, linear in code or in 1 / range; the surface
 # above or below as a wall; the one to the left or right; the ground above or below as a plane; the nearest at all.
@@ -57,7 +59,7 @@ def candidates(metres: Tensor, reflectance: Tensor, returned: Tensor, lit: Tenso
     inverse = (1 - share) / r[:, :1].clamp_min(0.1) + share / r[:, 1:2].clamp_min(0.1)
     plane = torch.where(both, encode_range(1 / inverse), column)
     sides = torch.where(found, encode_range(wall), cross)
-    grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250)), plane)
+    grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
     around = _around(code[:, 2:], distance[:, 2:], found[:, 2:], sides[:, 2:3], elevation)
     known = encode_range(metres)
     codes = torch.cat([cross, column, plane, sides, grounds, around], 1)
@@ -67,7 +69,7 @@ def candidates(metres: Tensor, reflectance: Tensor, returned: Tensor, lit: Tenso
 
 
 def _reflectances(reflectance: Tensor, lit: Tensor, returned: Tensor, sides: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    found, distance, source = sides if torch.equal(lit, returned) else _sides(lit)
+    found, distance, source = sides if _same(lit, returned) else _sides(lit)
     f = _take(reflectance, source)
     weight = found / distance.clamp_min(1)
     total = weight.sum(1, keepdim=True)
@@ -77,16 +79,21 @@ def _reflectances(reflectance: Tensor, lit: Tensor, returned: Tensor, sides: tup
     return torch.where(lit, reflectance, values)
 
 
+def _same(lit: Tensor, returned: Tensor) -> bool:
+    """Whether all known returns are lit; an exported network cannot ask."""
+    return lit is returned or (not torch.compiler.is_exporting() and torch.equal(lit, returned))
+
+
 def _sides(known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of the nearest known pixel above, below, left and right: whether there is one, its distance, its flat index."""
     height, width = known.shape[2:]
     rows = torch.arange(height, dtype=torch.int32)[:, None].expand(height, width)
     columns = torch.arange(width, dtype=torch.int32)[None].expand(height, width)
     k = known[:, 0]
-    above = torch.where(k, rows, -1).cummax(1).values
-    below = height - 1 - torch.where(k, rows, height).flip(1).sub(height - 1).neg().cummax(1).values.flip(1)
-    before = torch.where(k, columns, -1).cummax(2).values
-    after = width - 1 - torch.where(k, columns, width).flip(2).sub(width - 1).neg().cummax(2).values.flip(2)
+    above = _last(torch.where(k, rows, -1), 1)
+    below = height - 1 - _last(torch.where(k, rows, height).flip(1).sub(height - 1).neg(), 1).flip(1)
+    before = _last(torch.where(k, columns, -1), 2)
+    after = width - 1 - _last(torch.where(k, columns, width).flip(2).sub(width - 1).neg(), 2).flip(2)
     before = torch.where(before < 0, before[..., -1:] - width, before)
     after = torch.where(after >= width, after[..., :1] + width, after)
     found = torch.stack([above >= 0, below < height, before >= -width, after < 2 * width], 1)
@@ -94,6 +101,11 @@ def _sides(known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     row = torch.stack([above.clamp(0), below.clamp(max=height - 1), rows.expand_as(k), rows.expand_as(k)], 1)
     column = torch.stack([columns.expand_as(k)] * 2 + [before % width, after % width], 1)
     return found, distance, (row * width + column).long()
+
+
+def _last(place: Tensor, dim: int) -> Tensor:
+    """The last known place up to each, -1 for none."""
+    return running_max(place, dim, size_of(place, dim), -1)
 
 
 def _take(values: Tensor, source: Tensor) -> Tensor:
@@ -105,16 +117,13 @@ def _around(values: Tensor, distance: Tensor, found: Tensor, other: Tensor, elev
     """(B, 1, H, W): the nearest known value within two rows, by those to the left and right in each; else `other`."""
     far = torch.where(found, distance.square(), torch.inf)
     best, best_value = torch.full_like(other, torch.inf), other
+    tall, taller = F.pad(values, (0, 0, 2, 2)), F.pad(far, (0, 0, 2, 2), value=torch.inf)
     height = values.shape[2]
     for shift in (0, -1, 1, -2, 2):
-        a, b = max(0, shift), min(height, height + shift)
-        if a >= b:
-            continue
-        here = slice(a - shift, b - shift)
+        here = slice(2 + shift, 2 + shift + height)
         for side in (0, 1):
-            away = far[:, side : side + 1, a:b] + shift**2
-            closer = away < best[:, :, here]
-            best_value = best_value.clone() if best_value is other else best_value
-            best_value[:, :, here] = torch.where(closer, values[:, side : side + 1, a:b], best_value[:, :, here])
-            best[:, :, here] = torch.where(closer, away, best[:, :, here])
+            away = taller[:, side : side + 1, here] + shift**2
+            closer = away < best
+            best_value = torch.where(closer, tall[:, side : side + 1, here], best_value)
+            best = torch.minimum(best, away)
     return best_value

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.networks.candidates import RANGE_CANDIDATES, REFLECTANCE_CANDIDATES, Candidates, candidates
-from lidarsynth.networks.rays import Rays, encode_range
+from lidarsynth.networks.rays import Rays, decode_range, encode_range
 
 STEM = (4, 2)  # rows, columns of the patches that become channels
 NOISES = 3  # per pixel, along a ring, in patches
@@ -37,12 +37,16 @@ class Filled(NamedTuple):
     """code: range if the ray returns, in [-1, 1]; reflectance; logit: of returning. (B, 1, H, W) each.
 
     classes: logits of what the ray meets, (B, classes, H, W), where asked for.
+    spread: how far the candidates lie from the chosen range, in metres, each by its share in the choice (B, 1, H, W);
+    and `near` of the candidates (B, 4, H, W), where asked for.
     """
 
     code: Tensor
     reflectance: Tensor
     logit: Tensor
     classes: Tensor | None = None
+    spread: Tensor | None = None
+    near: Tensor | None = None
 
 
 class Block(nn.Module):
@@ -118,7 +122,7 @@ class FillUNet(nn.Module):
         nn.init.zeros_(self.out.bias)
         self.classes = Pointwise(2 * widths[0], classes * patch) if classes else None
 
-    def forward(self, known: Known, rays: Rays, noise: Tensor, classify: bool = False) -> Filled:
+    def forward(self, known: Known, rays: Rays, noise: Tensor, classify: bool = False, doubt: bool = False) -> Filled:
         with torch.no_grad():
             guesses = candidates(known.metres, known.reflectance, known.returned, known.lit, rays)
             x = _to_patches(inputs(known, rays, guesses, noise))
@@ -134,7 +138,10 @@ class FillUNet(nn.Module):
             h = F.interpolate(join(h), scale_factor=2, mode="nearest")
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
-        filled = _assemble(_to_pixels(self.out(h)), guesses, noise)
+        out = _to_pixels(self.out(h))
+        filled = _assemble(out, guesses, noise)
+        if doubt:
+            filled = filled._replace(spread=_spread(out, filled.code, guesses), near=guesses.near)
         if not classify:
             return filled
         if self.classes is None:
@@ -153,13 +160,22 @@ def _assemble(out: Tensor, guesses: Candidates, noise: Tensor) -> Filled:
     scores, shift, grain, f_scores, f_shift, f_gain, logit, gain = out.split(
         [RANGE_CANDIDATES, 1, 1, REFLECTANCE_CANDIDATES, 1, NOISES, 1, NOISES], 1
     )
-    prior = out.new_zeros(RANGE_CANDIDATES, 1, 1)
-    prior[1:3] = PRIOR
-    code = ((scores + prior).softmax(1) * guesses.code).sum(1, keepdim=True) + 0.1 * shift
+    code = (_shares(scores) * guesses.code).sum(1, keepdim=True) + 0.1 * shift
     code = code + 0.02 * grain * noise[:, :1]
     reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
     reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True)
     return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0)
+
+
+def _shares(scores: Tensor) -> Tensor:
+    prior = scores.new_zeros(RANGE_CANDIDATES, 1, 1)
+    prior[1:3] = PRIOR
+    return (scores + prior).softmax(1)
+
+
+def _spread(out: Tensor, code: Tensor, guesses: Candidates) -> Tensor:
+    away = (decode_range(guesses.code) - decode_range(code)).abs()
+    return (_shares(out[:, :RANGE_CANDIDATES]) * away).sum(1, keepdim=True)
 
 
 def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tensor:

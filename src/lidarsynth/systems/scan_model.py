@@ -335,10 +335,12 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
     mask = np.where(known, image.mask, filled.mask)
     reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
     points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
+    sure = None if filled.confidence is None else np.where(known, np.float32(1), filled.confidence)
     return RangeImage(
         range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
         reflectance=np.where(mask, reflectance, 0).astype(np.float32),
         mask=mask,
         sensor=filled.sensor,
         xyz=points,
+        confidence=sure,
     )

@@ -11,6 +11,7 @@ from torch import nn
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.description import Description
+from lidarsynth.systems.graph import Graph
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.training.task import Task
 
@@ -43,6 +44,8 @@ class System:
     transfer     (network, experiment, trained weights, their experiment, their name): copy weights into a fresh
                  network. Raises ValueError that says what does not fit; None where there is nothing to copy
     description  what is said of it
+    graph        (model, whether the number of columns is open) -> what an exported file holds. Raises ValueError for
+                 what cannot be exported; None where nothing of it can
     official     the reader of published checkpoints, if there is one
     """
 
@@ -53,3 +56,4 @@ class System:
     task: Callable[[Experiment], Task] | None = None
     transfer: Callable[[nn.Module, Experiment, nn.Module, Experiment, str], None] | None = None
     official: Official | None = None
+    graph: Callable[[Any, bool], Graph] | None = None

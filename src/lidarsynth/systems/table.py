@@ -18,6 +18,7 @@ from lidarsynth.networks.tensors import load_weights
 from lidarsynth.systems.cascade.family import CASCADE
 from lidarsynth.systems.diffusion.family import CONDITIONAL_UNET, EFFICIENT_UNET, REFINENET
 from lidarsynth.systems.gan.family import GAN
+from lidarsynth.systems.graph import Graph
 from lidarsynth.systems.interpolation.family import INTERPOLATION
 from lidarsynth.systems.memory import check_memory
 from lidarsynth.systems.model_card import card_text
@@ -99,6 +100,16 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
 def card_of(experiment: Experiment, repo_id: str = "owner/name") -> str:
     """`card_text` of any experiment. Raises ValueError as `system_of`."""
     return card_text(experiment, system_of(experiment).description, repo_id)
+
+
+def graph_of(model: ScanModel, open_columns: bool = False) -> Graph:
+    """What an exported file of the model holds. Raises ValueError for models that nothing can be exported of."""
+    graph = system_of(model.experiment).graph
+    if graph is None:
+        words = ", ".join(word for word, system in SYSTEMS.items() if system.graph)
+        raise ValueError(f"{model.experiment.name}: expected a network of {words} to export, found "
+                         f"{model.experiment.model.network}")  # fmt: skip
+    return graph(model, open_columns)
 
 
 def official_readers() -> dict[str, Official]:

@@ -39,6 +39,7 @@ class Job:
     corrupt    recipe to hide a part first, of complete
     sensor     that made the scans, None = recognised
     into       sensor of the result, of upsample
+    least      confidence of new points of complete and upsample, None = all
     times      as many beams as the scan's own, of upsample; None = the model's own number
     projection, width  of project
     transform  (4, 4) that was applied to the points, to be undone in the result, or None
@@ -53,6 +54,7 @@ class Job:
     corrupt: str | None = None
     sensor: str | None = None
     into: str | None = None
+    least: float | None = None
     times: int | None = None
     projection: str = "auto"
     width: int | None = None
@@ -172,9 +174,9 @@ def _made(
     assert model is not None
     if job.verb == "complete":
         sensor = None if job.sensor is None else get_sensor(job.sensor)
-        return complete_scan(model, scan, job.corrupt, job.how, on_step, sensor), ""
+        return complete_scan(model, scan, job.corrupt, job.how, on_step, sensor, job.least), ""
     sensor = named_sensor(scan, path, "--from", job.sensor)
-    filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times)
+    filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
 
 

@@ -54,27 +54,54 @@ def complete_scan(
     how: Filling = DEFAULT,
     on_step: OnStep = None,
     sensor: Sensor | None = None,
+    least: float | None = None,
 ) -> Filled:
     """Fill a scan; with a corruption `recipe` hide part of it first and judge the hidden pixels against it.
 
     sensor  that made the scan, for a model of any sensor; None = as recognised
+    least   confidence of new points that stay; None = all
 
-    Raises ValueError when no point is in view, or the recipe hides nothing.
+    Raises ValueError when no point is in view, the recipe hides nothing, or `least` meets a model without confidences.
     """
     model = model.suited_to(scan, sensor)
-    truth = model.image_of(scan)
     if recipe is None:
-        filled = model.filled(scan, how, on_step=on_step)
-        return Filled(filled, {"measured": truth, "completed": filled}, {})
+        filled = _sure(model.filled(scan, how, on_step=on_step), least)
+        return Filled(filled, {"measured": _measured(model, scan, filled), "completed": filled}, {})
+    truth = model.image_of(scan)
     if not truth.mask.any():
         raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
     known = corrupt(truth, recipe, how.seed)
     if known.all():
         raise ValueError(f"expected a corruption that hides at least one pixel, found {recipe!r}")
     before = truth.keep(known)
-    filled = model.filled(before, how, known, on_step)
+    filled = _sure(model.filled(before, how, known, on_step), least)
     shown = {f"input, {recipe}": before, "completed": filled, "truth": truth}
     return Filled(filled, shown, judged(filled, before, known, truth))
+
+
+def check_confident(model: ScanModel, how: Filling, least: float | None) -> None:
+    """Raises ValueError where new points are to have a `least` confidence that the model cannot give."""
+    name = model.experiment.name
+    if least is None:
+        return
+    if not 0 <= least <= 1:
+        raise ValueError(f"expected --min-confidence of 0 to 1, found {least:g}")
+    if model.experiment.confidence is None:
+        raise ValueError(f"{name}: expected a model with confidences, such as default, for --min-confidence, found one "
+                         "without")  # fmt: skip
+    if how.method not in ("auto", "conditional"):
+        raise ValueError(f"{name}: expected --method conditional for --min-confidence, found {how.method}")
+
+
+def _sure(filled: RangeImage, least: float | None) -> RangeImage:
+    return filled if least is None else filled.surer_than(least)
+
+
+def _measured(model: ScanModel, scan: Scan, filled: RangeImage) -> RangeImage:
+    """The scan's own image: the pixels of a filled one that hold measured points, where it says which."""
+    if filled.xyz is None:
+        return model.image_of(scan)
+    return filled.keep(np.any(filled.xyz != 0, axis=-1))
 
 
 def judged(filled: RangeImage, before: RangeImage, known: np.ndarray, truth: RangeImage) -> dict[str, Errors]:
@@ -91,12 +118,15 @@ def upsample_scan(
     how: Filling = DEFAULT,
     on_step: OnStep = None,
     times: int | None = None,
+    least: float | None = None,
 ) -> Filled:
     """Make a scan of `sensor_in`, which may have other beams than the model's, dense.
 
-    Raises ValueError when no point is in the model's view.
+    least  as in `complete_scan`
+
+    Raises ValueError when no point is in the model's view, or `least` meets a model without confidences.
     """
-    filled = model.upsampled(scan, how, sensor_in, on_step, times)
+    filled = _sure(model.upsampled(scan, how, sensor_in, on_step, times), least)
     measured = project(replace(scan, ring=None), filled.sensor, "spherical")
     return Filled(filled, {f"measured, {sensor_in.name}": measured, "upsampled": filled}, {})
 

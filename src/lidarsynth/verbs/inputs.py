@@ -303,7 +303,7 @@ def without_places(scan: Scan) -> Scan:
 
 
 def message_fields(filled: Scan, given: Fields) -> Fields:
-    """A filled scan as the columns that its message had, bit by bit for measured points, and `new`.
+    """A filled scan as the columns that its message had, bit by bit for measured points, and `new`, `confidence`.
 
     New points have their x y z, a reflectance in the message's own scale, the ring number that its row has there, and
     the time of the points in their direction; other fields are 0.
@@ -329,4 +329,5 @@ def message_fields(filled: Scan, given: Fields) -> Fields:
         order = np.flatnonzero(old)[np.argsort(azimuth[old])]
         nearest = np.searchsorted(azimuth[order], azimuth[new]).clip(0, len(order) - 1)
         fields[name][new] = fields[name][order[nearest]]
-    return fields | {"new": new.astype(np.uint8)}
+    sure = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
+    return fields | {"new": new.astype(np.uint8)} | sure

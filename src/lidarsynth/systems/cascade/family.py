@@ -12,6 +12,7 @@ from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.fill_unet import FillUNet
 from lidarsynth.networks.tensors import load_weights
 from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.cascade.graph import fill_graph
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.training import CASCADE as TASK
 from lidarsynth.systems.system import System
@@ -38,4 +39,4 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     load_weights(network, weights.state_dict(), name)
 
 
-CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer)
+CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer, graph=fill_graph)

@@ -22,9 +22,10 @@ from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
-from lidarsynth.networks.fill_unet import NOISES, Known, draw_noise
-from lidarsynth.networks.rays import decode_range, padded, rays_of
+from lidarsynth.networks.fill_unet import NOISES, Filled, Known, draw_noise
+from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -277,7 +278,12 @@ class CascadeModel(ScanModel):
         told[grid] |= hole
         return metres, reflectance, told
 
-    @torch.no_grad()
+    def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
+        """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
+        told = known | (self._blocked & ~image.mask)
+        filled, rays = self._network(image.range[None], image.reflectance[None], told[None], True, None, doubt=True)
+        return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
+
     def _fill(
         self,
         metres: np.ndarray,
@@ -287,6 +293,22 @@ class CascadeModel(ScanModel):
         rng: list[torch.Generator] | None,
     ) -> list[RangeImage]:
         """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples."""
+        weights = self.experiment.confidence if rng is None else None  # a sample is one of many
+        filled, rays = self._network(metres, reflectance, told, lit, rng, doubt=weights is not None)
+        sure = [None] * len(metres) if weights is None else list(confidence(filled, rays, weights))
+        return [self._image(*parts) for parts in zip(*filled[:3], sure, strict=True)]
+
+    @torch.inference_mode()
+    def _network(
+        self,
+        metres: np.ndarray,
+        reflectance: np.ndarray,
+        told: np.ndarray,
+        lit: bool,
+        rng: list[torch.Generator] | None,
+        doubt: bool,
+    ) -> tuple[Filled, Rays]:
+        """What the fill makes of (B, H, W) known pixels, with its padding, and the rays it was told."""
         count, (height, width) = len(metres), padded(self.sensor)
         known = _known(metres, reflectance, told, lit, (height, width))
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
@@ -296,17 +318,17 @@ class CascadeModel(ScanModel):
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = type(rays)(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
-        filled = self.network.fill(known, rays, noise.to(device))
-        return [self._image(*parts) for parts in zip(*filled[:3], strict=True)]
+        return self.network.fill(known, rays, noise.to(device), doubt=doubt), rays
 
-    def _image(self, code: Tensor, reflectance: Tensor, logit: Tensor) -> RangeImage:
+    def _image(self, code: Tensor, reflectance: Tensor, logit: Tensor, sure: Tensor | None) -> RangeImage:
         """The image of (1, H', W') outputs, without their padding."""
         height, width, sensor = self.sensor.height, self.sensor.width, self.sensor
         distance = decode_range(code)[0, :height, :width].cpu().numpy()
         mask = (logit[0, :height, :width] > 0).cpu().numpy() & (distance <= sensor.max_range) & ~self._blocked
         mask &= distance >= sensor.min_range
         shade = reflectance[0, :height, :width].clamp(0, 1).cpu().numpy()
-        return RangeImage(distance * mask, shade * mask, mask, sensor)
+        chance = None if sure is None else sure[0, :height, :width].cpu().numpy()
+        return RangeImage(distance * mask, shade * mask, mask, sensor, confidence=chance)
 
     @property
     def _blocked(self) -> np.ndarray:

@@ -12,6 +12,7 @@ from lidarsynth.systems.diffusion import official_lidargen
 from lidarsynth.systems.diffusion.build import build_denoiser, conditional_unet, efficient_unet, refinenet
 from lidarsynth.systems.diffusion.description import DESCRIPTION
 from lidarsynth.systems.diffusion.finetune import transfer
+from lidarsynth.systems.diffusion.graph import completion_graph, step_graph
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.diffusion.score_matching import SCORE
 from lidarsynth.systems.diffusion.training import DIFFUSION
@@ -29,7 +30,7 @@ def task(experiment: Experiment) -> Task:
     return DIFFUSION if experiment.score is None else SCORE
 
 
-EFFICIENT_UNET = System("diffusion", efficient_unet, DESCRIPTION, model, task, transfer)
-CONDITIONAL_UNET = replace(EFFICIENT_UNET, build=conditional_unet)
+EFFICIENT_UNET = System("diffusion", efficient_unet, DESCRIPTION, model, task, transfer, graph=step_graph)
+CONDITIONAL_UNET = replace(EFFICIENT_UNET, build=conditional_unet, graph=completion_graph)
 LIDARGEN = Official("lidargen", official_lidargen.belongs, official_lidargen.read)
 REFINENET = replace(EFFICIENT_UNET, build=refinenet, official=LIDARGEN)

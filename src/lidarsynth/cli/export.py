@@ -1,0 +1,30 @@
+"""The verb `export`: a model as one ONNX file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from lidarsynth.cli.arguments import NoSeed, Positional, SensorWord, Source, arg
+from lidarsynth.cli.terminal import load_with_bar, say
+
+
+def export(
+    model: Positional[Source],
+    out: Annotated[Positional[Path], arg(metavar="OUT.onnx", help="file to write.")],
+    sensor: SensorWord = None,
+    any_columns: Annotated[bool, arg(help="leave the number of columns open, in multiples of 16; of default.")] = False,
+    seed: NoSeed = 0,
+) -> None:
+    """Write a model as ONNX: completion in one step of default, kitti, kitti-streets; of others a denoising step.
+
+    It takes a minute. With the extra onnx; to run the file, onnxruntime and numpy are enough: examples/onnx_complete.py.
+    """
+    from lidarsynth.verbs.export import export_onnx
+
+    done = export_onnx(load_with_bar(model, "cpu"), out, sensor, any_columns)
+    say(f"wrote {done.path}: {done.does}, {done.sensor.name}, opset {done.opset}, {done.size / 1e6:.1f} MB")
+    for name, shape in {**done.inputs, **done.outputs}.items():
+        kind = "in " if name in done.inputs else "out"
+        what = done.says.get(name.removeprefix("filled_"), "")
+        say(f"  {kind} {name:<18} float32 {' x '.join(map(str, shape)):<22} {what}")

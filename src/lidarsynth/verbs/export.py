@@ -1,0 +1,118 @@
+"""A model as one ONNX file that says what it is (the extra `onnx`)."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.networks.running import LONGEST
+from lidarsynth.systems.graph import Graph
+from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.systems.table import graph_of
+
+OPSET = 18
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written.
+
+    inputs, outputs  name -> shape; a number, or `columns` where it is open
+    """
+
+    path: Path
+    does: str
+    opset: int
+    sensor: Sensor
+    inputs: Mapping[str, tuple[int | str, ...]]
+    outputs: Mapping[str, tuple[int | str, ...]]
+    says: Mapping[str, str]
+    size: int
+
+
+def export_onnx(model: ScanModel, path: str | Path, sensor: str | None = None, open_columns: bool = False) -> Exported:
+    """Write the model as ONNX: completion in one step of a cascade and of conditional models, else a denoising step.
+
+    sensor        of the images, for a model of any sensor; None = the model's own
+    open_columns  inputs may have any number of columns, in multiples of 16, up to 4,096
+
+    The file's metadata name the sensor (JSON), what inputs and outputs are, the model and its licence.
+    Raises ValueError for other models, for a name without .onnx, and where the extra `onnx` is missing.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".onnx" or path.is_dir() or not path.absolute().parent.is_dir():
+        raise ValueError(f"{path}: expected the name of a file in an existing folder that ends in .onnx")
+    model = model if sensor in (None, model.sensor.name) else model.into(get_sensor(sensor))
+    graph = graph_of(model, open_columns)
+    proto = _program(graph)
+    shapes = _shapes(proto.graph.input), _shapes(proto.graph.output)
+    _describe(proto, model, graph)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        scratch.write_bytes(proto.SerializeToString())
+        os.replace(scratch, path)
+    except OSError as error:
+        raise ValueError(f"{path}: expected a writable folder with room, found: {error.strerror}") from None
+    finally:
+        scratch.unlink(missing_ok=True)
+    opset = next(entry.version for entry in proto.opset_import if not entry.domain)
+    return Exported(path, graph.does, opset, model.sensor, *shapes, graph.says, path.stat().st_size)
+
+
+def _program(graph: Graph) -> Any:
+    """The ONNX model of a graph."""
+    try:
+        import onnx  # noqa: F401
+        from onnxscript import optimizer
+    except ImportError:
+        raise ValueError("expected the packages onnx and onnxscript; pip install 'lidarsynth[onnx]'") from None
+    columns = torch.export.Dim("blocks", min=2, max=LONGEST // graph.multiple) * graph.multiple
+    shapes = {name: {3: columns} for name in graph.inputs} if graph.open_columns else None
+    module = graph.module.cpu()
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of the exporter about itself
+        program = torch.onnx.export(
+            module,
+            kwargs=dict(graph.inputs),
+            dynamo=True,
+            optimize=False,  # its rewriting of torch 2.13 leaves names without a node
+            opset_version=OPSET,
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            dynamic_shapes=shapes,
+            verbose=False,
+        )
+    assert program is not None
+    optimizer.fold_constants(program.model)
+    optimizer.remove_unused_nodes(program.model)
+    return program.model_proto
+
+
+def _shapes(values: Any) -> dict[str, tuple[int | str, ...]]:
+    return {v.name: tuple(d.dim_value or "columns" for d in v.type.tensor_type.shape.dim) for v in values}
+
+
+def _describe(proto: Any, model: ScanModel, graph: Graph) -> None:
+    card = model.experiment.card
+    facts = {
+        "model": model.experiment.name,
+        "does": graph.does,
+        "sensor": json.dumps(model.sensor.to_dict()),
+        "licence": card.licence,
+        "data": card.data,
+        **{f"about {name}": text for name, text in graph.says.items() if name in (*graph.inputs, *graph.outputs)},
+    }
+    if graph.open_columns:
+        facts["columns"] = f"any multiple of {graph.multiple} up to {LONGEST}"
+    proto.producer_name = "lidarsynth"
+    for key, value in facts.items():
+        entry = proto.metadata_props.add()
+        entry.key, entry.value = key, value

@@ -1,0 +1,141 @@
+"""Exported files: the same scans as the model's by another program; they say what they are; others are refused."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lidarsynth as ls
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Confidence, Data, Experiment, Model, with_fields
+from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import CoarseUNet
+from lidarsynth.networks.fill_unet import FillUNet
+from lidarsynth.networks.running import running_max
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.table import assemble, build_network, graph_of
+from lidarsynth.verbs.export import Exported, export_onnx
+
+ROOT = Path(__file__).resolve().parents[1]
+SENSOR = ls.Sensor("small", tuple(np.linspace(5, -25, 20).tolist()), 64, 0.5, 120.0, mount=1.8)
+WEIGHTS = Confidence(-1.0, -0.5, 0.3, -0.2, -0.1, -0.4, 0.7)
+MATES = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
+
+
+def cascade() -> CascadeModel:
+    torch.manual_seed(0)
+    fill = FillUNet((16, 16), (1, 1))
+    torch.nn.init.normal_(fill.out.weight, std=0.02)
+    network = Cascade(CoarseUNet(32, (1, 2, 2, 2), 1), fill).eval()
+    record = Experiment("test", Data(sensor=SENSOR.to_dict()), Model(network="cascade"), confidence=WEIGHTS)
+    return CascadeModel(network, SENSOR, record)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return export_onnx(cascade(), tmp_path_factory.mktemp("onnx") / "fill.onnx", open_columns=True)
+
+
+def run(path: Path, **inputs: np.ndarray) -> list[np.ndarray]:
+    session = MATES.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return session.run(None, inputs)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("dim", [0, 1, 2, -1])
+def test_doubling_is_the_running_maximum(dim: int):
+    x = torch.randint(-1, 50, (3, 17, 33), generator=torch.Generator().manual_seed(1), dtype=torch.int32)
+    for size in (x.shape[dim], 64):
+        assert torch.equal(running_max(x, dim, size, -1), x.cummax(dim).values)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("width", "recipe"), [(64, "beams:4"), (128, "points:0.2"), (48, "sector:90")])
+def test_the_fill_is_the_models_for_any_number_of_columns(exported: Exported, width: int, recipe: str):
+    model = cascade().into(SENSOR.resized(width=width))
+    image = SyntheticStreets(3, 1, model.sensor).image(0)
+    known = corrupt(image, recipe)
+    sparse = image.keep(known)
+    arrays = {"range": sparse.range, "reflectance": sparse.reflectance, "known": known.astype(np.float32)}
+    found = run(exported.path, **{name: values[None, None] for name, values in arrays.items()})
+    filled = model.fill(sparse, known, Filling("conditional", 1))
+    for values, expected in zip(found, (filled.range, filled.reflectance, filled.confidence), strict=True):
+        np.testing.assert_allclose(values[0, 0], expected, rtol=1e-4, atol=2e-4)
+    np.testing.assert_array_equal(found[0][0, 0][known & sparse.mask], sparse.range[known & sparse.mask])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_file_says_what_it_is(exported: Exported):
+    import onnx
+
+    proto = onnx.load(str(exported.path))
+    onnx.checker.check_model(proto)
+    facts = {entry.key: entry.value for entry in proto.metadata_props}
+    assert json.loads(facts["sensor"])["elevations"] == list(SENSOR.elevations)
+    assert facts["does"] == "completion in one step" and "multiple of 16" in facts["columns"]
+    assert exported.opset == 18 and exported.inputs["range"] == (1, 1, 20, "columns")
+    assert list(exported.outputs) == ["filled_range", "filled_reflectance", "confidence"]
+    assert [path.name for path in exported.path.parent.iterdir()] == ["fill.onnx"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_conditional_model_completes_and_another_takes_one_step(tmp_path: Path):
+    small = {"data.sensor": SENSOR.rows(range(16)).to_dict(), "data.height": 16, "data.width": 64}
+    small |= {"model.base_channels": 8, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1)}
+    small |= {"model.gn_num_groups": 4, "model.attn_num_heads": 2, "data.mend": False, "data.projection": "spherical"}
+    torch.manual_seed(1)
+    experiment = with_fields(preset("kitti-streets"), small | {"model.stem": (1, 1)})
+    network = build_network(experiment)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    model = assemble(experiment, network)
+    image = SyntheticStreets(3, 1, model.sensor).image(0)
+    known = corrupt(image, "points:0.2")
+    sparse = image.keep(known)
+    noise = torch.randn(2, 16, 64, generator=torch.Generator().manual_seed(5))[None].numpy()  # that of seed 5
+    path = export_onnx(model, tmp_path / "complete.onnx").path
+    arrays = {"range": sparse.range, "reflectance": sparse.reflectance, "known": known.astype(np.float32)}
+    found = run(path, noise=noise, **{name: values[None, None] for name, values in arrays.items()})
+    filled = model.fill(sparse, known, model.resolved(Filling(seed=5)))
+    np.testing.assert_allclose(found[0][0, 0], filled.range, rtol=1e-3, atol=1e-2)
+    np.testing.assert_allclose(found[1][0, 0], filled.reflectance, rtol=1e-3, atol=1e-3)
+
+
+def test_what_cannot_be_exported_is_said_in_a_line(tmp_path: Path):
+    for model in (ls.load("bilinear"),):
+        with pytest.raises(ValueError, match="expected a network of cascade, .* to export, found bilinear"):
+            export_onnx(model, tmp_path / "x.onnx")
+    with pytest.raises(ValueError, match="ends in .onnx"):
+        export_onnx(cascade(), tmp_path / "x.pt")
+    tilted = cascade().into(replace(SENSOR, tilt=(1.0, 0.0)))
+    with pytest.raises(ValueError, match="without tilt and blocked rays"):
+        graph_of(tilted, open_columns=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_example_needs_no_torch(exported: Exported, tmp_path: Path):
+    scan = SyntheticStreets(4, 1, SENSOR).image(0).to_scan()
+    ls.write(tmp_path / "scan.pcd", replace(scan, ring=None, label=None))
+    program = [sys.executable, "-X", "importtime", str(ROOT / "examples" / "onnx_complete.py")]
+    done = subprocess.run([*program, str(exported.path), str(tmp_path / "scan.pcd"), str(tmp_path / "dense.npy")],
+                          capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert " torch" not in done.stderr and " lidarsynth" not in done.stderr
+    dense = np.load(tmp_path / "dense.npy")
+    np.testing.assert_array_equal(dense[: len(scan), :3], scan.xyz)
+    assert dense.shape[1] == 5 and len(dense) > len(scan)
+    filled = cascade().complete(scan)
+    assert abs(len(dense) - len(filled.to_scan())) < 0.1 * len(filled.to_scan())
