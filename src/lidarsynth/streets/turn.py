@@ -21,7 +21,7 @@ class Turn:
     rays, points (H, W, 3) float32: the beams' directions and where they ended, metres, in the sensor frame of the
     moment each was sent, (0, 0, 0) for none; distance (H, W) float32 m along the ray, 0 for none; reflectance, label
     (H, W); face, first (H, W) int32: the triangle of the return and the one met first, maybe a pane, -1 for none;
-    surface (H, W) float32 m, surface_label: where exactly that one is within the sensor's limits, 0 for none; its class.
+    surface (H, W) float32 m, surface_label: where exactly that one is within the sensor's limits, 0 for none; class.
     """
 
     rays: np.ndarray
