@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -68,6 +68,13 @@ def _whole(seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, empty: i
     image = np.full(seen.shape, empty, kind)
     image[seen] = values
     return image
+
+
+def perfect(turn: Turn, sensor: Sensor) -> Turn:
+    """The turn as a simulator casts it: each beam reports exactly what it meets first, panes too, reflectance 0."""
+    points, dark = local_points(turn.rays, turn.surface, sensor), np.zeros_like(turn.reflectance)
+    face = np.where(turn.surface > 0, turn.first, -1)
+    return replace(turn, points=points, distance=turn.surface, reflectance=dark, label=turn.surface_label, face=face)
 
 
 def world_rays(
