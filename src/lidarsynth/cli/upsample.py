@@ -8,6 +8,7 @@ from typing import Annotated
 from lidarsynth.cli.arguments import (
     Device,
     Intensity,
+    Labels,
     Method,
     Output,
     Picture,
@@ -41,6 +42,7 @@ def upsample(
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
+    labels: Labels = False,
     picture: Picture = True,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
@@ -51,5 +53,6 @@ def upsample(
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    job = Job("upsample", model, device, how, sensor=sensor_in, into=sensor_out, times=times, picture=picture)
+    job = Job("upsample", model, device, how, sensor=sensor_in, into=sensor_out, times=times,
+        picture=picture, labels=labels)  # fmt: skip
     work_through(job, scans, out, many, intensity)

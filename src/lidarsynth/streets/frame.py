@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import KINDS, actors_of, numbers_of
 from lidarsynth.streets.areas import TODAY, Density
@@ -22,8 +23,6 @@ from lidarsynth.streets.turn import Turn, attitudes, perfect, sensor_pose, shoot
 from lidarsynth.streets.weather import CLEAR, Weather
 from lidarsynth.streets.world import POSES, World
 
-# SemanticKITTI's raw class of each training class, where nothing says more.
-RAW = np.array([0, 10, 11, 15, 18, 13, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81], np.uint32)
 OUTLIER = np.uint32(1)  # returns of rain and fog
 
 
