@@ -5,15 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from networks import trained
+from networks import tiny_cascade
 from test_cascade import SMALL, perfect
 
 from lidarsynth.cli.main import main
-from lidarsynth.experiment.record import Data, Experiment, Model
 from lidarsynth.files.formats import read, write, write_labels
 from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.weights.load import load
 
 WORDS = ("--sensor", "own.toml", "--no-picture")
@@ -23,11 +21,7 @@ WORDS = ("--sensor", "own.toml", "--no-picture")
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a model, a sensor and a perfect scan."""
     monkeypatch.chdir(tmp_path)
-    shape = Model(network="cascade", base_channels=16, channel_multipliers=(1, 1, 1, 1),
-                  num_residual_blocks=(1, 1, 1, 1), classes=20)  # fmt: skip
-    experiment = Experiment("tiny", Data(sensor=SMALL.to_dict(), height=24, width=256), shape)
-    network = trained(experiment)
-    CascadeModel(network, SMALL, experiment).save("model")  # type: ignore[arg-type]
+    tiny_cascade(SMALL).save("model")
     elevations = list(SMALL.elevations)
     Path("own.toml").write_text(
         f"elevations = {elevations}\nwidth = 256\nmin_range = 0.5\nmax_range = 120.0\nmount = 1.8\n"
