@@ -27,7 +27,7 @@ from lidarsynth.networks.rays import decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
-from lidarsynth.systems.cascade.perfect import fitting, observed
+from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, sensor_that_made, with_known
@@ -315,7 +315,10 @@ class CascadeModel(ScanModel):
     def _answers(
         self, known: Known, rng: list[torch.Generator] | None, surely: np.ndarray | None = None
     ) -> list[RangeImage]:
-        """Images of (B, 1, H', W') padded pixels; `surely` (B, H, W) metres are those of rays, where they return."""
+        """Images of (B, 1, H', W') padded pixels.
+
+        surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
+        """
         count, _, height, width = known.told.shape
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
@@ -325,6 +328,8 @@ class CascadeModel(ScanModel):
         known = Known(*(part.to(device) for part in known))
         rays = type(rays)(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         code, *parts = self.network.fill(known, rays, noise.to(device), classify=self.labelled)
+        if surely is not None and rng is not None:
+            parts[1] = parts[1] + logistic(parts[1], rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(code)[:, 0, :height, :width].cpu().numpy() if surely is None else surely
         parts = [[None] * count if part is None else part[:, :, :height, :width] for part in parts]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lidarsynth.lidar.projection import pixel_of_points, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -22,6 +24,12 @@ def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
     if sensor.width / ALIKE <= full <= sensor.width * ALIKE:
         return sensor
     return sensor.resized(width=int(np.clip(full, *COLUMNS)))
+
+
+def logistic(logit: Tensor, rng: list[torch.Generator]) -> Tensor:
+    """Noise of the standard logistic distribution: `logit` plus it is positive with the chance of the logit."""
+    draw = torch.cat([torch.rand((1, *logit.shape[1:]), generator=one) for one in rng]).clamp(1e-6, 1 - 1e-6)
+    return torch.logit(draw).to(logit)
 
 
 def observed(scan: Scan, image: RangeImage, answer: RangeImage, projection: str) -> RangeImage:
