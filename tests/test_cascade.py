@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from lidarsynth.experiment.record import Data, Experiment, Model
 from lidarsynth.lidar.corruption import corrupt
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks import fill_unet
 from lidarsynth.networks.candidates import candidates
@@ -18,7 +18,8 @@ from lidarsynth.networks.coarse_unet import CoarseUNet, grid_columns, grid_rays,
 from lidarsynth.networks.fill_unet import NOISES, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import decode_range, encode_range, level_sines, padded, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.systems.cascade.model import CascadeModel, spread
+from lidarsynth.systems.cascade.known import spread
+from lidarsynth.systems.cascade.model import CascadeModel
 
 SMALL = Sensor("small", tuple(np.linspace(5, -25, 24).tolist()), 256, 0.5, 120.0, mount=1.8)
 
@@ -228,3 +229,79 @@ def test_a_scan_is_completed_in_its_own_sensor_until_another_is_named(model: Cas
         model.into("hdl-32e").upsample(scan, "vlp-16", times=2)
     with pytest.raises(ValueError, match="name the sensor"):
         model.complete(replace(scan, xyz=scan.xyz[:, [2, 0, 1]], ring=None))
+
+
+@pytest.fixture(scope="module")
+def learned(model: CascadeModel) -> CascadeModel:
+    """The untrained cascade with a head of classes, most rays returning."""
+    torch.manual_seed(1)
+    fill = FillUNet((16, 16, 16, 16), classes=20).eval()
+    fill.load_state_dict(model.network.fill.state_dict(), strict=False)
+    torch.nn.init.normal_(fill.out.weight, std=0.3)
+    experiment = replace(model.experiment, model=replace(model.experiment.model, classes=20))
+    return replace(model, network=Cascade(model.network.coarse, fill), experiment=experiment)
+
+
+def perfect(sensor: Sensor) -> Scan:
+    """Ground and a round wall, a ray per pixel, with every field; times tell the points apart."""
+    metres = np.minimum(20.0, sensor.mount / np.maximum(-sensor.directions()[..., 2], 1e-3)).astype(np.float32)
+    scan = RangeImage(metres, np.zeros_like(metres), metres > 0, sensor, np.full(metres.shape, 9)).to_scan()
+    numbers = np.arange(len(scan))
+    return replace(scan, time=numbers * 1e-5, extra={"object": numbers.astype(np.uint32)})
+
+
+def test_realised_points_are_the_simulators_bit_by_bit(learned: CascadeModel):
+    scan = perfect(SMALL)
+    real = learned.into(SMALL).realise(scan)
+    assert 0.05 * len(scan) < len(real) < 0.98 * len(scan) and real.reflectance.std() > 0.01
+    place = real.extra["object"].astype(int)
+    assert np.all(np.diff(place) > 0)
+    for name in ("xyz", "time", "ring", "label"):
+        np.testing.assert_array_equal(getattr(real, name), getattr(scan, name)[place])
+    again, other = (learned.realise(scan, SMALL, seed) for seed in (0, 1))
+    np.testing.assert_array_equal(again.extra["object"], real.extra["object"])
+    np.testing.assert_array_equal(again.reflectance, real.reflectance)
+    assert len(np.intersect1d(other.extra["object"], place)) < len(place)
+    bright = replace(scan, reflectance=np.full(len(scan), 0.7, np.float32))
+    np.testing.assert_array_equal(learned.realise(bright, SMALL).reflectance, real.reflectance)
+
+
+def test_what_a_sensor_cannot_see_is_never_realised(learned: CascadeModel):
+    sensor = replace(SMALL, blocked=((23, 0, 99),), max_range=15.0)
+    scan = perfect(SMALL)
+    real = learned.realise(scan, sensor)
+    depth = np.linalg.norm(real.xyz, axis=1)
+    assert depth.max() <= 15 < np.linalg.norm(scan.xyz, axis=1).max()
+    assert real.ring is not None
+    image = learned.realised(scan, sensor)
+    assert not image.mask[23, :100].any() and image.mask[23, 100:].any() and image.completed is not None
+    with pytest.raises(ValueError, match=r"expected points within .* found none"):
+        learned.realise(np.array([[0.0, 0.0, 50.0]]), SMALL)
+
+
+def test_a_scan_with_other_columns_keeps_its_own(learned: CascadeModel):
+    dense = replace(SMALL, width=1000)
+    assert learned.realised(perfect(dense), SMALL).shape == (24, 1000)
+    assert learned.realised(perfect(replace(SMALL, width=250)), SMALL).shape == (24, 256)
+    lone = learned.realise(perfect(dense), SMALL)
+    assert np.unique(lone.extra["object"]).size == len(lone)
+
+
+def test_models_without_classes_refuse_in_one_line(model: CascadeModel):
+    with pytest.raises(ValueError, match="test: expected a model that has learned which rays return"):
+        model.realise(perfect(SMALL), SMALL)
+    with pytest.raises(ValueError, match="test: expected a model that has learned classes"):
+        model.with_labels()
+
+
+def test_classes_come_with_generated_and_completed_scans(learned: CascadeModel):
+    (image,) = learned.generate(1, steps=2, labels=True)
+    (plain,) = learned.generate(1, steps=2)
+    assert image.label is not None and plain.label is None
+    np.testing.assert_array_equal(image.range, plain.range)
+    assert set(np.unique(image.label[image.mask])) <= set(range(1, 20)) and not image.label[~image.mask].any()
+    scan = replace(perfect(SMALL)[::3], label=None)
+    filled = learned.into(SMALL).with_labels().complete(scan).to_scan()
+    assert filled.label is not None and filled.label.min() >= 1
+    own = learned.into(SMALL).with_labels().complete(perfect(SMALL)[::3]).to_scan()
+    assert own.label is not None and np.all(own.label[own.extra["new"] == 0] == 9)

@@ -92,7 +92,11 @@ def test_the_file_says_what_it_is(exported: Exported):
 @pytest.mark.timeout(900)
 def test_a_conditional_model_completes_and_another_takes_one_step(tmp_path: Path):
     small = {"data.sensor": SENSOR.rows(range(16)).to_dict(), "data.height": 16, "data.width": 64}
-    small |= {"model.base_channels": 8, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1)}
+    small |= {
+        "model.base_channels": 8,
+        "model.channel_multipliers": (1, 1, 1, 1),
+        "model.num_residual_blocks": (1, 1, 1, 1),
+    }
     small |= {"model.gn_num_groups": 4, "model.attn_num_heads": 2, "data.mend": False, "data.projection": "spherical"}
     torch.manual_seed(1)
     experiment = with_fields(preset("kitti-streets"), small | {"model.stem": (1, 1)})
@@ -114,9 +118,9 @@ def test_a_conditional_model_completes_and_another_takes_one_step(tmp_path: Path
 
 def test_what_cannot_be_exported_is_said_in_a_line(tmp_path: Path):
     for model in (ls.load("bilinear"),):
-        with pytest.raises(ValueError, match="expected a network of cascade, .* to export, found bilinear"):
+        with pytest.raises(ValueError, match=r"expected a network of cascade, .* to export, found bilinear"):
             export_onnx(model, tmp_path / "x.onnx")
-    with pytest.raises(ValueError, match="ends in .onnx"):
+    with pytest.raises(ValueError, match=r"ends in \.onnx"):
         export_onnx(cascade(), tmp_path / "x.pt")
     tilted = cascade().into(replace(SENSOR, tilt=(1.0, 0.0)))
     with pytest.raises(ValueError, match="without tilt and blocked rays"):

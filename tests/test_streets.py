@@ -228,3 +228,16 @@ def test_wrong_options_are_named():
         draw_drive(0, 0, 3600, speed=30.0)
     with pytest.raises(IndexError, match=r"0\.\.3, got 4"):
         LabelledStreets(0, 4, Sensor("line", (-10.0,), 64))[4]
+
+
+def test_a_perfect_sensor_reports_what_its_beams_meet(still: list[Frame]):
+    """The same beams: all that was seen and more of it, without noise or reflectance, and no weather."""
+    real, perfect = still[0], LabelledStreets(0, 48, SMALL, Options(perfect=True))[4]
+    assert len(perfect.scan) > len(real.scan) and not perfect.scan.reflectance.any()
+    assert perfect.scan.ring is not None and real.scan.ring is not None
+    places = [set(zip(f.scan.ring.tolist(), f.scan.time.tolist(), strict=True)) for f in (perfect, real)]  # type: ignore[union-attr]
+    assert len(places[1] - places[0]) < 0.001 * len(places[1])
+    assert sum(b.points for b in perfect.boxes) >= 0.95 * sum(b.points for b in real.boxes)
+    assert [b.centre for b in perfect.boxes] == [b.centre for b in real.boxes]
+    with pytest.raises(ValueError, match="expected clear weather"):
+        Options(perfect=True, weather=Weather(rain=1))

@@ -48,6 +48,7 @@ Intensity = Annotated[
     arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),
 ]
 Picture = Annotated[bool, arg(help="write a .png beside each file.")]
+Labels = Annotated[bool, arg(help="SemanticKITTI's class of each point too: a field, and of .bin and .npy a .label.")]
 Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the range image.")]
 Recipe = Annotated[
     str | None,

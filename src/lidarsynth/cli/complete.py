@@ -8,6 +8,7 @@ from typing import Annotated
 from lidarsynth.cli.arguments import (
     Device,
     Intensity,
+    Labels,
     Least,
     Method,
     Picture,
@@ -37,6 +38,7 @@ def complete(
     device: Device = "cpu",
     intensity: Intensity = "auto",
     sensor: SensorWord = None,
+    labels: Labels = False,
     picture: Picture = True,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
@@ -52,7 +54,17 @@ def complete(
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
     how = Filling(method, steps, resamples, seed=seed)
-    job = Job("complete", model, device, how, corrupt=corrupt, sensor=sensor, picture=picture, least=min_confidence)
+    job = Job(
+        "complete",
+        model,
+        device,
+        how,
+        corrupt=corrupt,
+        sensor=sensor,
+        picture=picture,
+        least=min_confidence,
+        labels=labels,
+    )
     results = [result for result in work_through(job, scans, out, many, intensity) if result.errors]
     if len(results) <= PICTURES:
         for result in results:

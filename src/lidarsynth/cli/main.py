@@ -14,6 +14,7 @@ from lidarsynth.cli.export import export
 from lidarsynth.cli.generate import generate
 from lidarsynth.cli.info import info
 from lidarsynth.cli.project import project
+from lidarsynth.cli.realise import realise
 from lidarsynth.cli.sensor import sensor
 from lidarsynth.cli.streets import streets
 from lidarsynth.cli.terminal import answer
@@ -26,6 +27,7 @@ VERBS = {
     "generate": generate,
     "complete": complete,
     "upsample": upsample,
+    "realise": realise,
     "project": project,
     "view": view,
     "sensor": sensor,

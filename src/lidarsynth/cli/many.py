@@ -1,4 +1,4 @@
-"""What `complete`, `upsample` and `project` share: options for many scans, running them, and what is said of it."""
+"""What `complete`, `upsample`, `realise` and `project` share: options for many scans, running and reporting them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     if many.workers < 0:
         raise ValueError(f"expected --workers of at least 0, found {many.workers}")
     transform = read_transform(many.transform, many.mount)
-    inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform))
+    inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise"))
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
@@ -75,9 +75,12 @@ def _model(job: Job) -> ScanModel | None:
     if job.verb == "project":
         return None
     model = load_with_bar(job.model, job.device)
+    if job.verb == "realise":
+        model.check_realises()
+        return model
     model.resolved(job.how)
     check_confident(model, job.how, job.least)
-    return model
+    return model.with_labels() if job.labels else model
 
 
 def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
@@ -86,7 +89,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
 
     work = list(works(inputs, out, "ply"))
     model = _model(job)
-    calls = 1 if model is None else model.calls(model.resolved(job.how))
+    calls = 1 if model is None or job.verb == "realise" else model.calls(model.resolved(job.how))
     with step_bar(work[0].item.path.name, calls) as on_step:
         (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:
@@ -145,7 +148,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     out.parent.mkdir(parents=True, exist_ok=True)
     with write_bag(out) as writer, scan_bar(job.verb, inputs.count) as on_scan:
         topic = _copied(paths[0], writer, many)
-        stream = (Work(item, None, looked_at(number)) for number, item in enumerate(inputs.stream()))
+        stream = (Work(item, None, looked_at(number), number) for number, item in enumerate(inputs.stream()))
         for result in run(replace(job, picture=False), stream, many.workers, model):
             if result.cloud is not None:
                 writer.write_cloud(topic, result.cloud)

@@ -26,6 +26,9 @@ def streets(
         float | None, arg(metavar="KM/H", help="the car would like to drive; default: as the street has it.")
     ] = None,
     deskewed: Annotated[bool, arg(help="take the car's own motion within a turn out of the points.")] = False,
+    perfect: Annotated[
+        bool, arg(help="as a simulator casts: every beam returns, no noise, no reflectance; `realise` makes it real.")
+    ] = False,
     traffic: Annotated[float, arg(help="moving vehicles and cyclists: 1 = as usual, 2 = twice, 0 = none.")] = 1.0,
     parking: Annotated[float, arg(help="parked vehicles, likewise.")] = 1.0,
     pedestrians: Annotated[float, arg(help="likewise.")] = 1.0,
@@ -44,7 +47,7 @@ def streets(
     from lidarsynth.streets.weather import Weather
 
     density, weather = Density(traffic, parking, pedestrians, vegetation), Weather(rain, fog)
-    options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, density, weather)
+    options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
     made = LabelledStreets(seed, count, get_sensor(sensor), options)
     workers = os.cpu_count() or 1 if workers is None else workers
     for _ in counted((done, len(made)) for done in write_streets(out, made, format, workers)):

@@ -8,6 +8,7 @@ from typing import Annotated
 from lidarsynth.cli.arguments import (
     Device,
     Intensity,
+    Labels,
     Least,
     Method,
     Output,
@@ -43,6 +44,7 @@ def upsample(
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Intensity = "auto",
+    labels: Labels = False,
     picture: Picture = True,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
@@ -63,5 +65,6 @@ def upsample(
         times=times,
         picture=picture,
         least=min_confidence,
+        labels=labels,
     )
     work_through(job, scans, out, many, intensity)

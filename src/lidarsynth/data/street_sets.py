@@ -95,12 +95,10 @@ class _Task:
 
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
-    return {
-        "layout": layout,
-        "seed": streets.seed,
-        "sensor": streets.sensor.to_dict(),
-        "options": asdict(streets.options),
-    }
+    options = asdict(streets.options)
+    if not streets.options.perfect:
+        del options["perfect"]  # sets of before there was a choice go on
+    return {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> None:

@@ -225,7 +225,7 @@ def scan_table(scan: Scan) -> np.ndarray:
     ):
         if value is not None:
             columns[name] = value.astype(kind)
-    own = ("x", "y", "z", "intensity", "ring", "timestamp", "label")
+    own = set(columns)
     for name, value in scan.extra.items():
         columns[f"file_{name}" if name in own else name] = _storable(value)
     table = np.empty(len(scan), [(name, column.dtype) for name, column in columns.items()])

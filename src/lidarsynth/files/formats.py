@@ -15,8 +15,9 @@ import numpy as np
 
 from lidarsynth.files import arrays, feather, las, pcd, ply, text
 from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
-from lidarsynth.files.labels import read_labels
+from lidarsynth.files.labels import read_labels, read_words
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.semantic_kitti import RAW
 
 READERS: dict[str, Callable[[bytes], Fields]] = {
     ".bin": arrays.read_bin,
@@ -52,12 +53,15 @@ def read(path: str | Path, intensity: str = "auto", labels: str | Path | None = 
     return read_with_report(path, intensity, labels)[0]
 
 
-def read_with_report(path: str | Path, intensity: str = "auto", labels: str | Path | None = None) -> tuple[Scan, int]:
+def read_with_report(
+    path: str | Path, intensity: str = "auto", labels: str | Path | None = None, words: str | Path | None = None
+) -> tuple[Scan, int]:
     """The scan, and how many of the file's points were dropped: not finite, or (0, 0, 0) where nothing returned.
 
     intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" by type and range
                (`fields.reflectance_from`), "none" to read a file without intensity with reflectance 0
     labels     a SemanticKITTI `.label` file with one word per point of the file
+    words      likewise, of any ids, which are kept as they are in `extra["raw_label"]`
     Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`), other fields as `extra`.
     Raises FileError, a ValueError of one line "path: expected ..., found ...".
     """
@@ -69,6 +73,8 @@ def read_with_report(path: str | Path, intensity: str = "auto", labels: str | Pa
         fields = reader(data)
     if labels is not None:
         fields["label"] = read_labels(labels, len(next(iter(fields.values()), ())))
+    if words is not None:
+        fields["raw_label"] = read_words(words, len(next(iter(fields.values()), ())))
     with _naming(path):
         return scan_from_fields(fields, intensity)
 
@@ -118,6 +124,18 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
             if name in content.extra:
                 values = content.extra[name].astype(kind).tobytes()
                 _put(path.with_suffix(f".{name}"), lambda file, values=values: file.write(values))
+
+
+def write_labels(path: str | Path, scan: Scan) -> None:
+    """Save the labels of a scan as SemanticKITTI's `.label`: its `extra["raw_label"]`, or its classes' raw ids.
+
+    Raises FileError, and ValueError of a scan without labels.
+    """
+    if scan.label is None and "raw_label" not in scan.extra:
+        raise ValueError(f"{path}: expected a scan with labels, found one without")
+    words = scan.extra.get("raw_label", None if scan.label is None else RAW[scan.label])
+    assert words is not None
+    _put(Path(path), lambda file: file.write(words.astype("<u4").tobytes()))
 
 
 def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:

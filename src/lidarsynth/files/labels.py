@@ -1,4 +1,4 @@
-"""SemanticKITTI classes: raw `.label` words to the 20 training classes."""
+"""SemanticKITTI's `.label` files: a word a point, the raw class in its lower half, the instance in the upper."""
 
 from __future__ import annotations
 
@@ -15,14 +15,25 @@ def read_labels(path: str | Path, n: int) -> np.ndarray:
 
     Raises FileError when the file does not hold n words of 4 bytes or a raw id is not SemanticKITTI's.
     """
+    raw = read_words(path, n) & 0xFFFF  # the high half is the instance
+    classes = CLASS_OF_RAW[raw]
+    if np.any(classes < 0):
+        raise FileError(f"{path}: expected SemanticKITTI's raw ids, found {int(raw[classes < 0][0])}")
+    return classes
+
+
+def read_words(path: str | Path, n: int) -> np.ndarray:
+    """(n,) uint32 words of a `.label` file as they are. Raises FileError when it does not hold n of them."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
         raise FileError(f"{path}: expected a readable .label file, found: {error.strerror}") from None
     if len(data) != 4 * n:
         raise FileError(f"{path}: expected {4 * n} bytes, one label of 4 for each of {n} points, found {len(data)}")
-    raw = np.frombuffer(data, "<u4") & 0xFFFF  # the high half is the instance
-    classes = CLASS_OF_RAW[raw]
-    if np.any(classes < 0):
-        raise FileError(f"{path}: expected SemanticKITTI's raw ids, found {int(raw[classes < 0][0])}")
-    return classes
+    return np.frombuffer(data, "<u4")
+
+
+def label_path(scan: Path) -> Path:
+    """Where the labels of a scan file belong: of NN/velodyne/a.bin NN/labels/a.label, as published, else beside it."""
+    folder = scan.parent.with_name("labels") if scan.parent.name == "velodyne" else scan.parent
+    return folder / f"{scan.stem}.label"

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarsynth.lidar.projection import occupied, row_of_points
+from lidarsynth.lidar.projection import occupied, pixel_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 
@@ -22,15 +22,16 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     Points come row by row, each row from behind over the left; those above or below the view come last, and only
     without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
     the scan stays with its points; new ones have 0 there, the label of their pixel, and the time of the points measured
-    in their direction. `extra["new"]` is 1 for new points; where the image has `confidence`, measured points have 1.
+    in their direction. Labels of a filled image are those of measured points too, where the scan has none.
+    `extra["new"]` is 1 for new points; where the image has `confidence`, measured points have 1.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
-    row = row_of_points(scan, filled.sensor, projection)
-    reflectance = scan.reflectance
+    row, column = pixel_of_points(scan, filled.sensor, projection)
+    reflectance, label = scan.reflectance, scan.label
     if not reflectance.any():
-        turn = (1 - np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) / np.pi) / 2
-        column = (turn * filled.sensor.width).astype(int).clip(0, filled.sensor.width - 1)
         reflectance = np.where(row >= 0, filled.reflectance[row, column], reflectance)
+    if label is None and filled.label is not None:
+        label = np.where(row >= 0, filled.label[row, column], 0)
     assert new.ring is not None
     xyz = np.concatenate([scan.xyz, new.xyz])
     ring = np.concatenate([np.where(row < 0, filled.sensor.height, row), new.ring])
@@ -41,7 +42,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
         np.concatenate([reflectance, new.reflectance]),
         ring=None if (row < 0).any() else ring,
         time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
-        label=_labels(scan, new),
+        label=_labels(label, new),
         extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)]) for name, values in scan.extra.items()}
         | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])}
         | {name: np.concatenate([np.ones(len(scan), np.float32), values]) for name, values in new.extra.items()},
@@ -58,7 +59,7 @@ def _time_towards(xyz: np.ndarray, scan: Scan) -> np.ndarray:
     return scan.time[order[place]]
 
 
-def _labels(scan: Scan, new: Scan) -> np.ndarray | None:
-    if scan.label is None:
+def _labels(measured: np.ndarray | None, new: Scan) -> np.ndarray | None:
+    if measured is None:
         return None
-    return np.concatenate([scan.label, np.zeros(len(new), scan.label.dtype) if new.label is None else new.label])
+    return np.concatenate([measured, np.zeros(len(new), measured.dtype) if new.label is None else new.label])

@@ -92,6 +92,11 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     return np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
 
 
+def pixel_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> tuple[np.ndarray, np.ndarray]:
+    """Row, as `row_of_points`, and column of each point in the sensor's image, (N,) int64 each."""
+    return row_of_points(scan, sensor, method), _columns(scan.xyz, sensor.width)
+
+
 def is_even_grid(sensor: Sensor) -> bool:
     """Whether the rows are edges of evenly spaced pixels, as R2DM's `hdl-64e` has them, and not the beams of a unit."""
     return sensor.edges and (sensor.height < 3 or bool(np.ptp(np.diff(sensor.elevations)) < 1e-3))

@@ -46,3 +46,4 @@ def _class_of_raw() -> np.ndarray:
 
 
 CLASS_OF_RAW = _class_of_raw()
+RAW = np.array([raws[0] for raws in RAW_OF_CLASS], np.uint32)  # stands for each class where nothing says more

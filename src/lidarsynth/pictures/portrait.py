@@ -9,24 +9,33 @@ import numpy as np
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.pictures.figure import GAP, Picture, colour_bar, panel
 from lidarsynth.pictures.perspective import perspective
-from lidarsynth.pictures.render import bev, range_strip, reflectance_strip
+from lidarsynth.pictures.render import bev, label_strip, range_strip, reflectance_strip
 
 STRIP = 1024  # pixels, the width of a strip
 EXTENT = 32.0  # metres from the car to the left and right border of a view from above
 
 
 def portrait(image: RangeImage) -> np.ndarray:
-    """(H', W', 3) uint8: range and reflectance strips above a perspective view of the points."""
+    """(H', W', 3) uint8: strips of range, reflectance and, if known, class above a perspective view of the points."""
     distance, reflectance = strips(image, image.sensor.max_range)
-    view = perspective(image, size=(STRIP, STRIP * 9 // 16))
-    return panel([[("range", distance)], [("reflectance", reflectance)], [("points", view)]])
+    rows: list[list[Picture]] = [[("range", distance)], [("reflectance", reflectance)]]
+    if image.label is not None:
+        rows.append([("class", _enlarged(label_strip(image, _rows(image)), image))])
+    return panel([*rows, [("points", perspective(image, size=(STRIP, STRIP * 9 // 16)))]])
 
 
 def strips(image: RangeImage, max_range: float) -> tuple[np.ndarray, np.ndarray]:
     """Range and reflectance, (H', W', 3) uint8 of about 192 x 1024 for any size of image, colours to max_range m."""
-    rows, columns = max(round(192 / image.shape[0]), 1), max(round(STRIP / image.shape[1]), 1)
-    distance, reflectance = range_strip(image, max_range, rows), reflectance_strip(image, rows)
-    return np.repeat(distance, columns, axis=1), np.repeat(reflectance, columns, axis=1)
+    rows = _rows(image)
+    return _enlarged(range_strip(image, max_range, rows), image), _enlarged(reflectance_strip(image, rows), image)
+
+
+def _rows(image: RangeImage) -> int:
+    return max(round(192 / image.shape[0]), 1)
+
+
+def _enlarged(strip: np.ndarray, image: RangeImage) -> np.ndarray:
+    return np.repeat(strip, max(round(STRIP / image.shape[1]), 1), axis=1)
 
 
 def before_and_after(images: Mapping[str, RangeImage], points: Mapping[str, Scan]) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import KINDS, actors_of, numbers_of
 from lidarsynth.streets.areas import TODAY, Density
@@ -18,12 +19,10 @@ from lidarsynth.streets.moving import Bodies, MovingCaster
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.reader import FULL_TURN, Worlds
 from lidarsynth.streets.sensor_model import OPTICS, Optics
-from lidarsynth.streets.turn import Turn, attitudes, sensor_pose, shoot
+from lidarsynth.streets.turn import Turn, attitudes, perfect, sensor_pose, shoot
 from lidarsynth.streets.weather import CLEAR, Weather
 from lidarsynth.streets.world import POSES, World
 
-# SemanticKITTI's raw class of each training class, where nothing says more.
-RAW = np.array([0, 10, 11, 15, 18, 13, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81], np.uint32)
 OUTLIER = np.uint32(1)  # returns of rain and fog
 
 
@@ -35,12 +34,14 @@ class Options:
     rate      turns per second
     speed     m/s the carrier would like to drive, None = as the street has it
     deskewed  the carrier's own motion within a turn is taken out of the points, as odometry data sets have it
+    perfect   as a simulator casts: every beam reports exactly what it meets first, with a reflectance of 0
     """
 
     frames: int = 0
     rate: float = 10.0
     speed: float | None = None
     deskewed: bool = False
+    perfect: bool = False
     density: Density = TODAY
     weather: Weather = CLEAR
     optics: Optics = field(default=OPTICS)
@@ -49,6 +50,8 @@ class Options:
         if not (self.frames >= 0 and 0.1 <= self.rate <= 100):
             raise ValueError(f"expected frames >= 0 and a rate of 0.1 to 100 turns per second, found {self.frames} and "
                              f"{self.rate}")  # fmt: skip
+        if self.perfect and self.weather != CLEAR:
+            raise ValueError("expected clear weather of a perfect sensor, found rain or fog")
         if self.speed is not None and not 0.1 <= self.speed <= 60:
             raise ValueError(f"expected a speed of 0.1 to 60 m/s, found {self.speed}")
 
@@ -133,7 +136,7 @@ class LabelledStreets:
         rng = np.random.default_rng((self.seed, index, 1))
         poses = world.poses[pose][None]
         turn = shoot(world, caster, self.sensor, self.options.optics, rng, poses)
-        turn = self.options.weather.on(turn, self.sensor, np.random.default_rng((self.seed, index, 7)))
+        turn = self._weathered(turn, (self.seed, index, 7))
         moment = _standing(bodies)
         return self._frame(world, bodies, moment, turn, poses, None, 0.0, number, pose)
 
@@ -148,8 +151,13 @@ class LabelledStreets:
         near = np.linalg.norm(moment.place[there] - poses[0, :3], axis=1) < self.sensor.max_range + 10
         scene = MovingCaster(caster, bodies, there[near], moment, stamp)
         turn = shoot(drive.world, scene, self.sensor, self.options.optics, rng, poses, times)
-        turn = self.options.weather.on(turn, self.sensor, np.random.default_rng((self.seed, number, k, 7)))
+        turn = self._weathered(turn, (self.seed, number, k, 7))
         return self._frame(drive.world, bodies, moment, turn, poses, times, stamp, number, k)
+
+    def _weathered(self, turn: Turn, seed: tuple[int, ...]) -> Turn:
+        if self.options.perfect:
+            return perfect(turn, self.sensor)
+        return self.options.weather.on(turn, self.sensor, np.random.default_rng(seed))
 
     def _begun(self, number: int) -> tuple[Drive, Caster, Bodies, np.ndarray]:
         drive = self.drive(number)

@@ -13,7 +13,7 @@ from lidarsynth.streets.layout import build
 from lidarsynth.streets.materials import LABEL
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.sensor_model import OPTICS, Optics
-from lidarsynth.streets.turn import Turn, local_points, shoot
+from lidarsynth.streets.turn import Turn, perfect, shoot
 from lidarsynth.streets.world import POSES, THING, World, visible
 
 FULL_TURN = 2083  # azimuth steps per turn of KITTI's sensor at 10 Hz
@@ -93,7 +93,7 @@ class SyntheticStreets:
 
     def image(self, index: int) -> RangeImage:
         """(H, W) image of scan `index` with one ray per pixel, row = beam; no `xyz`, pixels hold the rays' ranges."""
-        return _seen(self._shoot(index, self.sensor), self.sensor)
+        return _image(self._shoot(index, self.sensor), self.sensor)
 
     def pair(self, index: int) -> tuple[RangeImage, RangeImage]:
         """`(perfect, seen)`, (H, W) images of the same rays: as a simulator casts them, and `image(index)`.
@@ -103,7 +103,7 @@ class SyntheticStreets:
         seen     may lack it, look through a pane, and errs by the sensor's noise
         """
         turn = self._shoot(index, self.sensor)
-        return _perfect(turn, self.sensor), _seen(turn, self.sensor)
+        return _image(perfect(turn, self.sensor), self.sensor), _image(turn, self.sensor)
 
     def _shoot(self, index: int, sensor: Sensor) -> Turn:
         """Returns of all H * W rays."""
@@ -117,15 +117,9 @@ class SyntheticStreets:
         return shoot(world, caster, sensor, self.optics, rng, pose[None])
 
 
-def _seen(turn: Turn, sensor: Sensor) -> RangeImage:
+def _image(turn: Turn, sensor: Sensor) -> RangeImage:
     distance = np.linalg.norm(turn.points, axis=-1).astype(np.float32)
     return RangeImage(distance, turn.reflectance, turn.distance > 0, sensor, turn.label.astype(np.int64))
-
-
-def _perfect(turn: Turn, sensor: Sensor) -> RangeImage:
-    distance = np.linalg.norm(local_points(turn.rays, turn.surface, sensor), axis=-1).astype(np.float32)
-    label = turn.surface_label.astype(np.int64)
-    return RangeImage(distance, np.zeros_like(distance), turn.surface > 0, sensor, label)
 
 
 def _emptied(world: World, labels: list[int]) -> World:

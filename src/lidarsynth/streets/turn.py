@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,8 +21,7 @@ class Turn:
     rays, points (H, W, 3) float32: the beams' directions and where they ended, metres, in the sensor frame of the
     moment each was sent, (0, 0, 0) for none; distance (H, W) float32 m along the ray, 0 for none; reflectance, label
     (H, W); face, first (H, W) int32: the triangle of the return and the one met first, maybe a pane, -1 for none;
-    surface (H, W) float32 m, surface_label: where exactly that one is within the sensor's limits, 0 for none; its
-    class.
+    surface (H, W) float32 m, surface_label: where exactly that one is within the sensor's limits, 0 for none; class.
     """
 
     rays: np.ndarray
@@ -69,6 +68,13 @@ def _whole(seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, empty: i
     image = np.full(seen.shape, empty, kind)
     image[seen] = values
     return image
+
+
+def perfect(turn: Turn, sensor: Sensor) -> Turn:
+    """The turn as a simulator casts it: each beam reports exactly what it meets first, panes too, reflectance 0."""
+    points, dark = local_points(turn.rays, turn.surface, sensor), np.zeros_like(turn.reflectance)
+    face = np.where(turn.surface > 0, turn.first, -1)
+    return replace(turn, points=points, distance=turn.surface, reflectance=dark, label=turn.surface_label, face=face)
 
 
 def world_rays(

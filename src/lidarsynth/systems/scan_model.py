@@ -82,6 +82,7 @@ class ScanModel(ABC):
         sampler: str | None = None,
         batch_size: int = 4,
         on_step: OnStep = None,
+        labels: bool = False,
     ) -> list[RangeImage]:
         """`n` new scans as range images; scan i depends on seed + i only.
 
@@ -89,9 +90,12 @@ class ScanModel(ABC):
         with one number of threads; a GPU makes batch_size at once, and there it holds for one batch_size. Other
         numbers of threads, batches and processors add up in another order: scans differ by rounding.
 
+        labels  the class of each return too, as `with_labels`
+
         Raises ValueError as `stream` does.
         """
-        return list(self.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
+        model = self.with_labels() if labels else self
+        return list(model.stream(n, steps, seed, sampler, batch_size, on_step=on_step))
 
     def stream(
         self,
@@ -161,6 +165,34 @@ class ScanModel(ABC):
         Raises ValueError when the sensor is not recognised or sees nothing that the model does.
         """
         return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed), sensor_in, on_step)
+
+    def realise(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
+        """A simulator's scan, in which every ray returns, as the real sensor would have reported it.
+
+        Points that return stay bit by bit with their fields, and get a reflectance; others, and those out of the
+        sensor's view or limits, are gone. Which ones is drawn from the seed.
+
+        scan    points, as a scan or an array (N, 3) x y z; their reflectance does not matter
+        sensor  that the simulator plays; None = recognised from the points, or that of `into`
+
+        Raises ValueError for a model that has not learned it, and where no point is in view.
+        """
+        return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
+
+    def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
+        """The image of `realise`."""
+        raise self._lacks("which rays return")
+
+    def check_realises(self) -> None:
+        """Raises ValueError for a model that cannot `realise`."""
+        raise self._lacks("which rays return")
+
+    def with_labels(self) -> ScanModel:
+        """The same model, whose images also have the class of each return, SemanticKITTI's 1-19.
+
+        Raises ValueError for a model that has learned no classes.
+        """
+        raise self._lacks("classes")
 
     def filled(
         self,
@@ -278,6 +310,10 @@ class ScanModel(ABC):
         card = card_text(self.experiment, self.description, repo_id)
         return push(self.experiment, self.network, repo_id, card, private, half)
 
+    def _lacks(self, what: str) -> ValueError:
+        return ValueError(f"{self.experiment.name}: expected a model that has learned {what}, such as default, found "
+                          "one that has not")  # fmt: skip
+
     def _generates_nothing(self) -> ValueError:
         return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found "
                           f"{self.kind}; use complete or upsample")  # fmt: skip
@@ -341,6 +377,7 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
         reflectance=np.where(mask, reflectance, 0).astype(np.float32),
         mask=mask,
         sensor=filled.sensor,
+        label=None if filled.label is None else np.where(mask, filled.label, 0),
         xyz=points,
         confidence=sure,
     )

@@ -1,4 +1,4 @@
-"""Many scans through `complete`, `upsample` or `project`: one after the other or in processes, one report."""
+"""Many scans through `complete`, `upsample`, `realise` or `project`: one by one or in processes, one report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 
 from lidarsynth.data.bags import Cloud
 from lidarsynth.data.windows import in_window
-from lidarsynth.files.formats import write
+from lidarsynth.files.formats import BARE, write, write_labels
+from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
@@ -25,6 +26,7 @@ from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
+from lidarsynth.verbs.realisation import realise_scan, realised_fields
 
 FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
 
@@ -33,9 +35,9 @@ FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so m
 class Job:
     """What is done with every scan.
 
-    verb       complete, upsample or project
+    verb       complete, upsample, realise or project
     model      as `load` takes it; not of project
-    how        of complete and upsample
+    how        of complete and upsample; of realise its seed, scan i being drawn from seed + i
     corrupt    recipe to hide a part first, of complete
     sensor     that made the scans, None = recognised
     into       sensor of the result, of upsample
@@ -45,6 +47,7 @@ class Job:
     transform  (4, 4) that was applied to the points, to be undone in the result, or None
     strict     refuse scans that are not in their sensor's frame
     picture    a .png beside each file
+    labels     classes of the points too, of complete and upsample
     """
 
     verb: str
@@ -61,15 +64,17 @@ class Job:
     transform: np.ndarray | None = None
     strict: bool = False
     picture: bool = True
+    labels: bool = False
 
 
 @dataclass(frozen=True)
 class Work:
-    """One scan, the file to write, or None for one that goes into a bag, and whether to look at its frame."""
+    """One scan, the file to write, or None for one that goes into a bag, whether to look at its frame, its number."""
 
     item: Input
     target: Path | None
     check: bool
+    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -118,6 +123,7 @@ def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> C
 
             model = load(job.model, device=job.device)
         model = model.into(job.into) if job.into else model
+        model = model.with_labels() if job.labels else model
     return partial(_one, job, model, on_step)
 
 
@@ -126,11 +132,12 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     try:
         loaded = work.item.read()
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
-        done, note = _made(job, model, work.item.path, loaded.scan, on_step)
+        done, note = _made(job, model, work, loaded.scan, on_step)
         cloud = None
         if work.target is None:
             points = _points(done, loaded, job.transform)
-            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, message_fields(points, loaded.given))
+            fields = realised_fields if job.verb == "realise" else message_fields
+            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields(points, loaded.given))
         else:
             _store(work.target, done, loaded, job)
     except (ValueError, FloatingPointError) as error:
@@ -163,9 +170,10 @@ def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -
 
 
 def _made(
-    job: Job, model: ScanModel | None, path: Path, scan: Scan, on_step: OnStep
+    job: Job, model: ScanModel | None, work: Work, scan: Scan, on_step: OnStep
 ) -> tuple[Filled | RangeImage, str]:
     """The result, and what was done in words."""
+    path = work.item.path
     if job.verb == "project":
         image = project(scan, named_sensor(scan, path, "--sensor", job.sensor), job.projection, job.width)
         if not image.mask.any():
@@ -175,6 +183,10 @@ def _made(
     if job.verb == "complete":
         sensor = None if job.sensor is None else get_sensor(job.sensor)
         return complete_scan(model, scan, job.corrupt, job.how, on_step, sensor, job.least), ""
+    if job.verb == "realise":
+        sensor = named_sensor(scan, path, "--sensor", job.sensor)
+        filled = realise_scan(model, scan, sensor, job.how.seed + work.number)
+        return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
     sensor = named_sensor(scan, path, "--from", job.sensor)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
@@ -183,7 +195,7 @@ def _made(
 def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | None) -> Scan:
     if isinstance(done, RangeImage):
         raise ValueError("expected a file or folder for range images, found a bag, which holds points")
-    if "new" not in done.points.extra:
+    if done.errors:
         raise ValueError("expected a file or folder with --corrupt, found a bag")
     return back_in_place(done.points, loaded, transform)
 
@@ -193,9 +205,10 @@ def _store(target: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) ->
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
         write(target, image)
-    elif "new" in done.points.extra:
-        write(target, without_places(back_in_place(done.points, loaded, job.transform)))
     else:
-        write(target, without_places(done.points))
+        placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
+        if target.suffix.lower() in BARE and (job.labels or "raw_label" in placed.extra):
+            write_labels(label_path(target), placed)
+        write(target, without_places(placed))
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.files.formats import write
+from lidarsynth.files.formats import write, write_labels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.pictures.portrait import portrait
@@ -21,6 +21,7 @@ from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 RECORD, SCRATCH = "generate.json", ".unfinished"
+LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
@@ -99,6 +100,8 @@ def _store(folder: Path, name: str, image: RangeImage, endings: tuple[str, ...])
         path = scratch / f"{name}{ending}"
         if ending == ".png":
             save_png(path, portrait(image))
+        elif ending == LABEL:
+            write_labels(path, image.to_scan())
         else:
             write(path, image)
         os.replace(path, folder / path.name)

@@ -17,6 +17,7 @@ from lidarsynth.data.capture import datagrams, is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.files.fields import Fields, FileError, find, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
+from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import parse_transform, transformed
 from lidarsynth.lidar.scan import Scan
 
@@ -29,12 +30,14 @@ class Reading:
     topic      of a bag; None = the only one of points
     metadata   `.json` of an Ouster capture; None = the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
+    labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
     """
 
     intensity: str = "auto"
     topic: str | None = None
     metadata: Path | None = None
     transform: np.ndarray | None = None
+    labels: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,9 @@ class FileInput:
 
     def read(self) -> Loaded:
         """The scan. Raises FileError."""
-        return _loaded(*read_with_report(self.path, self.reading.intensity), self.reading)
+        words = label_path(self.path) if self.reading.labels else None
+        words = words if words is not None and words.is_file() else None
+        return _loaded(*read_with_report(self.path, self.reading.intensity, words=words), self.reading)
 
 
 @dataclass(frozen=True)
@@ -290,7 +295,7 @@ def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) ->
     """A filled scan in the frame of its file: measured points bit by bit as given, new ones transformed back."""
     if transform is None:
         return filled
-    place, old = filled.extra["point"], filled.extra["new"] == 0
+    place, old = filled.extra["point"], filled.extra.get("new", np.zeros(len(filled))) == 0
     xyz = transformed(filled.xyz, np.linalg.inv(transform))
     given = np.stack([loaded.given[str(find(loaded.given, axis))] for axis in "xyz"], axis=1)
     xyz[old] = given[place[old]]

@@ -39,7 +39,7 @@ def works(
             if skipped is not None:
                 skipped.append(file)
             continue
-        yield Work(item, file, looked_at(number))
+        yield Work(item, file, looked_at(number), number)
 
 
 def looked_at(number: int) -> bool:

@@ -17,8 +17,9 @@ from PIL import Image
 
 from lidarsynth.data.layouts.layout import Content, Layout, is_held_out, read_record
 from lidarsynth.data.layouts.nuscenes_tables import Shot, fixed_rows, lidarseg_path, scene_rows
+from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.streets.actors import KINDS
-from lidarsynth.streets.frame import RAW, Frame, LabelledStreets
+from lidarsynth.streets.frame import Frame, LabelledStreets
 
 VERSION = "v1.0-trainval"
 TABLES = ("category", "attribute", "visibility", "sensor", "calibrated_sensor", "ego_pose", "log", "map", "scene",

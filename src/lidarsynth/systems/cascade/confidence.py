@@ -35,7 +35,7 @@ def signals(filled: Filled, rays: Rays) -> Tensor:
     """
     assert filled.spread is not None and filled.near is not None
     metres = decode_range(filled.code)
-    allowed = tolerance(metres)
+    allowed = torch.as_tensor(tolerance(metres))
     height = torch.log1p(metres)  # a step of it times 1 + range is about a step in metres
     up = (height[:, :, 1:] - height[:, :, :-1]).abs()
     rows = torch.maximum(torch.cat([up[:, :, :1], up], 2), torch.cat([up, up[:, :, -1:]], 2))
@@ -52,7 +52,7 @@ def signals(filled: Filled, rays: Rays) -> Tensor:
     return torch.cat(parts, 1)
 
 
-def _by_tolerance(metres: Tensor, allowed: np.ndarray | Tensor) -> Tensor:
+def _by_tolerance(metres: Tensor, allowed: Tensor) -> Tensor:
     return torch.log((metres + LEAST) / allowed)
 
 

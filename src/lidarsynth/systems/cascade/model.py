@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -17,6 +16,7 @@ from lidarsynth.diffusion.samplers import STEPS, even_log_snr, generators, noise
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
+from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
@@ -27,6 +27,8 @@ from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
+from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, sensor_that_made, with_known
@@ -39,7 +41,6 @@ TIMES = 4  # as many beams
 # Of the noise that training draws: its energy scores leave samples rougher than streets are. Chosen by street-2 among
 # 0.25, 0.4 and 1 on grids of true streets (docs/training-default.md).
 GRAIN = 0.4
-ANSWERS = 0.02  # of the rays of a beam
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,12 +50,14 @@ class CascadeModel(ScanModel):
     network.coarse   velocity of flow matching on a grid of 16 beams x 128 columns of the sensor
     network.fill     known pixels and rays -> all pixels, in one step
     own              whether scans are completed, and made denser, in the sensor that made them: until `into`
+    labelled         whether its images have classes: after `with_labels`
     """
 
     network: Cascade
     sensor: Sensor
     experiment: Experiment
     own: bool = True
+    labelled: bool = False
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     any_sensor: ClassVar[bool] = True
@@ -78,6 +81,17 @@ class CascadeModel(ScanModel):
             if sensor is None:
                 raise ValueError(f"{reason}, or into(SENSOR)")
         return self.into(sensor)
+
+    def with_labels(self) -> CascadeModel:
+        """The same model, whose images also have the class of each return."""
+        if not self.experiment.model.classes:
+            super().with_labels()  # refuses
+        return replace(self, labelled=True)
+
+    def check_realises(self) -> None:
+        """Raises ValueError for a cascade without classes: one recipe teaches both."""
+        if not self.experiment.model.classes:
+            super().check_realises()
 
     def stream(
         self,
@@ -196,6 +210,18 @@ class CascadeModel(ScanModel):
         filled = model.fill(image, known, how, on_step)
         return replace(filled, completed=with_measured(replace(scan, ring=None), image.mask, filled, "spherical"))
 
+    def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
+        """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
+        self.check_realises()
+        scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
+        model = self.suited_to(scan) if sensor is None else self.into(sensor)
+        model = model.into(fitting(scan, model.sensor, projection))
+        image = project(scan, model.sensor, projection).keep(~model._blocked)
+        if not image.mask.any():
+            raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
+        answer = model._answers(unanswered(image, padded(model.sensor)), generators(seed, 1), surely=image.range[None])
+        return observed(scan, image, answer[0], projection)
+
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch: the coarse steps and the fill."""
         self._sampler(sampler)
@@ -233,7 +259,7 @@ class CascadeModel(ScanModel):
         ranges[(ranges < self.sensor.min_range) | (ranges > self.sensor.max_range)] = 0
         ranges[:, self._blocked] = 0
         told |= self._blocked
-        return self._fill(ranges, shades * (ranges > 0), told, True, rng)
+        return [image.keep(image.mask) for image in self._fill(ranges, shades * (ranges > 0), told, True, rng)]
 
     def _holes(
         self,
@@ -246,7 +272,7 @@ class CascadeModel(ScanModel):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Metres, reflectance and known pixels with a grid of new ones where nothing is known around."""
         self._grid()
-        rows, columns, cell = _best_known(told)
+        rows, columns, cell = best_known(told)
         rays, standing = self._grid_rays(rows, columns, 1)
         grid = np.ix_(rows, columns)
         here = torch.from_numpy(told[grid])[None].to(self._device)
@@ -270,7 +296,7 @@ class CascadeModel(ScanModel):
             if on_step is not None:
                 on_step()
         new_metres, new_reflectance = (part[0].cpu().numpy() for part in coarse.decode(x_0, standing))
-        hole = ~_widened(cell)
+        hole = ~widened(cell)
         metres, reflectance, told = metres.copy(), reflectance.copy(), told.copy()
         new_metres = np.where(new_metres > self.sensor.max_range, 0, new_metres)
         metres[grid] = np.where(hole, new_metres, metres[grid])
@@ -281,7 +307,8 @@ class CascadeModel(ScanModel):
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         told = known | (self._blocked & ~image.mask)
-        filled, rays = self._network(image.range[None], image.reflectance[None], told[None], True, None, doubt=True)
+        pixels = known_of(image.range[None], image.reflectance[None], told[None], True, padded(self.sensor))
+        filled, rays = self._network(pixels, None, 0, doubt=True)
         return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
 
     def _fill(
@@ -293,42 +320,58 @@ class CascadeModel(ScanModel):
         rng: list[torch.Generator] | None,
     ) -> list[RangeImage]:
         """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples."""
+        return self._answers(known_of(metres, reflectance, told, lit, padded(self.sensor)), rng)
+
+    def _answers(
+        self, known: Known, rng: list[torch.Generator] | None, surely: np.ndarray | None = None
+    ) -> list[RangeImage]:
+        """Images of (B, 1, H', W') padded pixels.
+
+        surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
+        """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
-        filled, rays = self._network(metres, reflectance, told, lit, rng, doubt=weights is not None)
-        sure = [None] * len(metres) if weights is None else list(confidence(filled, rays, weights))
-        return [self._image(*parts) for parts in zip(*filled[:3], sure, strict=True)]
+        grain = GRAIN if surely is None else 1.0
+        filled, rays = self._network(known, rng, grain, doubt=weights is not None, classify=self.labelled)
+        logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
+        height, width = self.sensor.height, self.sensor.width
+        metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
+        sure = None if weights is None else confidence(filled, rays, weights)
+        parts = (filled.reflectance, logit, filled.classes, sure)
+        cut = [[None] * len(metres) if part is None else part[..., :height, :width].cpu() for part in parts]
+        return [self._image(*of_one) for of_one in zip(metres[:, :height, :width], *cut, strict=True)]
 
     @torch.inference_mode()
     def _network(
         self,
-        metres: np.ndarray,
-        reflectance: np.ndarray,
-        told: np.ndarray,
-        lit: bool,
+        known: Known,
         rng: list[torch.Generator] | None,
-        doubt: bool,
+        grain: float,
+        doubt: bool = False,
+        classify: bool = False,
     ) -> tuple[Filled, Rays]:
-        """What the fill makes of (B, H, W) known pixels, with its padding, and the rays it was told."""
-        count, (height, width) = len(metres), padded(self.sensor)
-        known = _known(metres, reflectance, told, lit, (height, width))
+        """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told; `grain` of a unit of noise."""
+        count, _, height, width = known.told.shape
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
-            noise = GRAIN * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
+            noise = grain * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
         device = self._device
         known = Known(*(part.to(device) for part in known))
-        rays = type(rays)(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
-        return self.network.fill(known, rays, noise.to(device), doubt=doubt), rays
+        rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
+        return self.network.fill(known, rays, noise.to(device), classify=classify, doubt=doubt), rays
 
-    def _image(self, code: Tensor, reflectance: Tensor, logit: Tensor, sure: Tensor | None) -> RangeImage:
-        """The image of (1, H', W') outputs, without their padding."""
-        height, width, sensor = self.sensor.height, self.sensor.width, self.sensor
-        distance = decode_range(code)[0, :height, :width].cpu().numpy()
-        mask = (logit[0, :height, :width] > 0).cpu().numpy() & (distance <= sensor.max_range) & ~self._blocked
+    def _image(
+        self, distance: np.ndarray, reflectance: Tensor, logit: Tensor, classes: Tensor | None, sure: Tensor | None
+    ) -> RangeImage:
+        """The image of (H, W) metres, (1, H, W) and (C, H, W) outputs, and chances."""
+        sensor = self.sensor
+        mask = (logit[0] > 0).numpy() & (distance <= sensor.max_range) & ~self._blocked
         mask &= distance >= sensor.min_range
-        shade = reflectance[0, :height, :width].clamp(0, 1).cpu().numpy()
-        chance = None if sure is None else sure[0, :height, :width].cpu().numpy()
-        return RangeImage(distance * mask, shade * mask, mask, sensor, confidence=chance)
+        shade = reflectance[0].clamp(0, 1).numpy()
+        label = None if classes is None else classes[1:].argmax(0).numpy() + 1  # 0, unlabeled, is no answer
+        chance = None if sure is None else sure.reshape(distance.shape).numpy()
+        # The label is that of all rays: what is known may return.
+        return RangeImage(distance * mask, shade * mask, mask, sensor, label, confidence=chance)
 
     @property
     def _blocked(self) -> np.ndarray:
@@ -337,49 +380,3 @@ class CascadeModel(ScanModel):
     @property
     def _device(self) -> torch.device:
         return next(self.network.parameters()).device
-
-
-def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, np.ndarray]:
-    """A scan's own image as every `times`-th row of a denser sensor's, and which pixels were looked at: those rows."""
-    shape = (sensor.height, sensor.width)
-    metres, shade, mask = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
-    metres[::times], shade[::times], mask[::times] = sparse.range, sparse.reflectance, sparse.mask
-    known = np.zeros(shape, bool)
-    known[::times] = (sparse.mask.mean(1) > ANSWERS)[:, None]  # a beam that hardly answers may not be there
-    xyz = None
-    if sparse.xyz is not None:
-        xyz = np.zeros((*shape, 3), np.float32)
-        xyz[::times] = sparse.xyz
-    return RangeImage(metres, shade, mask, sensor, xyz=xyz), known
-
-
-def _known(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
-    """(B, H, W) arrays as padded tensors (B, 1, H', W'): rows below are known to be empty, columns go around."""
-    extra, columns = size[0] - told.shape[1], np.arange(size[1]) % told.shape[2]
-
-    def part(values: np.ndarray, below: float) -> Tensor:
-        values = np.pad(values[:, :, columns], ((0, 0), (0, extra), (0, 0)), constant_values=below)
-        return torch.from_numpy(np.ascontiguousarray(values))[:, None]
-
-    returned = told & (metres > 0)
-    ranges = part(np.where(returned, metres, 0).astype(np.float32), 0)
-    shades = part(np.where(returned & lit, reflectance, 0).astype(np.float32), 0)
-    return Known(ranges, shades, part(told, True), part(returned, False), part(returned & lit, False))
-
-
-def _best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each of 16 x 128 bands the row and the column with most known pixels, and which cells hold any: (16, 128)."""
-    rows, columns = (
-        np.linspace(0, size, count + 1).astype(int) for size, count in zip(told.shape, (ROWS, COLUMNS), strict=True)
-    )
-    row = np.array([a + told[a:b].sum(1).argmax() for a, b in pairwise(rows)])
-    column = np.array([a + told[:, a:b].sum(0).argmax() for a, b in pairwise(columns)])
-    cell = np.add.reduceat(np.add.reduceat(told.astype(int), rows[:-1], 0), columns[:-1], 1) > 0
-    return row, column, cell
-
-
-def _widened(cell: np.ndarray) -> np.ndarray:
-    """(16, 128) bool: cells and their eight neighbours, around the turn."""
-    tall = np.pad(cell, ((1, 1), (0, 0)))
-    tall = tall[:-2] | tall[1:-1] | tall[2:]
-    return tall | np.roll(tall, 1, 1) | np.roll(tall, -1, 1)

@@ -1,0 +1,75 @@
+"""What a cascade is told of an image, and where a scan's own pixels stand in it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
+from lidarsynth.networks.fill_unet import Known
+
+ANSWERS = 0.02  # of the rays of a beam
+
+
+def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
+    """(B, H, W) arrays as padded tensors (B, 1, H', W'): rows below are known to be empty, columns go around."""
+    extra, columns = size[0] - told.shape[1], np.arange(size[1]) % told.shape[2]
+
+    def part(values: np.ndarray, below: float) -> Tensor:
+        values = np.pad(values[:, :, columns], ((0, 0), (0, extra), (0, 0)), constant_values=below)
+        return torch.from_numpy(np.ascontiguousarray(values))[:, None]
+
+    returned = told & (metres > 0)
+    ranges = part(np.where(returned, metres, 0).astype(np.float32), 0)
+    shades = part(np.where(returned & lit, reflectance, 0).astype(np.float32), 0)
+    return Known(ranges, shades, part(told, True), part(returned, False), part(returned & lit, False))
+
+
+def unanswered(image: RangeImage, size: tuple[int, int]) -> Known:
+    """(1, 1, H', W') what is known of a perfect image, padded to `size`: where surfaces are, and nothing else."""
+    below, columns = size[0] - image.shape[0], np.arange(size[1]) % image.shape[1]
+    metres = _tensor(np.pad(image.range[:, columns], ((0, below), (0, 0))))
+    there = _tensor(np.pad(image.mask[:, columns], ((0, below), (0, 0))))
+    nothing = torch.zeros_like(there)
+    return Known(metres, torch.zeros_like(metres), nothing, there, nothing)
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values))[None, None]
+
+
+def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, np.ndarray]:
+    """A scan's own image as every `times`-th row of a denser sensor's, and which pixels were looked at: those rows."""
+    shape = (sensor.height, sensor.width)
+    metres, shade, mask = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
+    metres[::times], shade[::times], mask[::times] = sparse.range, sparse.reflectance, sparse.mask
+    known = np.zeros(shape, bool)
+    known[::times] = (sparse.mask.mean(1) > ANSWERS)[:, None]  # a beam that hardly answers may not be there
+    xyz = None
+    if sparse.xyz is not None:
+        xyz = np.zeros((*shape, 3), np.float32)
+        xyz[::times] = sparse.xyz
+    return RangeImage(metres, shade, mask, sensor, xyz=xyz), known
+
+
+def best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each of 16 x 128 bands the row and the column with most known pixels, and which cells hold any: (16, 128)."""
+    rows, columns = (
+        np.linspace(0, size, count + 1).astype(int) for size, count in zip(told.shape, (ROWS, COLUMNS), strict=True)
+    )
+    row = np.array([a + told[a:b].sum(1).argmax() for a, b in pairwise(rows)])
+    column = np.array([a + told[:, a:b].sum(0).argmax() for a, b in pairwise(columns)])
+    cell = np.add.reduceat(np.add.reduceat(told.astype(int), rows[:-1], 0), columns[:-1], 1) > 0
+    return row, column, cell
+
+
+def widened(cell: np.ndarray) -> np.ndarray:
+    """(16, 128) bool: cells and their eight neighbours, around the turn."""
+    tall = np.pad(cell, ((1, 1), (0, 0)))
+    tall = tall[:-2] | tall[1:-1] | tall[2:]
+    return tall | np.roll(tall, 1, 1) | np.roll(tall, -1, 1)

@@ -1,0 +1,46 @@
+"""A simulator's scan in a real sensor's rays: which of its points the sensor reports, and how bright."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.lidar.projection import pixel_of_points, row_of_points
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor
+
+ALIKE = 1.33  # a scan with so many times the sensor's columns, or so many times fewer, has its own
+COLUMNS = (128, 4096)
+
+
+def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
+    """The sensor with as many columns as the scan has points a ring, where that is not about its own number."""
+    row = row_of_points(scan, sensor, projection)
+    count = np.bincount(row[row >= 0], minlength=1)
+    full = int(np.percentile(count[count > 0], 75)) if count.any() else sensor.width
+    if sensor.width / ALIKE <= full <= sensor.width * ALIKE:
+        return sensor
+    return sensor.resized(width=int(np.clip(full, *COLUMNS)))
+
+
+def logistic(logit: Tensor, rng: list[torch.Generator]) -> Tensor:
+    """Noise of the standard logistic distribution: `logit` plus it is positive with the chance of the logit."""
+    draw = torch.cat([torch.rand((1, *logit.shape[1:]), generator=one) for one in rng]).clamp(1e-6, 1 - 1e-6)
+    return torch.logit(draw).to(logit)
+
+
+def observed(scan: Scan, image: RangeImage, answer: RangeImage, projection: str) -> RangeImage:
+    """The pixels of a perfect scan's image that return, as `answer` says; `completed` are their points, bit by bit.
+
+    Each point shares the fate and the reflectance of its pixel; what is out of the sensor's view or limits is gone.
+    """
+    mask = image.mask & answer.mask
+    row, column = pixel_of_points(scan, image.sensor, projection)
+    depth = np.linalg.norm(scan.xyz, axis=1)
+    kept = (row >= 0) & (depth >= image.sensor.min_range) & (depth <= image.sensor.max_range) & mask[row, column]
+    points = replace(scan, reflectance=answer.reflectance[row, column])[kept]
+    image = replace(image, reflectance=answer.reflectance).keep(mask)
+    return replace(image, completed=points)

@@ -1,0 +1,34 @@
+"""What the verb `realise` does with one simulated scan: leave out what no sensor would report, and light the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsynth.files.fields import Fields, find
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.verbs.completion import Filled
+
+
+def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) -> Filled:
+    """A perfect scan as `sensor` would have reported it. Raises ValueError as `ScanModel.realise` does."""
+    real = model.realised(scan, sensor, seed)
+    return Filled(real, {"simulated": project(scan, real.sensor), f"as {sensor.name} sees it": real}, {})
+
+
+def realised_fields(real: Scan, given: Fields) -> Fields:
+    """A realised scan as the columns that its message had, bit by bit but for the intensity, in the message's scale."""
+    fields = {name: column[real.extra["point"]] for name, column in given.items()}
+    name = find(given, "reflectance")
+    if name is None:
+        return fields | {"intensity": real.reflectance}
+    fields[name] = (real.reflectance * _full(given[name])).astype(given[name].dtype)
+    return fields
+
+
+def _full(values: np.ndarray) -> float:
+    """What a reflectance of 1 is in a column: 1 of floats up to 1, else the full scale of 8 or 16 bits."""
+    highest = values.max(initial=0)
+    return 1.0 if values.dtype.kind == "f" and highest <= 1 else 255.0 if highest <= 255 else 65535.0

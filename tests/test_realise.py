@@ -1,0 +1,128 @@
+"""The verb `realise`: whose points, fields and labels stay, in files, folders and bags; and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from networks import tiny_cascade
+from test_cascade import SMALL, perfect
+
+from lidarsynth.cli.main import main
+from lidarsynth.files.formats import read, write, write_labels
+from lidarsynth.files.labels import read_words
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.weights.load import load
+
+WORDS = ("--sensor", "own.toml", "--no-picture")
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a model, a sensor and a perfect scan."""
+    monkeypatch.chdir(tmp_path)
+    tiny_cascade(SMALL).save("model")
+    elevations = list(SMALL.elevations)
+    Path("own.toml").write_text(
+        f"elevations = {elevations}\nwidth = 256\nmin_range = 0.5\nmax_range = 120.0\nmount = 1.8\n"
+    )
+    return tmp_path
+
+
+def is_part_of(real: Scan, whole: Scan) -> np.ndarray:
+    """(N,) which points of the whole they are, in order; they are the same bit by bit."""
+    order = {row.tobytes(): k for k, row in enumerate(whole.xyz)}
+    assert len(order) == len(whole)
+    found = np.array([order[row.tobytes()] for row in real.xyz])
+    assert 0 < len(found) < len(whole) and np.all(np.diff(found) > 0)
+    return found
+
+
+def test_fields_and_points_survive(place: Path, capsys: pytest.CaptureFixture[str]):
+    scan = perfect(SMALL)
+    write("sim.pcd", scan)
+    main(["realise", "sim.pcd", "--out", "real.pcd", "--model", "model", *WORDS])
+    real, sim = read("real.pcd"), read("sim.pcd", intensity="none")
+    kept = is_part_of(real, sim)
+    assert f"would report {len(real)} of {len(sim)} points" in capsys.readouterr().out
+    for name in ("ring", "time", "label"):
+        np.testing.assert_array_equal(getattr(real, name), getattr(sim, name)[kept])
+    np.testing.assert_array_equal(real.extra["object"], sim.extra["object"][kept])
+    assert "new" not in real.extra and real.reflectance.any()
+    library = load("model").realise(sim, "own.toml")
+    np.testing.assert_array_equal(library.xyz, real.xyz)
+    np.testing.assert_array_equal(library.reflectance, real.reflectance)
+
+
+def test_a_folder_draws_each_scan_anew_and_thins_its_labels(place: Path):
+    scan = perfect(SMALL)
+    folder = place / "00" / "velodyne"
+    folder.mkdir(parents=True)
+    (place / "00" / "labels").mkdir()
+    words = np.arange(len(scan), dtype=np.uint32) << np.uint32(16) | np.uint32(40)
+    for name in ("a", "b"):
+        write(folder / f"{name}.bin", scan)
+        write_labels(place / "00" / "labels" / f"{name}.label", replace(scan, extra={"raw_label": words}))
+    main(["realise", "00/velodyne", "--out", "real", "--format", "bin", "--model", "model", *WORDS])
+    kept = []
+    for name in ("a", "b"):
+        real = read(f"real/{name}.bin")
+        kept.append(is_part_of(real, scan))
+        np.testing.assert_array_equal(read_words(f"real/{name}.label", len(real)), words[kept[-1]])
+    assert not np.array_equal(*kept)
+    np.testing.assert_array_equal(is_part_of(load("model").realise(scan, SMALL, seed=1), scan), kept[1])
+    main(["realise", "00/velodyne", "--out", "real", "--format", "bin", "--model", "model", *WORDS, "--skip-existing"])
+    main(["realise", "00/velodyne/a.bin", "--out", "a.ply", "--model", "model", *WORDS])
+    np.testing.assert_array_equal(read("a.ply").extra["raw_label"], words[kept[0]])
+
+
+def test_labels_that_do_not_fit_are_named(place: Path, capsys: pytest.CaptureFixture[str]):
+    write("a.bin", perfect(SMALL))
+    Path("a.label").write_bytes(b"1234")
+    with pytest.raises(SystemExit):
+        main(["realise", "a.bin", "--out", "o.ply", "--model", "model", *WORDS])
+    assert "a.label: expected" in capsys.readouterr().err and not Path("o.ply").exists()
+
+
+def test_bags_keep_their_columns(place: Path):
+    pytest.importorskip("rosbags")
+    from lidarsynth.data.bag_writer import write_bag
+    from lidarsynth.data.bags import Cloud
+    from lidarsynth.verbs.inputs import Reading, inputs_of
+
+    scan = perfect(SMALL)
+    fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
+              "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip
+    with write_bag(Path("sim.mcap")) as writer:
+        for k in range(2):
+            writer.write_cloud("/points", Cloud(10**9 + k, "lidar", 10**9 + k, fields))
+    main(["realise", "sim.mcap", "--out", "real.mcap", "--model", "model", "--sensor", "own.toml"])
+    clouds = [item.read() for item in inputs_of([Path("real.mcap")], Reading("none")).stream()]
+    assert [cloud.stamp for cloud in clouds] == [10**9, 10**9 + 1]
+    for cloud in clouds:
+        kept = cloud.given["object"].astype(int)
+        assert 0 < len(kept) < len(scan) and cloud.given.keys() == fields.keys()
+        for name in ("x", "y", "z", "ring"):
+            np.testing.assert_array_equal(cloud.given[name], fields[name][kept])
+        assert cloud.given["intensity"].max() > 1 and cloud.given["intensity"].std() > 0
+
+
+def test_a_model_that_cannot_is_refused_before_any_work(place: Path, capsys: pytest.CaptureFixture[str]):
+    write("sim.pcd", perfect(SMALL))
+    for words in (["realise", "sim.pcd", "--out", "o"], ["generate", "--labels", "--out", "o"]):
+        with pytest.raises(SystemExit) as stop:
+            main([*words, "--model", "kitti"])
+        said = capsys.readouterr().err
+        assert stop.value.code == 2 and said.count("expected a model that has learned") == 1
+    assert not Path("o").exists()
+
+
+def test_labels_of_generated_scans(place: Path):
+    main(["generate", "-n", "2", "--labels", "--steps", "1", "--model", "model", "--out", "made", "--no-picture"])
+    scan = read("made/000001.ply", intensity="unit")
+    assert scan.label is not None and scan.label.min() >= 1
+    raw = read_words("made/000001.label", len(scan))
+    assert set(raw.tolist()) <= {10, 11, 15, 18, 13, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81}
+    from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW
+
+    np.testing.assert_array_equal(CLASS_OF_RAW[raw], scan.label)
