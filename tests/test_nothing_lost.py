@@ -219,8 +219,9 @@ def test_what_a_killed_run_left_is_swept_also_when_it_goes_on(cache, trained, tm
     out = Path(shutil.copytree(trained, tmp_path / "out", symlinks=True))
     (out / "checkpoints/.saving-step-00000006").mkdir()
     (out / ".saving-abc").mkdir()
+    (out / ".model.0123.part").write_bytes(b"half")
     list(run(tiny(4), cache, out, options=QUIET))
-    assert not list(out.rglob(".saving-*"))
+    assert not list(out.rglob(".saving-*")) and not list(out.rglob("*.part"))
 
 
 def test_validation_that_is_not_there_fails_before_the_first_step(cache, tmp_path):

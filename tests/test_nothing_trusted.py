@@ -1,5 +1,6 @@
 """Files of settings, weights and caches that are pipes, devices, huge, crafted or cut short; and odd surroundings."""
 
+import errno
 import json
 import os
 import subprocess
@@ -16,10 +17,13 @@ from lidarsynth.data.index import read_index
 from lidarsynth.evaluation import accumulation, evaluate
 from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.statistics import load_statistics
-from lidarsynth.experiment.folder import read_experiment
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.experiment.folder import read_experiment, save
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.files.formats import write
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, read_sensor
 from lidarsynth.lidar.small_file import read_json, read_toml
+from lidarsynth.lidar.whole_file import sweep, whole_file, write_whole
 from lidarsynth.networks.tensors import read_state
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.table import load_folder
@@ -188,13 +192,39 @@ def test_devices_that_compute_nothing_are_refused(device: str):
         check_device(device)
 
 
-def test_pictures_have_the_rights_that_the_umask_leaves(tmp_path: Path):
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path):
     old = os.umask(0o027)
     try:
-        path = save_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
+        save_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
+        save(tmp_path, Experiment("linear"), torch.nn.Linear(2, 2))
+        write(tmp_path / "scan.bin", Scan(np.zeros((1, 3), np.float32), np.zeros(1, np.float32)))
     finally:
         os.umask(old)
-    assert path.stat().st_mode & 0o777 == 0o640 and [p.name for p in tmp_path.iterdir()] == ["a.png"]
+    rights = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    assert rights == dict.fromkeys(("a.png", "experiment.json", "model.safetensors", "scan.bin"), 0o640)
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path):
+    path = tmp_path / "file"
+    write_whole(path, "before")
+
+    def fail(error: BaseException) -> None:
+        with whole_file(path) as scratch:
+            scratch.write_text("half")
+            raise error
+
+    for error in (ValueError(), KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left")):
+        with pytest.raises(type(error)) as raised:
+            fail(error)
+        assert path.read_text() == "before" and [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert isinstance(raised.value, OSError) and raised.value.filename == str(path)
+    with whole_file(path, durable=True) as scratch:
+        scratch.write_text("after")
+        assert path.read_text() == "before"
+    assert path.read_text() == "after"
+    (tmp_path / ".file.0.part").touch()
+    sweep(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 def command(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:

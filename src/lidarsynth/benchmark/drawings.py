@@ -11,10 +11,10 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.benchmark.rows import Row
-from lidarsynth.data.index import whole
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_COLOURS, CLASSES
+from lidarsynth.lidar.whole_file import whole_file
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.pictures.figure import GAP, Picture, colour_bar, panel
 from lidarsynth.pictures.perspective import Camera, perspective
@@ -99,7 +99,7 @@ def save_scores(path: Path, rows: Sequence[Row], protocols: Sequence[str], title
         _curves(axes, rows, protocol, measure.name)
         if number == 1:
             axes.legend(fontsize="small")
-    with whole(path, 1 << 20) as scratch:
+    with whole_file(path) as scratch:
         figure.savefig(scratch, format="png", dpi=120)
 
 

@@ -16,7 +16,6 @@ from lidarsynth.benchmark.record import record_of
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.setup import Load, Setup, open_setup
 from lidarsynth.benchmark.sources import corrupted, located
-from lidarsynth.benchmark.store import write_text
 from lidarsynth.benchmark.tables import page
 from lidarsynth.benchmark.upsampling import Problem, upsampling_row
 from lidarsynth.evaluation.accumulation import OnImages
@@ -25,6 +24,7 @@ from lidarsynth.evaluation.pairs import classes_of
 from lidarsynth.evaluation.protocols import R2DM_UPSAMPLING, get_protocol
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.pictures.render import save_png
 
@@ -82,11 +82,11 @@ def benchmark(
     outcome = upsampling(setup, settings) if isinstance(settings, Upsampling) else generation(setup, settings)
     names = protocols_of(settings)
     text = page(settings.title, command, outcome.rows, names, outcome.about)
-    write_text(out / RESULTS, record_of(kind, settings, setup, outcome.rows, outcome.data, command))
+    write_whole(out / RESULTS, record_of(kind, settings, setup, outcome.rows, outcome.data, command))
     save_png(out / FIGURE, side_by_side(outcome.pictures, settings.title, outcome.note))
     if draws_scores:
         save_scores(out / SCORES, outcome.rows, names, settings.title)
-    write_text(out / TABLE, text)
+    write_whole(out / TABLE, text)
     return text
 
 

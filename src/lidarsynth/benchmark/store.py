@@ -13,9 +13,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarsynth.data.index import sweep, whole
 from lidarsynth.files.formats import read_image, write
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.whole_file import sweep, write_whole
 
 
 class Seconds(NamedTuple):
@@ -39,7 +39,7 @@ class Store:
         """Keep scan i. Raises FileError, OSError where the disk is full."""
         (self.folder / f"{i:06d}.json").unlink(missing_ok=True)
         write(self.folder / f"{i:06d}.npz", image)
-        write_text(self.folder / f"{i:06d}.json", json.dumps({"seconds": seconds._asdict(), "input": stamp}) + "\n")
+        write_whole(self.folder / f"{i:06d}.json", json.dumps({"seconds": seconds._asdict(), "input": stamp}) + "\n")
 
     def image(self, i: int) -> RangeImage:
         """Scan i. Raises FileError."""
@@ -66,7 +66,7 @@ class Store:
             return found
         report = judge()
         if final(report):
-            write_text(path, json.dumps(report, allow_nan=False) + "\n")
+            write_whole(path, json.dumps(report, allow_nan=False) + "\n")
         return report
 
     def _record(self, i: int) -> dict[str, Any]:
@@ -81,15 +81,8 @@ def open_store(folder: Path, name: str, settings: dict[str, Any]) -> Store:
     store = Store(folder / f"{slug}-{digest}")
     store.folder.mkdir(parents=True, exist_ok=True)
     sweep(store.folder)
-    write_text(store.folder / "settings.json", json.dumps(settings, indent=1) + "\n")
+    write_whole(store.folder / "settings.json", json.dumps(settings, indent=1) + "\n")
     return store
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, whole or not at all. Raises OSError of one line."""
-    data = text.encode()
-    with whole(path, len(data)) as scratch:
-        scratch.write_bytes(data)
 
 
 def _read_table(path: Path) -> dict[str, Any]:

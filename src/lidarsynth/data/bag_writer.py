@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, naming, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
+from lidarsynth.lidar.whole_file import whole_file
 
 Put = Callable[[Topic, int, bytes], None]  # topic, nanoseconds, message
 FORMATS = {".bag": "ros1", ".mcap": "cdr"}  # what each kind of file holds
@@ -50,15 +49,9 @@ def write_bag(path: str | Path) -> Iterator[BagWriter]:
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise FileError(f"{path}: expected a name that ends in {', '.join(FORMATS)} for a bag, found {path.suffix!r}")
-    scratch = path.with_name(f".{secrets.token_hex(8)}{path.suffix.lower()}")
     opened = {".bag": _bag, ".mcap": _mcap}[path.suffix.lower()]
-    try:
-        with naming(path), opened(scratch) as put:
-            yield BagWriter(path, FORMATS[path.suffix.lower()], put)
-        os.replace(scratch, path)
-    finally:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
+    with naming(path), whole_file(path) as scratch, opened(scratch) as put:
+        yield BagWriter(path, FORMATS[path.suffix.lower()], put)
 
 
 def points_topic(name: str, encoding: str) -> Topic:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.index import close_index, open_index, stored_step, whole, write_index
+from lidarsynth.data.index import close_index, open_index, resumable_file, stored_step, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
@@ -172,7 +172,7 @@ def npy_header(dtype: np.dtype, count: int) -> bytes:
 def _store(path: Path, records: np.ndarray) -> str:
     """Write a shard, whole or not at all; returns its checksum."""
     header, body = npy_header(records.dtype, len(records)), records.view(np.uint8)
-    with whole(path, len(header) + body.nbytes) as scratch, open(scratch, "wb") as file:
+    with resumable_file(path, len(header) + body.nbytes) as scratch, open(scratch, "wb") as file:
         file.write(header)
         file.write(body.data)
     digest = hashlib.sha256(header)

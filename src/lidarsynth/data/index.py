@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
+from lidarsynth.lidar.whole_file import sweep, whole_file
 
 INDEX, REPORT = "index.json", "report.json"
 PLACE = ("root", "missing")  # of a source: where it lies on this disk, not what it is
@@ -85,12 +84,6 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
     return index | {"source": head["source"], "count": max(count, index["count"])}
 
 
-def sweep(folder: Path) -> None:
-    """Remove what killed calls left unfinished; nobody may be writing."""
-    for stale in folder.glob(".*.part"):
-        stale.unlink(missing_ok=True)
-
-
 def close_index(folder: Path, index: dict[str, Any]) -> None:
     """Write the index when all shards are; a killed call's worker may have outlived the sweep of `open_index`."""
     sweep(folder)
@@ -102,13 +95,10 @@ def write_index(folder: Path, index: dict[str, Any]) -> None:
     lines = [f" {json.dumps(name)}: {json.dumps(index['shards'][name])}" for name in sorted(index["shards"])]
     head = [f"{json.dumps(key)}: {json.dumps(value)}" for key, value in index.items() if key != "shards"]
     head.append('"shards": {\n' + ",\n".join(lines) + "\n}")
-    _write_text(folder / INDEX, "{\n" + ",\n".join(head) + "\n}\n")
-    _write_text(folder / REPORT, json.dumps(report(index), indent=1) + "\n")
-
-
-def _write_text(path: Path, text: str) -> None:
-    with whole(path, len(text)) as scratch:
-        scratch.write_text(text)
+    texts = {INDEX: "{\n" + ",\n".join(head) + "\n}\n", REPORT: json.dumps(report(index), indent=1) + "\n"}
+    for name, text in texts.items():
+        with resumable_file(folder / name, len(text)) as scratch:
+            scratch.write_text(text)
 
 
 def report(index: dict[str, Any]) -> dict[str, Any]:
@@ -126,14 +116,11 @@ def report(index: dict[str, Any]) -> dict[str, Any]:
 
 
 @contextmanager
-def whole(path: Path, size: int) -> Iterator[Path]:
-    """A place to write `path` to, moved there afterwards. Raises OSError of one line that says how much was wanted."""
-    scratch = path.with_name(f".{path.stem}.{secrets.token_hex(8)}.part")  # a pid is not alone on a shared disk
+def resumable_file(path: Path, size: int) -> Iterator[Path]:
+    """`whole_file` of `size` bytes; its OSError is one line that says how much room was wanted, and how to go on."""
     try:
-        yield scratch
-        os.replace(scratch, path)
+        with whole_file(path) as scratch:
+            yield scratch
     except OSError as error:
         raise OSError(f"{path.parent}: expected a writable folder with room for {size / 2**20:.1f} MiB more, found: "
                       f"{error.strerror}; the same command goes on") from None  # fmt: skip
-    finally:
-        scratch.unlink(missing_ok=True)

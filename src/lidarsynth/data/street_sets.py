@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
@@ -17,13 +16,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lidarsynth.data.index import whole
+from lidarsynth.data.index import resumable_file
 from lidarsynth.data.layouts.kitti import KITTI
 from lidarsynth.data.layouts.layout import Layout
 from lidarsynth.data.layouts.nuscenes import NUSCENES
 from lidarsynth.data.layouts.pcd import PCD
 from lidarsynth.data.layouts.semantickitti import SEMANTICKITTI
 from lidarsynth.data.workers import in_order
+from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
 from lidarsynth.streets.drawing import bev_with_boxes, strips
 from lidarsynth.streets.frame import LabelledStreets
@@ -46,7 +46,7 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
     Raises ValueError where the folder holds another set or something else, OSError of one line when the disk is full.
     """
     _claim(folder, _settings(streets, layout))
-    _sweep(folder)
+    sweep(folder, deep=True)
     task = _Task(folder, streets, layout)
     chunks = task.chunks()
     done = len(streets) - sum(map(len, chunks))
@@ -58,7 +58,7 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
             yield done
     finally:
         written.close()
-        _sweep(folder)  # a killed worker's
+        sweep(folder, deep=True)  # a killed worker's
     for path, content in LAYOUTS[layout].tables(streets, folder):
         _put(folder / path, content)
 
@@ -123,20 +123,13 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
     _put(path, (json.dumps(settings, indent=1) + "\n").encode())
 
 
-def _sweep(folder: Path) -> None:
-    """Remove what killed calls left unfinished."""
-    for stale in folder.rglob(".*.part"):
-        with suppress(OSError):
-            stale.unlink()
-
-
 def _put(path: Path, content: bytes | BinaryIO) -> None:
     """The file, whole or not at all. Raises OSError of one line."""
     source = BytesIO(content) if isinstance(content, bytes) else content
     size = source.seek(0, 2)
     source.seek(0)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole(path, size) as scratch, open(scratch, "wb") as file:
+    with resumable_file(path, size) as scratch, open(scratch, "wb") as file:
         shutil.copyfileobj(source, file)
 
 

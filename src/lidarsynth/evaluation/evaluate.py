@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from lidarsynth.data.cache import sha256 as sha256_of_file
-from lidarsynth.data.index import whole
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
 from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, sensor_of, stem_of
@@ -25,6 +24,7 @@ from lidarsynth.evaluation.statistics import Statistics, definition, load_statis
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
@@ -111,7 +111,8 @@ class _Run:
                 self.on_images("pairs", numbers.stop, len(judged))
             if unfinished and time.monotonic() - saved > accumulation.SAVE_EVERY:
                 with suppress(OSError):  # the cache is for going on only
-                    _write(unfinished, json.dumps(pairs.state()))
+                    unfinished.parent.mkdir(parents=True, exist_ok=True)
+                    write_whole(unfinished, json.dumps(pairs.state()))
                 saved = time.monotonic()
         with suppress(OSError):
             if unfinished:
@@ -324,11 +325,5 @@ def check_out(out: Path) -> None:
 def write_report(report: Report, out: Path) -> None:
     """Write the report as JSON and, beside it with the ending `.md`, as Markdown. Raises ValueError as `check_out`."""
     check_out(out)
-    _write(out, report.json())
-    _write(out.with_suffix(".md"), report.markdown())
-
-
-def _write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with whole(path, len(text)) as scratch:
-        scratch.write_text(text)
+    write_whole(out, report.json())
+    write_whole(out.with_suffix(".md"), report.markdown())

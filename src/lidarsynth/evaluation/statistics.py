@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from hashlib import blake2b, sha256
@@ -14,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialized
 from torch import Tensor, nn
 
 from lidarsynth.evaluation.features import cloud_features, drawn_again, features, gated
@@ -23,6 +21,7 @@ from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, from_dict
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import Array, Moments
 from lidarsynth.metrics.occupancy import Occupancy
@@ -278,16 +277,8 @@ def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str]
         **(extra or {}),
     }
     metadata["sha256"] = _content(tensors, metadata)
-    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.touch()
-        mode = unfinished.stat().st_mode & 0o777
-        save_file(tensors, unfinished, metadata)
-        unfinished.chmod(mode)  # safetensors lets nobody else read what it writes
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, serialized(tensors, metadata))
     return metadata["sha256"]
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 
 import torch
@@ -13,6 +11,7 @@ from torch import nn
 
 from lidarsynth.experiment.record import Experiment, from_dict
 from lidarsynth.lidar.small_file import read_json
+from lidarsynth.lidar.whole_file import whole_file
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
 
@@ -25,11 +24,9 @@ def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: b
     # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
     exact = {name for name, _ in network.named_buffers()}
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()}
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as scratch:
-        (Path(scratch) / WEIGHTS).write_bytes(serialized(weights))  # save_file would hide it from other users
-        (Path(scratch) / RECORD).write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
-        for name in (WEIGHTS, RECORD):
-            os.replace(Path(scratch) / name, folder / name)
+    with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
+        record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
+        file.write_bytes(serialized(weights))  # save_file would hide it from other users
     return folder
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import secrets
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, s
 from lidarsynth.files.labels import read_labels, read_words
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import RAW
+from lidarsynth.lidar.whole_file import whole_file
 
 READERS: dict[str, Callable[[bytes], Fields]] = {
     ".bin": arrays.read_bin,
@@ -139,17 +139,11 @@ def write_labels(path: str | Path, scan: Scan) -> None:
 
 
 def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:
-    """Write a file beside its place, then move it there."""
-    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
-        with open(unfinished, "xb") as file:
+        with whole_file(path) as scratch, open(scratch, "wb") as file:
             write_to(file)
-        os.replace(unfinished, path)
     except OSError as error:
         raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from None
-    finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
 
 
 def _suffix(path: str | Path, known: dict, verb: str) -> str:

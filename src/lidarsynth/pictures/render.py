@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.whole_file import whole_file
 from lidarsynth.pictures.colours import label_colours, point_colours, range_colours, reflectance_colours
 
 BACKGROUNDS: dict[str, tuple[int, int, int]] = {"dark": (16, 18, 24), "white": (255, 255, 255)}
@@ -134,12 +133,6 @@ def save_png(path: str | Path, rgb: np.ndarray) -> Path:
     """Writes (H, W, 3) uint8 as a PNG, whole or not at all; returns the path. Raises ValueError for other arrays."""
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
         raise ValueError(f"rgb must be (H, W, 3) uint8 with pixels, got {rgb.shape} {rgb.dtype}")
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.png")
-    try:
-        with open(temporary, "xb") as file:  # with the rights that the user's umask leaves
-            Image.fromarray(rgb).save(file, format="PNG", compress_level=6)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    with whole_file(path) as scratch:
+        Image.fromarray(rgb).save(scratch, format="PNG", compress_level=6)
+    return Path(path)

@@ -22,6 +22,8 @@ import torch
 from lidarsynth.experiment.folder import RECORD, WEIGHTS, save
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.small_file import read_json
+from lidarsynth.lidar.whole_file import sweep as sweep_parts
+from lidarsynth.lidar.whole_file import whole_file, write_whole
 from lidarsynth.training.loop import Run
 
 FOLDER, LATEST, STATE, CHECKSUMS = "checkpoints", "latest", "state.pt", "checksums.json"
@@ -30,13 +32,8 @@ SCRATCH = ".saving-"
 
 def save_run(path: str | Path, run: Run) -> None:
     """Write the run's state; the file is moved into place when complete, and survives a power cut from then on."""
-    path = Path(path)
-    scratch = path.with_suffix(".tmp")
-    with scratch.open("wb") as file:
+    with whole_file(path, durable=True) as scratch, scratch.open("wb") as file:
         torch.save(run.state_dict(), file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(scratch, path)
 
 
 def load_run(path: str | Path, run: Run) -> None:
@@ -134,7 +131,7 @@ def _write(folder: Path, experiment: Experiment, run: Run) -> None:
     save(folder, experiment, run.ema)
     save_run(folder / STATE, run)
     digests = {name: _sha256(folder / name) for name in (STATE, WEIGHTS, RECORD)}
-    (folder / CHECKSUMS).write_text(json.dumps(digests, indent=1) + "\n")
+    write_whole(folder / CHECKSUMS, json.dumps(digests, indent=1) + "\n")
 
 
 def _appear(home: Path, write: Callable[[Path], object]) -> None:
@@ -151,5 +148,6 @@ def _appear(home: Path, write: Callable[[Path], object]) -> None:
 def sweep(out: str | Path) -> None:
     """Remove what a killed process left half-written."""
     for folder in (Path(out), Path(out) / FOLDER):
+        sweep_parts(folder)
         for scratch in folder.glob(f"{SCRATCH}*"):
             scratch.unlink() if scratch.is_symlink() else shutil.rmtree(scratch, ignore_errors=True)

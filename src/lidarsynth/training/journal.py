@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.pictures.render import save_png
 from lidarsynth.training.loop import Progress
 
@@ -96,9 +96,7 @@ def _continue_table(path: Path, step: int, columns: Sequence[str]):
     """The open table with the rows up to `step`."""
     lines = path.read_text().splitlines()[1:] if path.exists() else []
     kept = [line for line in lines if line.count(",") == len(columns) - 1 and int(line.split(",")[0]) <= step]
-    scratch = path.with_suffix(".tmp")
-    scratch.write_text("\n".join([",".join(columns), *kept]) + "\n")
-    os.replace(scratch, path)
+    write_whole(path, "\n".join([",".join(columns), *kept]) + "\n")
     return path.open("a")
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.batch import Result
 
 REPORT = "report.json"
@@ -55,9 +55,7 @@ def _row(result: Result) -> dict[str, Any]:
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """The report as JSON, whole or not at all."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}.part")
-    scratch.write_text(json.dumps(report, indent=1) + "\n")
-    os.replace(scratch, path)
+    write_whole(path, json.dumps(report, indent=1) + "\n")
 
 
 def merge_shards(out: Path, parts: int) -> Path | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 import torch
 
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.networks.running import LONGEST
 from lidarsynth.systems.graph import Graph
 from lidarsynth.systems.scan_model import ScanModel
@@ -55,14 +55,10 @@ def export_onnx(model: ScanModel, path: str | Path, sensor: str | None = None, o
     proto = _program(graph)
     shapes = _shapes(proto.graph.input), _shapes(proto.graph.output)
     _describe(proto, model, graph)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        scratch.write_bytes(proto.SerializeToString())
-        os.replace(scratch, path)
+        write_whole(path, proto.SerializeToString())
     except OSError as error:
         raise ValueError(f"{path}: expected a writable folder with room, found: {error.strerror}") from None
-    finally:
-        scratch.unlink(missing_ok=True)
     opset = next(entry.version for entry in proto.opset_import if not entry.domain)
     return Exported(path, graph.does, opset, model.sensor, *shapes, graph.says, path.stat().st_size)
 

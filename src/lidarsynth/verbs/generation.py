@@ -1,14 +1,12 @@
 """What the verb `generate` does: scans streamed into a folder, which goes on where it was stopped.
 
-A finished scan is a file NNNNNN.ply and its picture NNNNNN.png. Both are made in the folder's `.unfinished` and then
-moved, so that a kill at any moment leaves whole files only. `generate.json` says what the scans were made with.
+A finished scan is a file NNNNNN.ply and its picture NNNNNN.png. Each appears whole, the
+scan last, so that a kill at any moment leaves whole files only. `generate.json` says what the scans were made with.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +14,12 @@ from typing import Any
 from lidarsynth.files.formats import write, write_labels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.small_file import read_json
+from lidarsynth.lidar.whole_file import sweep, write_whole
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
-RECORD, SCRATCH = "generate.json", ".unfinished"
+RECORD = "generate.json"
 LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
 
 
@@ -41,10 +40,8 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
     if taken := sorted(folder.glob("[0-9]" * 6 + ".*")):
         raise ValueError(f"{folder}: expected a folder without scans, or with {RECORD}, found {taken[0].name}; "
                          f"use another --out")  # fmt: skip
-    scratch = folder / SCRATCH
-    scratch.mkdir(parents=True, exist_ok=True)
-    (scratch / RECORD).write_text(json.dumps(settings, indent=1) + "\n")
-    os.replace(scratch / RECORD, record)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(record, json.dumps(settings, indent=1) + "\n")
 
 
 def _recorded(record: Path) -> dict[str, Any]:
@@ -83,26 +80,20 @@ def generate_into(
     on_step: OnStep = None,
 ) -> Iterator[Path]:
     """Make the scans of `runs`, a batch in memory at a time, and yield each file when it and its picture are there."""
-    try:
-        for run in runs:
-            images = model.stream(run.stop, steps, seed, sampler, batch_size, run.start, on_step)
-            for i, image in zip(run, images, strict=True):
-                yield _store(folder, f"{i:06d}", image, endings)
-    finally:
-        shutil.rmtree(folder / SCRATCH, ignore_errors=True)
+    sweep(folder)
+    for run in runs:
+        images = model.stream(run.stop, steps, seed, sampler, batch_size, run.start, on_step)
+        for i, image in zip(run, images, strict=True):
+            yield _store(folder, f"{i:06d}", image, endings)
 
 
 def _store(folder: Path, name: str, image: RangeImage, endings: tuple[str, ...]) -> Path:
-    """Write the files of one scan and move them to their places, the scan last."""
-    scratch = folder / SCRATCH
-    scratch.mkdir(exist_ok=True)
+    """Write the files of one scan, the scan last."""
     for ending in reversed(endings):
-        path = scratch / f"{name}{ending}"
         if ending == ".png":
-            save_png(path, portrait(image))
+            save_png(folder / f"{name}.png", portrait(image))
         elif ending == LABEL:
-            write_labels(path, image.to_scan())
+            write_labels(folder / f"{name}{LABEL}", image.to_scan())
         else:
-            write(path, image)
-        os.replace(path, folder / path.name)
+            write(folder / f"{name}{ending}", image)
     return folder / f"{name}{endings[0]}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -13,6 +12,7 @@ from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
 from lidarsynth.lidar.learning import LearnedSensor, learn_sensor
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.inputs import Input, Inputs
 
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
@@ -45,9 +45,7 @@ def _readable(inputs: Iterable[Input]) -> Iterator[Scan]:
 def write_toml(path: Path, text: str) -> None:
     """The text as a file, whole or not at all, in a folder that is made if need be."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}.part")
-    scratch.write_text(text)
-    os.replace(scratch, path)
+    write_whole(path, text)
 
 
 def sensor_toml(sensor: Sensor, comments: Sequence[str] = ()) -> str:

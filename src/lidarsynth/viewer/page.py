@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.data.index import whole
+from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.viewer.colouring import colourings, ground_height
 from lidarsynth.viewer.packing import Shown, packed
 
@@ -76,6 +76,5 @@ def write_page(path: Path, title: str, entries: Iterable[Entry]) -> int:
     """
     content = standalone(title, entries).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole(path, len(content)) as scratch:
-        scratch.write_bytes(content)
+    write_whole(path, content)
     return len(content)
