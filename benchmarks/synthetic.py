@@ -19,6 +19,7 @@ import numpy as np
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.metrics.sharpness import Sharpness
 from lidarsynth.pictures.colours import label_colours
@@ -26,7 +27,6 @@ from lidarsynth.pictures.figure import compare as figure
 from lidarsynth.pictures.figure import panel
 from lidarsynth.pictures.render import bev as bev_picture
 from lidarsynth.pictures.render import label_strip, range_strip, save_png
-from lidarsynth.streets.materials import LABEL
 from lidarsynth.streets.reader import SyntheticStreets
 
 SENSOR = SENSORS["hdl-64e-kitti"]
@@ -161,7 +161,7 @@ def pictures(real: list[RangeImage], seed: int, folder: Path) -> list[Path]:
 
 
 def _legend(image: RangeImage) -> list[tuple[str, np.ndarray]]:
-    names = list(LABEL)
+    names = list(CLASS_NUMBER)
     assert image.label is not None
     present = np.unique(image.label[image.mask])
     return [(names[k], np.broadcast_to(label_colours(np.array([[k]])), (12, 90, 3)).copy()) for k in present]

@@ -1,4 +1,7 @@
-"""Which pixels of a range image are known: sparse beams, sparse points, a blocked sector, a removed region."""
+"""Which pixels of a range image are known: sparse beams, sparse points, a blocked sector, a removed region.
+
+The patterns are what training hides, too: masks (H, W) bool of a shape, True = known.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,31 @@ import numpy as np
 from lidarsynth.lidar.scan import RangeImage
 
 
+def every_beam(shape: tuple[int, int], every: int, first: int = 0) -> np.ndarray:
+    """Every `every`-th row is known, from row `first` on."""
+    known = np.zeros(shape, bool)
+    known[first::every] = True
+    return known
+
+
+def without_rectangle(shape: tuple[int, int], rows: range, columns: range) -> np.ndarray:
+    """`rows` of `columns` are lost; columns go on at the other end of the turn."""
+    known = np.ones(shape, bool)
+    known[rows.start : rows.stop, np.asarray(columns, int) % shape[1]] = False
+    return known
+
+
+def without_columns(shape: tuple[int, int], columns: range) -> np.ndarray:
+    """A sector is lost: `columns` of all rows."""
+    return without_rectangle(shape, range(shape[0]), columns)
+
+
 def beams(image: RangeImage, rng: np.random.Generator, every: float = 4, first: float = 0) -> np.ndarray:
     """Every `every`-th beam is known, from row `first` on. (H, W) bool."""
     if every != int(every) or first != int(first) or not 1 <= every <= image.shape[0] or not 0 <= first < every:
         raise ValueError(f"beams expects whole numbers EVERY in 1..{image.shape[0]} and FIRST below it, "
                          f"found {every:g}:{first:g}")  # fmt: skip
-    known = np.zeros(image.shape, bool)
-    known[int(first) :: int(every)] = True
-    return known
+    return every_beam(image.shape, int(every), int(first))
 
 
 def points(image: RangeImage, rng: np.random.Generator, share: float = 0.1) -> np.ndarray:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidarsynth.streets.materials import LABEL, NUMBER
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.streets.materials import NUMBER
 
 KERB = 0.12  # metres from carriageway to sidewalk
 CROWN = 0.018  # fall of a carriageway from its middle to its edges
@@ -98,7 +99,7 @@ class Ground:
         wear (N,) float32, and how far the real surface lies below the smooth one (N,) float32 metres: crown and bumps.
         """
         material = np.full(x.shape, NUMBER[self.verge], np.uint8)
-        label = np.full(x.shape, LABEL["sidewalk" if self.verge == "sidewalk" else "terrain"], np.uint8)
+        label = np.full(x.shape, CLASS_NUMBER["sidewalk" if self.verge == "sidewalk" else "terrain"], np.uint8)
         sag = np.zeros(x.shape, np.float32)
         tracks, roadway = np.zeros(x.shape, np.float32), np.zeros(x.shape, bool)
         for road in self.roads:
@@ -108,11 +109,11 @@ class Ground:
             sag[inside] = CROWN * np.abs(d[inside])
             tracks[inside] = 1.6 * np.cos(4 * np.pi * d[inside] / road.half + self.phase)  # two wheels a lane
             material[inside] = NUMBER["road" if road.paved else "gravel"]
-            label[inside] = LABEL["road"]
+            label[inside] = CLASS_NUMBER["road"]
             park = inside & ((d < road.parking[0] - road.half) | (d > road.half - road.parking[1]))
-            material[park], label[park] = NUMBER["parking"], LABEL["parking"]
+            material[park], label[park] = NUMBER["parking"], CLASS_NUMBER["parking"]
             self._paint(road, s, d, material)
-        material[raised], label[raised] = NUMBER["sidewalk"], LABEL["sidewalk"]
+        material[raised], label[raised] = NUMBER["sidewalk"], CLASS_NUMBER["sidewalk"]
         wear = np.zeros(x.shape, np.float32)
         wear[roadway] = tracks[roadway]
         for kx, ky, phase in self.patches:

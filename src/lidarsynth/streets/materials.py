@@ -55,10 +55,3 @@ MATERIALS: dict[str, Material] = {
 
 NUMBER = {name: i for i, name in enumerate(MATERIALS)}
 TABLE = np.array(list(MATERIALS.values()), np.float32)
-
-# SemanticKITTI training classes (facts/metrics.md section 4), the words of this folder.
-LABEL = {
-    "unlabeled": 0, "car": 1, "bicycle": 2, "motorcycle": 3, "truck": 4, "other-vehicle": 5, "person": 6,
-    "bicyclist": 7, "motorcyclist": 8, "road": 9, "parking": 10, "sidewalk": 11, "other-ground": 12, "building": 13,
-    "fence": 14, "vegetation": 15, "trunk": 16, "terrain": 17, "pole": 18, "traffic-sign": 19,
-}  # fmt: skip

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.layout import build
-from lidarsynth.streets.materials import LABEL
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.sensor_model import OPTICS, Optics
 from lidarsynth.streets.turn import Turn, perfect, shoot
@@ -29,7 +29,7 @@ class Worlds:
     def __getitem__(self, number: int) -> tuple[World, Caster]:
         if number not in self._kept:
             world = visible(build(np.random.default_rng((self.seed, number)), self.density), self.sensor)
-            world = _emptied(world, [LABEL[word] for word in self.without])
+            world = _emptied(world, [CLASS_NUMBER[word] for word in self.without])
             if len(self._kept) >= 2:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[number] = (world, Caster(world.corners))
@@ -63,8 +63,8 @@ class SyntheticStreets:
     ):
         if seed < 0 or length < 1:
             raise ValueError(f"expected seed >= 0 and length >= 1, got seed {seed} and length {length}")
-        if unknown := [word for word in without if word not in LABEL]:
-            raise ValueError(f"expected classes of {', '.join(LABEL)}, found {unknown[0]!r}")
+        if unknown := [word for word in without if word not in CLASS_NUMBER]:
+            raise ValueError(f"expected classes of {', '.join(CLASS_NUMBER)}, found {unknown[0]!r}")
         self.without = without
         self.apart = apart
         self.optics = optics

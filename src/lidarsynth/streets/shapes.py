@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsynth.streets.materials import LABEL, NUMBER
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.streets.materials import NUMBER
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ def mesh(corners: np.ndarray, material: str, label: str) -> Mesh:
     """All of one material and class. corners (T, 3, 3) or anything that reshapes to it."""
     corners = np.asarray(corners, np.float32).reshape(-1, 3, 3)
     count = len(corners)
-    return Mesh(corners, np.full(count, NUMBER[material], np.uint8), np.full(count, LABEL[label], np.uint8))
+    return Mesh(corners, np.full(count, NUMBER[material], np.uint8), np.full(count, CLASS_NUMBER[label], np.uint8))
 
 
 def join(*parts: Mesh) -> Mesh:

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.areas import Area
 from lidarsynth.streets.ground import Ground, Road, ground_mesh, slab_mesh
-from lidarsynth.streets.materials import LABEL, NUMBER
+from lidarsynth.streets.materials import NUMBER
 from lidarsynth.streets.objects import library
 
 GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
@@ -201,7 +202,7 @@ def _soup(corners: np.ndarray, kind: int, material: str, label: str) -> dict[str
         "corners": np.asarray(corners, np.float32),
         "kind": np.full(count, kind, np.uint8),
         "material": np.full(count, NUMBER[material], np.uint8),
-        "label": np.full(count, LABEL[label], np.uint8),
+        "label": np.full(count, CLASS_NUMBER[label], np.uint8),
         "tint": np.zeros(count, np.float32),
         "front": np.full(count, -1, np.int16),
         "thing": np.full(count, -1, np.int32),

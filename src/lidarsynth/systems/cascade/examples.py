@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.corruption import every_beam, without_columns, without_rectangle
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
@@ -139,20 +140,20 @@ def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled
         known[np.ix_(np.unique(rows), np.arange(rng.integers(step), width, step))] = True
     elif kind < 0.72:
         step = int(rng.choice((2, 2, 3, 4, 4, 4, 6, 8)))
-        known[rng.integers(step) :: step] = True
+        known = every_beam(shape, step, int(rng.integers(step)))
     elif kind < 0.79:
         known[rng.random(height) < rng.uniform(1 / 8, 1 / 2)] = True
     elif kind < 0.9:
         known[:] = rng.random(shape) < 0.02 * 30 ** rng.random()
     elif kind < 0.95:
-        known[:, int(rng.integers(8, width // 2)) :] = True
-        known = np.roll(known, int(rng.integers(width)), 1)
+        kept, shift = int(rng.integers(8, width // 2)), int(rng.integers(width))
+        known = without_columns(shape, range(shift, shift + kept))
     else:
         known[:] = True
         for _ in range(int(rng.integers(1, 4))):
             tall, wide = int(rng.integers(2, height)), int(rng.integers(4, width // 3))
             top, left = int(rng.integers(height - tall + 1)), int(rng.integers(width - wide))
-            known[top : top + tall, left : left + wide] = False
+            known &= without_rectangle(shape, range(top, top + tall), range(left, left + wide))
     if rng.random() < 0.08:
         known &= rng.random(shape) < rng.uniform(0.3, 1)
     return known

@@ -11,12 +11,14 @@ from collections.abc import Sized
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from lidarsynth.diffusion.denoiser import Denoiser, masked_mean, min_snr_weight
 from lidarsynth.experiment.record import Experiment, Training
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.corruption import every_beam, without_columns, without_rectangle
 from lidarsynth.lidar.depth import CODECS, decode, encode, valid
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.diffusion.build import build_denoiser
@@ -201,43 +203,35 @@ def scaled(experiment: Experiment, x_0: Tensor, rng: torch.Generator) -> Tensor:
 
 
 def random_known(x_0: Tensor, rng: torch.Generator) -> Tensor:
-    """Bool (2, H, W): a random pattern of known pixels, of one of six kinds.
+    """Bool (2, H, W): a random pattern of known pixels: even beams (most), uneven beams, points, without a sector or
+    a rectangle; a tenth of all keep points only.
 
     Half of the samples also hide where the sensor measured nothing (-1 in x_0), as in a scan whose drop-outs are to be
     filled; a tenth hide all reflectance.
     """
-    dice = torch.rand(10, generator=rng).tolist()
-    known = _pattern(x_0.shape[1], x_0.shape[2], dice, rng).expand(x_0.shape).clone()
-    if dice[8] < 0.5:
+    kind, size, width, place, sparse, share, column, _, empty, dark = torch.rand(10, generator=rng).tolist()
+    shape = height, columns = x_0.shape[1], x_0.shape[2]
+    pattern = np.ones(shape, bool)
+    if kind < 0.6:
+        every = (2, 3, 4, 4, 4, 6, 8)[int(size * 7)]
+        pattern = every_beam(shape, every, 0 if width < 0.5 else int(place * every))
+    elif kind < 0.7:  # one beam in eight to one in two
+        pattern = pattern & (torch.rand(height, 1, generator=rng) < 1 / 8 + 3 / 8 * size).numpy()
+    if 0.7 < kind < 0.82 or sparse < 0.1:  # 2 % to 80 % of the points
+        pattern &= (torch.rand(shape, generator=rng) < math.exp(math.log(0.02) + share * math.log(40))).numpy()
+    if 0.82 <= kind < 0.91:  # 20 to 180 degrees
+        first = int(width * columns)
+        pattern &= without_columns(shape, range(first, first + int(columns * (20 + 160 * size) / 360)))
+    if kind >= 0.91:
+        tall, wide = int(height * (0.1 + 0.9 * size)), int(columns * (0.02 + 0.2 * width))
+        top, left = int(place * (height - tall + 1)), int(column * columns)
+        pattern &= without_rectangle(shape, range(top, top + tall), range(left, left + wide))
+    known = torch.from_numpy(pattern).expand(x_0.shape).clone()
+    if empty < 0.5:
         known &= x_0[:1] > -1
-    if dice[9] < 0.1:
+    if dark < 0.1:
         known[1] = False
     return known
-
-
-def _pattern(height: int, width: int, draw: list[float], rng: torch.Generator) -> Tensor:
-    """Bool (H, W): even beams (most), uneven beams, points, a lost sector, a lost rectangle, or beams + points."""
-    mask = torch.ones(height, width, dtype=torch.bool)
-    if draw[0] < 0.6:  # every k-th beam, k = 2, 3, 4, 4, 4, 6, 8
-        step = (2, 3, 4, 4, 4, 6, 8)[int(draw[1] * 7)]
-        first = 0 if draw[2] < 0.5 else int(draw[3] * step)
-        mask = torch.zeros_like(mask)
-        mask[first::step] = True
-    elif draw[0] < 0.7:  # any beams, one in eight to one in two
-        mask = mask & (torch.rand(height, 1, generator=rng) < 1 / 8 + 3 / 8 * draw[1])
-    if 0.7 < draw[0] < 0.82 or draw[4] < 0.1:  # a share of the points, 2 % to 80 %
-        share = math.exp(math.log(0.02) + draw[5] * math.log(40))
-        mask = mask & (torch.rand(height, width, generator=rng) < share)
-    if 0.82 <= draw[0] < 0.91:  # a sector of 20 to 180 degrees is lost
-        lost = int(width * (20 + 160 * draw[1]) / 360)
-        mask[:, :lost] = False
-        mask = mask.roll(int(draw[2] * width), dims=1)
-    if draw[0] >= 0.91:  # a rectangle is lost
-        rows, columns = int(height * (0.1 + 0.9 * draw[1])), int(width * (0.02 + 0.2 * draw[2]))
-        top = int(draw[3] * (height - rows + 1))
-        mask[top : top + rows, :columns] = False
-        mask = mask.roll(int(draw[6] * width), dims=1)
-    return mask
 
 
 DIFFUSION = Task(
