@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -496,3 +497,9 @@ def test_refusals_of_a_process(tmp_path: Path):
     process = started("info", tmp_path / "none.bin")
     out, err = process.communicate(timeout=60)
     refused(Answer(process.returncode, out, err), "none.bin: expected", "no file or folder of that name")
+
+
+def test_the_version_and_without_a_verb_the_help(run: Run):
+    assert run("--version").out == f"lidarsynth {version('lidarsynth')}\n"
+    assert run().code == 0
+    assert run().out == run("--help").out

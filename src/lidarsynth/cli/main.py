@@ -17,7 +17,7 @@ from lidarsynth.cli.project import project
 from lidarsynth.cli.realise import realise
 from lidarsynth.cli.sensor import sensor
 from lidarsynth.cli.streets import streets
-from lidarsynth.cli.terminal import answer
+from lidarsynth.cli.terminal import answer, say
 from lidarsynth.cli.train import train
 from lidarsynth.cli.upsample import upsample
 from lidarsynth.cli.view import view
@@ -44,4 +44,9 @@ VERBS = {
 def main(argv: list[str] | None = None) -> None:
     """Run one verb: exits 0, or 2 with one line that says what was expected and what was found."""
     argv = sys.argv[1:] if argv is None else argv
+    if argv[:1] == ["--version"]:
+        from importlib.metadata import version
+
+        say(f"lidarsynth {version('lidarsynth')}")
+        return
     answer(VERBS, fields_joined(argv) if argv[:1] == ["train"] else argv)

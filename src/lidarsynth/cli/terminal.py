@@ -174,15 +174,20 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
 
 
 def _parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> Callable[[], None]:
-    """The verb with its arguments, not yet run; tyro's box of complaints becomes one line."""
+    """The verb with its arguments, not yet run; tyro's box of complaints becomes one line.
+
+    Only the verb that is named is given to tyro, which takes as long as there are verbs to describe.
+    """
     box = io.StringIO()
     try:
         with redirect_stderr(box):
+            if argv and argv[0] in verbs:
+                return tyro.cli(_later(verbs[argv[0]]), prog=f"lidarsynth {argv[0]}", args=argv[1:])
             return tyro.extras.subcommand_cli_from_dict(
                 {name: _later(verb) for name, verb in verbs.items()},
                 prog="lidarsynth",
                 description="Generate, complete and judge LiDAR scans.",
-                args=argv,
+                args=argv or ["--help"],
             )
     except SystemExit as end:
         if end.code:

@@ -18,8 +18,8 @@ from torch import Tensor
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.files.arrays import image_of, unzip
-from lidarsynth.files.fields import MAX_BYTES, FileError
-from lidarsynth.files.formats import READERS, read, read_image
+from lidarsynth.files.fields import MAX_BYTES
+from lidarsynth.files.formats import READERS, holds_image, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -148,13 +148,7 @@ def read_item(path: Path, number: int | None = None) -> Item:
         return image_of(arrays)
     if path.suffix.lower() in TENSORS:
         return _read_tensor(path)
-    if path.suffix.lower() == ".npz":
-        try:
-            return read_image(path)
-        except FileError as error:
-            if "expected a saved range image" not in str(error):
-                raise
-    return read(path)
+    return read_image(path) if holds_image(path) else read(path)
 
 
 @lru_cache(maxsize=1)  # images of a batch are read one after the other

@@ -178,9 +178,12 @@ IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least an
 }
 
 
+NEEDED = {"range", "reflectance", "mask", "sensor"}  # arrays of a range image
+
+
 def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
     """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and what else of IMAGE it has."""
-    if missing := {"range", "reflectance", "mask", "sensor"} - arrays.keys():
+    if missing := NEEDED - arrays.keys():
         raise FileError(f"expected a saved range image, found no {', '.join(sorted(missing))} in {', '.join(arrays)}")
     for name, (kinds, low, high) in IMAGE.items():
         if name in arrays and arrays[name].dtype.kind not in kinds:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BufferedIOBase
@@ -89,6 +90,15 @@ def _naming(path: str | Path) -> Iterator[None]:
         raise FileError(f"{path}: {''.join(c if c.isprintable() else '?' for c in text)}") from None
     except MemoryError:
         raise FileError(f"{path}: expected a scan that fits in memory, found one that does not") from None
+
+
+def holds_image(path: str | Path) -> bool:
+    """Whether a file is an `.npz` with the arrays of a range image, by their names; damaged files hold none."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in arrays.NEEDED} <= set(archive.namelist())
+    except (OSError, *arrays.ZIP_ERRORS):
+        return False
 
 
 def read_image(path: str | Path) -> RangeImage:

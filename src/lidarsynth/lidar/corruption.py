@@ -6,6 +6,7 @@ The patterns are what training hides, too: masks (H, W) bool of a shape, True = 
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 
 import numpy as np
 
@@ -107,7 +108,7 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
             raise ValueError(f"{name} expects numbers after the colon, found {part!r}") from None
         if not np.isfinite(values).all():
             raise ValueError(f"{name} expects finite numbers, found {part!r}")
-        takes = CORRUPTIONS[name].__code__.co_argcount - 2
+        takes = len(signature(CORRUPTIONS[name]).parameters) - 2  # after image and rng
         if len(values) > takes:
             raise ValueError(f"{name} expects at most {takes} numbers, found {len(values)} in {part!r}")
         known &= CORRUPTIONS[name](image, rng, *values)
