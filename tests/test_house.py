@@ -5,6 +5,7 @@ import resource
 import statistics
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -65,6 +66,7 @@ def tree(path: Path) -> ast.Module:
 MODULES = {module_name(path): path for path in FILES}
 
 
+@lru_cache
 def imported(path: Path, everywhere: bool = True) -> set[str]:
     """Full names of what a file imports, in its functions too where `everywhere`: modules, and names in modules."""
     names: set[str] = set()
@@ -77,21 +79,43 @@ def imported(path: Path, everywhere: bool = True) -> set[str]:
     return names
 
 
+@lru_cache
 def imported_modules(path: Path) -> set[str]:
     """The lidarsynth modules a file imports; `from lidarsynth.lidar import sensor` is lidarsynth.lidar.sensor."""
     ours = {name for name in imported(path) if name.split(".")[0] == "lidarsynth"}
     return {name if name in MODULES else name.rpartition(".")[0] for name in ours} - {module_name(path)}
 
 
+@lru_cache
 def functions(path: Path) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
     return [n for n in ast.walk(tree(path)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
 
 
+@lru_cache
 def calls(path: Path) -> list[tuple[str, ast.Call]]:
     return [(ast.unparse(node.func), node) for node in ast.walk(tree(path)) if isinstance(node, ast.Call)]
 
 
-@pytest.mark.parametrize("path", CODE, ids=short)
+def of_every(paths: list[Path]) -> Callable[[Callable[[Path], None]], Callable[[], None]]:
+    """A rule for one file as one test of all of them, which names every file that breaks it."""
+
+    def decorate(rule: Callable[[Path], None]) -> Callable[[], None]:
+        def test() -> None:
+            broken = []
+            for path in paths:
+                try:
+                    rule(path)
+                except AssertionError as error:
+                    broken.append(str(error))
+            assert not broken, "\n".join(broken)
+
+        test.__name__ = rule.__name__
+        return test
+
+    return decorate
+
+
+@of_every(CODE)
 def test_a_room_knows_only_the_rooms_above_it(path: Path):
     own = part(module_name(path))
     assert own in ROOMS, f"{short(path)} is in no room of docs/design.md"
@@ -100,7 +124,7 @@ def test_a_room_knows_only_the_rooms_above_it(path: Path):
     assert others <= set(above), f"{short(path)} in {own} imports {sorted(others - set(above))}, rooms below its own"
 
 
-@pytest.mark.parametrize("path", CODE, ids=short)
+@of_every(CODE)
 def test_no_submodule_imports_the_root_or_private_names(path: Path):
     assert "lidarsynth" not in imported_modules(path), "the root imports the parts, never the other way round"
     private = {n for n in imported(path) if n.startswith("lidarsynth") and n.rpartition(".")[2].startswith("_")}
@@ -122,7 +146,7 @@ def test_sub_package_inits_are_empty():
     assert not bare, f"folders without __init__.py: {bare}"
 
 
-@pytest.mark.parametrize("path", CODE, ids=short)
+@of_every(CODE)
 def test_optional_packages_are_imported_where_they_are_used(path: Path):
     top = {name.split(".")[0] for name in imported(path, everywhere=False)}
     foreign = top - CORE - {"lidarsynth"} - sys.stdlib_module_names
@@ -131,7 +155,7 @@ def test_optional_packages_are_imported_where_they_are_used(path: Path):
     )
 
 
-@pytest.mark.parametrize("path", FILES, ids=short)
+@of_every(FILES)
 def test_files_and_functions_are_short(path: Path):
     lines = path.read_text().splitlines()
     assert len(lines) <= 400, f"{short(path)} has {len(lines)} lines"
@@ -143,7 +167,7 @@ def test_modules_are_named_by_what_they_hold():
     assert not [short(p) for p in FILES if VAGUE & set(p.relative_to(PACKAGE).with_suffix("").parts)]
 
 
-@pytest.mark.parametrize("path", [p for p in CODE if short(p) not in SPEAKERS], ids=short)
+@of_every([p for p in CODE if short(p) not in SPEAKERS])
 def test_the_library_never_prints_and_never_exits(path: Path):
     loud = {"print", "exit", "quit", "sys.exit", "os._exit", "sys.stdout.write", "sys.stderr.write"}
     found = [f"{name} in line {node.lineno}" for name, node in calls(path) if name in loud]
@@ -152,7 +176,7 @@ def test_the_library_never_prints_and_never_exits(path: Path):
     assert not found, f"{short(path)}: {found}"
 
 
-@pytest.mark.parametrize("path", CODE, ids=short)
+@of_every(CODE)
 def test_code_of_others_is_never_loaded(path: Path):
     for name, node in calls(path):
         options = {k.arg: ast.unparse(k.value) for k in node.keywords}
@@ -165,7 +189,7 @@ def test_code_of_others_is_never_loaded(path: Path):
     assert "torch.load" not in imported(path), "write torch.load in full, so that this test sees it"
 
 
-@pytest.mark.parametrize("path", CODE, ids=short)
+@of_every(CODE)
 def test_no_duck_typing_hidden_signatures_or_global_randomness(path: Path):
     for name, node in calls(path):
         assert name != "hasattr", f"{short(path)}:{node.lineno}: hasattr"
@@ -176,7 +200,7 @@ def test_no_duck_typing_hidden_signatures_or_global_randomness(path: Path):
     assert not hidden, f"{short(path)}: **{'kwargs'} hides the signature of {hidden}"
 
 
-@pytest.mark.parametrize("path", CODE, ids=short)
+@of_every(CODE)
 def test_public_names_have_docstrings(path: Path):
     assert ast.get_docstring(tree(path)), f"{short(path)} says nothing about itself"
     kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
