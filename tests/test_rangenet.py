@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.knn import knn_labels, smooth_labels
+from lidarsynth.metrics.knn import knn_labels
 from lidarsynth.networks.rangenet import RangeNet, frechet_features, frechet_positions
 from lidarsynth.networks.rangenet_archive import read_rangenet
 from lidarsynth.networks.tensors import load_weights
@@ -198,8 +198,6 @@ def test_knn_equals_the_reference_exactly(fixture_tensors):
     for size in (3, 5):
         points = knn_labels(t["proj_range"], t["proj_argmax"], t["py"], t["px"], t["unproj_range"], k=size, search=size)
         assert torch.equal(points, t[f"original.k{size}.search{size}"])
-        image = smooth_labels(t["proj_range"], t["proj_argmax"], k=size, search=size)
-        assert torch.equal(image, t[f"simplified.k{size}.search{size}"])
 
 
 def test_knn_keeps_a_uniform_surface_and_separates_by_range():

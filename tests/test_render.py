@@ -28,7 +28,6 @@ from lidarsynth.pictures.render import (
     EMPTY,
     bev,
     label_strip,
-    mask_strip,
     range_strip,
     reflectance_strip,
     save_png,
@@ -115,13 +114,6 @@ def test_strips_colour_measured_pixels_and_leave_the_others_dark():
     assert range_strip(image, max_range=10.0, row_scale=1).shape == (4, 32, 3)
 
 
-def test_mask_strip_is_light_where_known():
-    known = np.zeros((4, 32), bool)
-    known[1] = True
-    strip = mask_strip(known, row_scale=2).mean(axis=-1)
-    assert strip[2:4].min() > 200 > 100 > strip[[0, 1, 4, 5, 6, 7]].max()
-
-
 def test_strips_say_what_is_wrong():
     image = small_image()
     bare = RangeImage(image.range, image.reflectance, image.mask, SMALL)
@@ -129,8 +121,6 @@ def test_strips_say_what_is_wrong():
         label_strip(bare)
     with pytest.raises(ValueError, match="whole number from 1, got 0"):
         range_strip(image, row_scale=0)
-    with pytest.raises(ValueError, match=r"\(H, W\) bool, got \(4, 32\) float32"):
-        mask_strip(image.range)
 
 
 @pytest.mark.parametrize(

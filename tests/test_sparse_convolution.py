@@ -13,7 +13,6 @@ from lidarsynth.networks.sparse_convolution import (
     grow,
     levels_of,
     shrink,
-    voxel_hash,
     with_norm,
 )
 
@@ -44,13 +43,10 @@ def test_the_chain_of_operators_is_torchsparses(oracle_tensors):
     assert_equal_to_five_digits(grow(x, levels[0], o["up1_k2s2.kernel"]), o["up1_k2s2.out"])
 
 
-def test_offsets_hashes_and_normalisation_are_torchsparses(oracle_tensors):
+def test_offsets_and_normalisation_are_torchsparses(oracle_tensors):
     o = oracle_tensors("lidm_operators")
     assert torch.tensor(OFFSETS_3).tolist() == o["offsets_k3"].tolist()
     assert torch.tensor(OFFSETS_2).tolist() == o["offsets_k2"].tolist()
-    assert torch.equal(voxel_hash(o["coords"]), o["hash"])
-    for offset, expected in zip(OFFSETS_2, o["hash_k2_offsets"], strict=True):
-        assert torch.equal(voxel_hash(o["coords"] + torch.tensor([*offset, 0])), expected)
     norm = nn.BatchNorm1d(5).eval()
     norm.load_state_dict({k[3:]: v for k, v in o.items() if k.startswith("bn.") and k != "bn.out"}, strict=False)
     with torch.no_grad():

@@ -44,31 +44,6 @@ def knn_labels(
     return _vote(weighted, _windows(labels, search)[:, pixel], k, cutoff, 1, classes)
 
 
-def smooth_labels(
-    image_range: np.ndarray | Tensor,
-    image_label: np.ndarray | Tensor,
-    k: int = 3,
-    search: int = 3,
-    sigma: float = 1.0,
-    cutoff: float = 1.0,
-    classes: int = len(CLASSES),
-) -> Tensor:
-    """(H, W) int64 classes by the k nearest pixels, R2DM's version of `knn_labels` for images; 0 may win.
-
-    It convolves the difference to each neighbour with one minus a Gaussian, instead of weighting neighbours by where
-    they are; kept as published. Arguments and errors as in `knn_labels`.
-    """
-    ranges, labels = torch.as_tensor(image_range).float(), torch.as_tensor(image_label)
-    _check_window(k, search)
-    height, width = ranges.shape
-    near = _windows(ranges, search)
-    near = torch.where(near < 0, torch.inf, near)
-    difference = (near - ranges.view(1, -1)).abs().view(-1, 1, height, width)
-    kernel = _inverse_gaussian(search, sigma)[None, None].to(near)
-    weighted = nn.functional.conv2d(difference, kernel, padding=(search - 1) // 2).view(-1, height * width)
-    return _vote(weighted, _windows(labels, search), k, cutoff, 0, classes).view(height, width)
-
-
 def _check_window(k: int, search: int) -> None:
     if search % 2 != 1 or not 1 <= k <= search**2:
         raise ValueError(f"expected an odd window and k within its pixels, found search {search} and k {k}")

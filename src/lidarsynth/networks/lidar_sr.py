@@ -231,15 +231,6 @@ def remove_uncertain(mean: Tensor, std: Tensor, threshold: float = 0.03) -> Tens
     return torch.where(std > threshold * mean, 0, mean)
 
 
-def copy_measured(high: Tensor, low: Tensor) -> Tensor:
-    """The upsampled (...,H,W) with every (H/h)-th row, from row 0, as measured in (...,h,W)."""
-    if high.shape[-1] != low.shape[-1] or high.shape[-2] % low.shape[-2]:
-        raise ValueError(f"expected a multiple of {low.shape[-2]} rows of {low.shape[-1]}, got {tuple(high.shape)}")
-    copied = high.clone()
-    copied[..., :: high.shape[-2] // low.shape[-2], :] = low
-    return copied
-
-
 def from_official(checkpoint: object, scale: tuple[int, int] = (4, 1)) -> LidarSR:
     """The network, in evaluation mode, of a checkpoint of ILN's repository (`lsr_4h_1w_*.pth`: scale (4, 1)).
 

@@ -18,7 +18,6 @@ from lidarsynth.lidar.semantic_kitti import CLASSES
 BLOCKS: dict[int, tuple[int, ...]] = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # layers -> residual units per stage
 MEANS = (12.12, 10.88, 0.23, -1.04, 0.21)  # range, x, y, z in metres, remission: of SemanticKITTI's pixels
 STDS = (12.32, 11.47, 6.91, 0.86, 0.16)
-ARCHIVES: dict[int, str] = {2048: "darknet53", 1024: "darknet53-1024", 512: "darknet53-512"}  # image width -> weights
 
 
 class RangeNet(nn.Module):

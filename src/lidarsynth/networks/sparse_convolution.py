@@ -159,15 +159,3 @@ class Kernel(nn.Module):
         shape = (inputs, outputs) if cells == 1 else (cells, inputs, outputs)
         self.kernel = nn.Parameter(torch.empty(shape), requires_grad=False)
         nn.init.normal_(self.kernel, std=(cells * inputs) ** -0.5)
-
-
-def voxel_hash(coordinates: Tensor) -> Tensor:
-    """(N,) int64: torchsparse's hash of voxels (N, 4), 64-bit FNV-1a over x, y, z, batch, each number taken whole.
-
-    Its order is that of the finest voxels in the published SPVCNN; nothing here depends on it.
-    """
-    number = coordinates.long() & 0xFFFFFFFF  # as uint32
-    state = torch.full((len(number),), 14695981039346656037 - (1 << 64), dtype=torch.int64, device=number.device)
-    for axis in number.unbind(1):
-        state = (state ^ axis) * 1099511628211  # modulo 2^64, as int64 wraps
-    return ((state >> 60) & 15) ^ (state & ((1 << 60) - 1))

@@ -12,13 +12,6 @@ from torch import Tensor
 from lidarsynth.networks.sparse_convolution import OFFSETS_2, Level
 
 
-def voxels_of(points: Tensor) -> Level:
-    """The occupied unit cells floor(p) of points (P, 4), ordered by batch, x, y, z."""
-    cells = torch.floor(points).long()
-    # unique rows come sorted by their columns, so the batch goes first
-    return Level(torch.unique(cells.roll(1, 1), dim=0).roll(-1, 1))
-
-
 def voxel_of_points(points: Tensor, level: Level) -> Tensor:
     """(P,) int64: the row of the voxel floor(p / s) * s around each point, -1 where it is not occupied."""
     return level.find(_corner(points, level.stride).long())

@@ -49,13 +49,6 @@ def label_strip(image: RangeImage, row_scale: int = ROW_SCALE) -> np.ndarray:
     return _strip(label_colours(image.label), image.mask, row_scale)
 
 
-def mask_strip(known: np.ndarray, row_scale: int = ROW_SCALE) -> np.ndarray:
-    """(H * row_scale, W, 3) uint8 from `known` (H, W) bool: light where known, dark where to be filled."""
-    if known.ndim != 2 or known.dtype != bool:
-        raise ValueError(f"known must be (H, W) bool, got {known.shape} {known.dtype}")
-    return _strip(np.where(known[..., None], np.array(KNOWN, np.uint8), np.array(UNKNOWN, np.uint8)), None, row_scale)
-
-
 def bev(
     points: Scan | RangeImage,
     by: str = "height",  # word of colours.COLOURS

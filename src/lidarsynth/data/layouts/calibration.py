@@ -33,10 +33,3 @@ def camera_poses(to_world: np.ndarray) -> np.ndarray:
     """(N, 3, 4) poses of `poses.txt`, camera of scan i -> camera of the first, from sensor poses (N, 4, 4)."""
     relative = np.linalg.inv(to_world[0]) @ to_world
     return (AXES @ relative @ np.linalg.inv(AXES))[:, :3]
-
-
-def sensor_poses(poses: np.ndarray, calibration: np.ndarray = AXES) -> np.ndarray:
-    """(N, 4, 4) sensor poses relative to the first, the inverse of `camera_poses`."""
-    whole = np.tile(np.eye(4), (len(poses), 1, 1))
-    whole[:, :3] = poses
-    return np.linalg.inv(calibration) @ whole @ calibration

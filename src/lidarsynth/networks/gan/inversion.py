@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from lidarsynth.networks.gan.inverse_depth import to_depth
@@ -56,28 +56,6 @@ def invert(
                 latents.copy_(project(latents))
 
 
-def tune(
-    network: nn.Module,  # changed in place: give a copy
-    render: Callable[[Tensor], Tensor],  # through that network, as in `invert`
-    latents: Tensor,
-    reference: Tensor,
-    mask: Tensor,
-    limits: tuple[float, float],
-    steps: int = 500,
-    learning_rate: float = 5e-4,
-) -> Iterator[Fit]:
-    """Stage 2, pivotal tuning: latents stay, all weights of the network follow the same loss; yields as `invert`."""
-    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
-    for step in range(steps + 1):
-        inverse, loss = reconstruction(render(latents), reference, mask, limits)
-        yield Fit(step, latents.detach().clone(), inverse.detach(), loss.detach())
-        if step == steps:
-            return
-        optimizer.zero_grad()
-        loss.sum().backward()
-        optimizer.step()
-
-
 def reconstruction(
     image: Tensor, reference: Tensor, mask: Tensor, limits: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
@@ -90,11 +68,6 @@ def reconstruction(
 def relative_distance(generated: Tensor, reference: Tensor) -> Tensor:
     """|reference - generated| / reference, any shape."""
     return (reference - generated).abs() / (reference + 1e-11)
-
-
-def squared_distance(generated: Tensor, reference: Tensor) -> Tensor:
-    """(reference - generated)^2, any shape."""
-    return (reference - generated).square()
 
 
 def multiscale_loss(
@@ -136,16 +109,6 @@ def masked_halve(x: Tensor, mask: Tensor) -> Tensor:
 def window(mask: Tensor) -> Tensor:
     """How many of the 3x3 pixels around every second pixel are valid: (B,1,H,W) -> (B,1,H/2,W/2)."""
     return F.conv2d(Pad(1)(mask), mask.new_ones(1, 1, 3, 3), stride=2)
-
-
-def geocross(w: Tensor) -> Tensor:
-    """How far the styles of W+ (B,num_styles,D) lie apart on the sphere: (B,).
-
-    Mean of D^3/8 over all ordered pairs, a style with itself included, D their angle. PULSE (Menon et al. 2020).
-    """
-    x, y = w[:, :, None], w[:, None]
-    angle = 2 * torch.atan2(_length(x - y), _length(x + y))
-    return (angle.square() * angle / 8).mean((1, 2))
 
 
 def _length(x: Tensor) -> Tensor:
