@@ -39,7 +39,17 @@ ROOMS = (
     "cli",  # one file a verb: arguments, printing
     "__main__",
 )
-CORE = {"torch", "numpy", "einops", "safetensors", "tyro", "tqdm", "PIL", "tomli"}  # pyproject's dependencies
+CORE = {
+    "torch",
+    "numpy",
+    "einops",
+    "safetensors",
+    "tyro",
+    "tqdm",
+    "PIL",
+    "platformdirs",
+    "tomli",
+}  # pyproject's dependencies
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
 PURE = {"experiment/record", "experiment/presets", "experiment/upsampling_presets"}  # no torch, no numpy, no lidar
 SPEAKERS = {"cli/terminal.py", "__main__.py"}  # the only ones that print and set the exit code

@@ -1,6 +1,7 @@
 """Official checkpoints load and say what they should; releases download, continue and fail in one clear line."""
 
 import http.server
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -399,7 +400,12 @@ def test_a_release_is_fetched_by_its_name_once(server, tiny, tmp_path, monkeypat
         load_parts("r2dm-a-kitti360")
 
 
-def test_the_cache_is_the_users_and_the_names_are_the_paper_rows(monkeypatch):
+def test_the_cache_is_the_users_and_the_names_are_the_paper_rows(monkeypatch, tmp_path):
     monkeypatch.delenv("LIDARSYNTH_CACHE", raising=False)
-    assert cache_folder() == Path.home() / ".cache" / "lidarsynth"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    if sys.platform == "linux":
+        assert cache_folder() == tmp_path / "own" / "lidarsynth"
+    (tmp_path / ".cache" / "lidarsynth").mkdir(parents=True)
+    assert cache_folder() == tmp_path / ".cache" / "lidarsynth", "what earlier versions downloaded is found"
     assert {"r2dm-a-kitti360", "r2dm-h-kitti360", "r2dm-h-kittiraw"} <= set(RELEASES)

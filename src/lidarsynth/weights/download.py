@@ -13,17 +13,20 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import BinaryIO
 
+from platformdirs import user_cache_path
+
 OnBytes = Callable[[int, "int | None"], object]  # called with (bytes so far, bytes in all or None if not known)
 
 
 def cache_folder() -> Path:
-    """Where releases are kept: LIDARSYNTH_CACHE, or ~/.cache/lidarsynth."""
+    """Where releases are kept: LIDARSYNTH_CACHE, or ~/.cache/lidarsynth if it is there, or the system's own place."""
     if chosen := os.environ.get("LIDARSYNTH_CACHE"):
         return Path(chosen)
     try:
-        return Path.home() / ".cache" / "lidarsynth"
+        earlier = Path.home() / ".cache" / "lidarsynth"  # of version 0.1.0 on every system
     except RuntimeError:  # neither HOME nor a passwd entry, as in some containers
         return Path(tempfile.gettempdir()) / "lidarsynth-cache"
+    return earlier if earlier.is_dir() else user_cache_path("lidarsynth", appauthor=False)
 
 
 def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
