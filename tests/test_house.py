@@ -49,7 +49,7 @@ CORE = {
     "PIL",
     "platformdirs",
     "tomli",
-}  # pyproject's dependencies
+}  # pyproject
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools"}
 PURE = {"experiment/record", "experiment/presets", "experiment/upsampling_presets"}  # no torch, no numpy, no lidar
 SPEAKERS = {"cli/terminal.py", "__main__.py"}  # the only ones that print and set the exit code
