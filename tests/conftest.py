@@ -1,6 +1,7 @@
 """What all tests share: the folder of facts, reference tensors and real scans, and one thread per process."""
 
 import os
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +23,19 @@ def shared() -> Path:
     if not (SHARED / "fixtures").is_dir():
         pytest.skip(f"reference values are not here: {SHARED} (set LIDARSYNTH_SHARED)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What published programs say of themselves, facts/*.json and fixtures/*.json, and a small network of R2DM's."""
+    folder = tmp_path_factory.mktemp("reference")
+    with tarfile.open(ORACLES / "reference.tar.xz") as archive:
+        for member in archive:  # one by one: Python 3.10 has no filter for all
+            if member.isfile():
+                path = folder / member.name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(archive.extractfile(member).read())  # type: ignore[union-attr]
+    return folder
 
 
 @pytest.fixture(scope="session")

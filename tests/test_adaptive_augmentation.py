@@ -50,8 +50,8 @@ def test_probability_moves_as_the_reference(fixture_tensors):
     assert augmentation.p.item() == pytest.approx(0.9)
 
 
-def test_buffers_are_the_official_ones(shared):
-    check_structure(shared, "dusty_v2", {"A": AdaptiveAugmentation()}, {"A": 0})
+def test_buffers_are_the_official_ones(reference):
+    check_structure(reference, "dusty_v2", {"A": AdaptiveAugmentation()}, {"A": 0})
 
 
 def test_wavelets_are_orthonormal_and_bands_add_up():

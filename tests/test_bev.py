@@ -31,9 +31,9 @@ def test_histograms_equal_the_reference_exactly(fixture_tensors):
         )
 
 
-def test_jsd_and_mmd_equal_the_reference(fixture_tensors, shared: Path):
+def test_jsd_and_mmd_equal_the_reference(fixture_tensors, reference: Path):
     tensors = fixture_tensors("metrics/inputs")
-    values = json.loads((shared / "fixtures/metrics/values.json").read_text())
+    values = json.loads((reference / "fixtures/metrics/values.json").read_text())
     generated, real = (bev_histograms(tensors[name]) for name in ("clouds_gen", "clouds_real"))
     assert jensen_shannon_distance(generated.sum(0), real.sum(0)) == pytest.approx(values["bev_jsd"], rel=1e-5)
     assert gaussian_mmd(generated, real) == pytest.approx(values["bev_mmd"], rel=1e-3)

@@ -196,6 +196,7 @@ def test_repaint_fills_a_lost_sector_and_leaves_the_rest(model: CascadeModel):
         (lambda m: m.generate(0), "at least 1"),
         (lambda m: m.generate(1, sampler="nonsense"), "a sampler of ddpm"),
         (lambda m: m.into(replace(SMALL, elevations=(1.0, 0.0))).generate(1), "at least 16 beams"),
+        (lambda m: m.into(replace(SMALL, elevations=(1.0, 0.0))).generation_steps(), "at least 16 beams"),
         (lambda m: m.evaluations("posterior"), "a method of auto, conditional, sample, repaint"),
         (lambda m: m.evaluations(steps=4), "expected 1 step"),
     ],

@@ -30,8 +30,8 @@ def features(fixture_tensors) -> tuple[Tensor, Tensor]:
 
 
 @pytest.fixture
-def values(shared: Path) -> dict:
-    return json.loads((shared / "fixtures/metrics/values.json").read_text())
+def values(reference: Path) -> dict:
+    return json.loads((reference / "fixtures/metrics/values.json").read_text())
 
 
 def draw(count: int, size: int, seed: int = 0, shift: float = 0.0) -> np.ndarray:

@@ -14,25 +14,25 @@ from lidarsynth.networks.gan.modulated import RandomFourierFeatures
 SMALL, FULL = "gan_dusty_v2_small", "gan_dusty_v2_full"
 
 
-def generator(shared, name: str, tensors) -> Generator:
-    facts = json.loads((shared / "fixtures" / f"{name}.json").read_text())
+def generator(reference, name: str, tensors) -> Generator:
+    facts = json.loads((reference / "fixtures" / f"{name}.json").read_text())
     mapping, config = (facts["config"]["generator"][f"{part}_kwargs"] for part in ("mapping", "synthesis"))
     resolution, widths = tuple(config["resolution"]), (config["ch_base"], config["ch_max"])
     net = Generator(resolution, mapping["in_ch"], mapping["out_ch"], *widths)
     return load(net, "G", facts, tensors)
 
 
-def discriminator(shared, name: str, tensors) -> Discriminator:
-    facts = json.loads((shared / "fixtures" / f"{name}.json").read_text())
+def discriminator(reference, name: str, tensors) -> Discriminator:
+    facts = json.loads((reference / "fixtures" / f"{name}.json").read_text())
     config = facts["config"]["discriminator"]["layer_kwargs"]
     net = Discriminator(tuple(config["resolution"]), config["ch_base"], config["ch_max"])
     return load(net, "D", facts, tensors)
 
 
 @pytest.mark.parametrize("name", [SMALL, FULL])
-def test_images_and_their_gradient_equal_the_reference(shared, fixture_tensors, name):
+def test_images_and_their_gradient_equal_the_reference(reference, fixture_tensors, name):
     expected = fixture_tensors(name)
-    net = generator(shared, name, expected)
+    net = generator(reference, name, expected)
     angle, uniform, z = expected["angle"], expected["uniform"], expected["z"].requires_grad_()
     out = net(z, angle, uniform)
     for key in ("image", "image_orig", "raydrop_logit", "w"):
@@ -45,9 +45,9 @@ def test_images_and_their_gradient_equal_the_reference(shared, fixture_tensors, 
     assert_close(truncated, expected["trunc0.7.image_orig"], **TOLERANCE)
 
 
-def test_other_angles_and_a_style_per_layer_equal_the_reference(shared, fixture_tensors):
+def test_other_angles_and_a_style_per_layer_equal_the_reference(reference, fixture_tensors):
     expected = fixture_tensors(SMALL)
-    net = generator(shared, SMALL, expected)
+    net = generator(reference, SMALL, expected)
     uniform = expected["uniform"][:1]
     with torch.no_grad():
         custom = net(expected["z"][:1], expected["angle_custom"], uniform)
@@ -56,9 +56,9 @@ def test_other_angles_and_a_style_per_layer_equal_the_reference(shared, fixture_
     assert_close(wplus.image_orig, expected["wplus.image_orig"], **TOLERANCE)
 
 
-def test_every_block_equals_the_reference(shared, fixture_tensors):
+def test_every_block_equals_the_reference(reference, fixture_tensors):
     expected = fixture_tensors(SMALL)
-    network = generator(shared, SMALL, expected).synthesis_network
+    network = generator(reference, SMALL, expected).synthesis_network
     levels = network.pyramid(expected["angle"])
     w = expected["eval.w"][:1]
     h, maps = None, {}
@@ -74,9 +74,9 @@ def test_every_block_equals_the_reference(shared, fixture_tensors):
     assert_close(fourier[:, ::16], expected["inter.fourier.block0"], **TOLERANCE)
 
 
-def test_a_training_step_and_its_running_means_equal_the_reference(shared, fixture_tensors):
+def test_a_training_step_and_its_running_means_equal_the_reference(reference, fixture_tensors):
     expected = fixture_tensors(SMALL)
-    net = generator(shared, SMALL, expected).train()
+    net = generator(reference, SMALL, expected).train()
     with torch.no_grad():
         out = net(expected["z"], expected["angle"], expected["uniform"], shift=expected["train.shift_unit"])
     assert_close(out.image_orig, expected["train.image_orig"], **TOLERANCE)
@@ -89,15 +89,15 @@ def test_a_training_step_and_its_running_means_equal_the_reference(shared, fixtu
 
 
 @pytest.mark.parametrize("name", [SMALL, FULL])
-def test_discriminator_and_losses_equal_the_reference(shared, fixture_tensors, name):
+def test_discriminator_and_losses_equal_the_reference(reference, fixture_tensors, name):
     expected = fixture_tensors(name)
-    check_discriminator(discriminator(shared, name, expected), expected)
+    check_discriminator(discriminator(reference, name, expected), expected)
 
 
-def test_names_shapes_and_counts_are_the_official_ones(shared):
+def test_names_shapes_and_counts_are_the_official_ones(reference):
     with torch.device("meta"):
         nets = {"G": Generator(), "D": Discriminator()}
-    check_structure(shared, "dusty_v2", nets, {"G": 4_367_594, "D": 38_445_569})
+    check_structure(reference, "dusty_v2", nets, {"G": 4_367_594, "D": 38_445_569})
 
 
 def regular_angles(height: int, width: int) -> torch.Tensor:

@@ -84,10 +84,10 @@ def test_parameter_counts_are_the_official_ones(encoding, width, count):
     assert sum(parameter.numel() for parameter in net.parameters()) == count
 
 
-def test_keys_and_shapes_are_the_official_ones(shared):
+def test_keys_and_shapes_are_the_official_ones(reference):
     with torch.device("meta"):
         net = EfficientUNet()
-    official_shapes = json.loads((shared / "facts" / "r2dm_H_state_dict.json").read_text())
+    official_shapes = json.loads((reference / "facts" / "r2dm_H_state_dict.json").read_text())
     official_shapes.pop("_dummy")
     assert {f"model.{key}": list(value.shape) for key, value in net.state_dict().items()} == official_shapes
 

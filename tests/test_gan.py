@@ -38,16 +38,16 @@ def load(net: torch.nn.Module, letter: str, facts: dict, tensors) -> torch.nn.Mo
     return net.eval()
 
 
-def generator(shared, name: str, tensors) -> Generator:
-    facts = json.loads((shared / "fixtures" / f"{name}.json").read_text())
+def generator(reference, name: str, tensors) -> Generator:
+    facts = json.loads((reference / "fixtures" / f"{name}.json").read_text())
     config = facts["config"]["generator"]["synthesis_kwargs"]
     resolution, widths = tuple(config["resolution"]), (config["ch_base"], config["ch_max"])
     net = Generator(resolution, config["in_ch"], *widths, raydrop="dusty" in name)
     return load(net, "G", facts, tensors)
 
 
-def discriminator(shared, name: str, tensors) -> Discriminator:
-    facts = json.loads((shared / "fixtures" / f"{name}.json").read_text())
+def discriminator(reference, name: str, tensors) -> Discriminator:
+    facts = json.loads((reference / "fixtures" / f"{name}.json").read_text())
     config = facts["config"]["discriminator"]["layer_kwargs"]
     net = Discriminator(tuple(config["resolution"]), config["ch_base"], config["ch_max"])
     return load(net, "D", facts, tensors)
@@ -59,9 +59,9 @@ def test_procedural_weights_are_the_stated_ones():
 
 
 @pytest.mark.parametrize("name", SMALL + FULL)
-def test_images_and_their_gradient_equal_the_reference(shared, fixture_tensors, name):
+def test_images_and_their_gradient_equal_the_reference(reference, fixture_tensors, name):
     expected = fixture_tensors(name)
-    net = generator(shared, name, expected)
+    net = generator(reference, name, expected)
     uniform = expected.get("uniform")
     z = expected["z"].requires_grad_()
     out = net(z, uniform)
@@ -81,9 +81,9 @@ def test_images_and_their_gradient_equal_the_reference(shared, fixture_tensors, 
 
 
 @pytest.mark.parametrize("name", SMALL + FULL)
-def test_discriminator_and_losses_equal_the_reference(shared, fixture_tensors, name):
+def test_discriminator_and_losses_equal_the_reference(reference, fixture_tensors, name):
     expected = fixture_tensors(name)
-    check_discriminator(discriminator(shared, name, expected), expected)
+    check_discriminator(discriminator(reference, name, expected), expected)
 
 
 def check_discriminator(net: torch.nn.Module, expected) -> None:
@@ -106,9 +106,9 @@ def check_discriminator(net: torch.nn.Module, expected) -> None:
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_training_step_averages_the_styles(shared, fixture_tensors, name):
+def test_a_training_step_averages_the_styles(reference, fixture_tensors, name):
     expected = fixture_tensors(name)
-    net = generator(shared, name, expected).train()
+    net = generator(reference, name, expected).train()
     out = net(expected["z"], expected.get("uniform"))
     assert_close(out.image_orig.detach(), expected["train.image_orig"], **TOLERANCE)
     assert_close(net.w_avg, expected["train.w_avg_after"], **TOLERANCE)
@@ -117,15 +117,15 @@ def test_a_training_step_averages_the_styles(shared, fixture_tensors, name):
 @pytest.mark.parametrize(
     ("model", "raydrop", "count"), [("vanilla", False, 36_308_929), ("dusty_v1", True, 36_309_954)]
 )
-def test_names_shapes_and_counts_are_the_official_ones(shared, model, raydrop, count):
+def test_names_shapes_and_counts_are_the_official_ones(reference, model, raydrop, count):
     with torch.device("meta"):
         nets = {"G": Generator(raydrop=raydrop), "D": Discriminator()}
-    check_structure(shared, model, nets, {"G": count, "D": 2_821_057})
+    check_structure(reference, model, nets, {"G": count, "D": 2_821_057})
 
 
-def check_structure(shared, model: str, nets: dict[str, torch.nn.Module], counts: dict[str, int]) -> None:
+def check_structure(reference, model: str, nets: dict[str, torch.nn.Module], counts: dict[str, int]) -> None:
     """Names, shapes and parameter counts of G, D and A against the official ones; A is the same for all models."""
-    table = json.loads((shared / "facts" / "gans_state_dict_shapes.json").read_text())
+    table = json.loads((reference / "facts" / "gans_state_dict_shapes.json").read_text())
     for letter, net in nets.items():
         official = {
             key: tuple(entry["shape"])

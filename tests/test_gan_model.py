@@ -271,8 +271,8 @@ def test_the_first_release_is_read_too(fixture_tensors, tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize(("official", "word"), [("vanilla", "vanilla-gan"), ("dusty_v2", "dusty-v2")])
-def test_the_published_sizes_are_read(shared: Path, tmp_path: Path, official: str, word: str):
-    table = json.loads((shared / "facts" / "gans_state_dict_shapes.json").read_text())
+def test_the_published_sizes_are_read(reference: Path, tmp_path: Path, official: str, word: str):
+    table = json.loads((reference / "facts" / "gans_state_dict_shapes.json").read_text())
     entries = table[f"wacv23/{official}.G"].items()
     state = {key: torch.zeros(()).expand(entry["shape"]) for key, entry in entries}  # a file of few bytes
     checkpoint = {"step": 1, "angle": angles(64, 512), "G": state, "D": {}, "G_ema": state, "A": {}}

@@ -15,11 +15,11 @@ COUNTS = {0: 1_219_649, 1: 1_244_673, 2: 1_269_697}
 
 
 @pytest.fixture(scope="module")
-def network_of(shared):
+def network_of(reference):
     """Name of a fixture -> its network, in evaluation mode."""
 
     def build(name: str) -> ILN | LIIF:
-        path = shared / "fixtures" / f"{name}.json"
+        path = reference / "fixtures" / f"{name}.json"
         if not path.is_file():
             pytest.skip(f"reference values are not here: {path}")
         seed = json.loads(path.read_text())["procedural"]["seed"]
@@ -75,9 +75,9 @@ def test_gradients_equal_the_reference(fixture_tensors, network_of, name):
 
 @pytest.mark.parametrize("name", FIXTURES)
 @torch.no_grad()
-def test_queries_from_angles_are_the_references(fixture_tensors, network_of, shared, name):
+def test_queries_from_angles_are_the_references(fixture_tensors, network_of, reference, name):
     expected, network = fixture_tensors(name), network_of(name)
-    spec = json.loads((shared / "fixtures" / f"{name}.json").read_text())["lidar_spec"]
+    spec = json.loads((reference / "fixtures" / f"{name}.json").read_text())["lidar_spec"]
     low = expected["input"]
     for grid in {key.split(".")[0] for key in expected if key.startswith("grid_")}:
         angles = expected[f"{grid}.angles_v"], expected[f"{grid}.angles_h"]
@@ -91,8 +91,8 @@ def test_queries_from_angles_are_the_references(fixture_tensors, network_of, sha
 
 
 @pytest.mark.parametrize("name", ["iln_0d", "iln_1d", "iln_2d", "liif"])
-def test_names_shapes_and_counts_are_the_published_ones(shared, name):
-    facts = json.loads((shared / "facts" / "upsampling_state_dict_shapes.json").read_text())[name]
+def test_names_shapes_and_counts_are_the_published_ones(reference, name):
+    facts = json.loads((reference / "facts" / "upsampling_state_dict_shapes.json").read_text())[name]
     with torch.device("meta"):
         network = LIIF() if name == "liif" else ILN(int(name[4]))
     found = [(key, list(value.shape)) for key, value in network.state_dict().items()]

@@ -33,8 +33,8 @@ def denoiser(shared):
 
 
 @pytest.fixture
-def numbers(shared):
-    stated = json.loads((shared / "fixtures" / "lidargen" / "info.json").read_text())["langevin"]
+def numbers(reference):
+    stated = json.loads((reference / "fixtures" / "lidargen" / "info.json").read_text())["langevin"]
     return {"levels": stated["n_levels"], "steps": stated["n_steps_each"], "rate": stated["step_lr"] / 0.01**2}
 
 

@@ -40,9 +40,9 @@ def test_the_small_networks_equal_the_reference(fixture_tensors, fixture, scale)
     assert_output_and_stages(from_official(official(expected), scale), expected)
 
 
-def test_the_published_width_equals_the_reference(fixture_tensors, shared):
+def test_the_published_width_equals_the_reference(fixture_tensors, reference):
     expected = fixture_tensors("lsr_4h1w_full")
-    stated = json.loads((shared / "fixtures" / "lsr_4h1w_full.json").read_text())["procedural"]
+    stated = json.loads((reference / "fixtures" / "lsr_4h1w_full.json").read_text())["procedural"]
     with torch.device("meta"):
         network = LidarSR()
     weights = upsampling_weights(network, stated["seed"])
@@ -108,8 +108,8 @@ def test_training_equals_the_reference(fixture_tensors, fixture, scale):
 
 
 @pytest.mark.parametrize(("name", "scale"), PUBLISHED.items())
-def test_names_and_shapes_are_the_published_ones(shared, name, scale):
-    facts = json.loads((shared / "facts" / "upsampling_state_dict_shapes.json").read_text())[name]
+def test_names_and_shapes_are_the_published_ones(reference, name, scale):
+    facts = json.loads((reference / "facts" / "upsampling_state_dict_shapes.json").read_text())[name]
     with torch.device("meta"):
         network = LidarSR(scale)
     found = [(key, list(value.shape)) for key, value in network.state_dict().items()]
@@ -123,8 +123,8 @@ def test_the_count_is_the_published_one_in_both_programs(keras):
     assert sum(parameter.numel() for parameter in network.parameters()) == 34_600_001
 
 
-def test_the_keras_layers_are_the_published_ones(shared):
-    layers = json.loads((shared / "facts" / "lsr_keras_layers.json").read_text())["layers"]
+def test_the_keras_layers_are_the_published_ones(reference):
+    layers = json.loads((reference / "facts" / "lsr_keras_layers.json").read_text())["layers"]
     expected = [shape for _, _, weights in layers for _, shape in weights]
     with torch.device("meta"):
         state = LidarSR(keras=True).state_dict()

@@ -175,10 +175,10 @@ def test_official_weights_generate_and_save_as_ours(official, tmp_path):
 
 
 @torch.no_grad()
-def test_official_weights_sample_as_the_reference(official, fixture_tensors, shared):
+def test_official_weights_sample_as_the_reference(official, fixture_tensors, reference):
     """The published chain from [0, 1] images, with its own few noise levels, as ours from [-1, 1] images."""
     tensors = fixture_tensors("lidargen/langevin")
-    stated = json.loads((shared / "fixtures" / "lidargen" / "info.json").read_text())["langevin"]
+    stated = json.loads((reference / "fixtures" / "lidargen" / "info.json").read_text())["langevin"]
     loaded = lidarsynth.load(official)
     assert isinstance(loaded, LidarModel)
     x_1, noise = 2 * tensors["chain.init"] - 1, iter(tensors["chain.noise"])
@@ -188,8 +188,8 @@ def test_official_weights_sample_as_the_reference(official, fixture_tensors, sha
 
 
 @pytest.fixture(scope="module")
-def shapes(shared) -> dict[str, list[int]]:
-    return json.loads((shared / "fixtures" / "lidargen" / "state_dict_full.json").read_text())["model"]
+def shapes(reference) -> dict[str, list[int]]:
+    return json.loads((reference / "fixtures" / "lidargen" / "state_dict_full.json").read_text())["model"]
 
 
 def file_of(path: Path, shapes: dict[str, list[int]], step: int = 100_000, average: bool = True) -> Path:

@@ -68,7 +68,7 @@ def test_spvcnn_and_the_features_of_both_networks_are_the_published_ones(oracle_
 
 
 @pytest.mark.parametrize(("name", "kind"), [("minkowskinet", MinkowskiUNet), ("spvcnn", SPVCNN)])
-def test_every_stage_is_the_published_one(name: str, kind: type, fixture_tensors: Callable, shared: Path):
+def test_every_stage_is_the_published_one(name: str, kind: type, fixture_tensors: Callable, reference: Path):
     o, clouds = fixture_tensors(f"lidm/{name}_io"), fixture_tensors("lidm/clouds")
     network, found = filled(kind, fixture_tensors(f"lidm/{name}_weights")), {}
     for part in ("stem", "stage1", "stage2", "stage3", "stage4", "up1", "up2", "up3", "up4"):
@@ -89,8 +89,8 @@ def test_every_stage_is_the_published_one(name: str, kind: type, fixture_tensors
 @pytest.mark.parametrize(
     ("name", "kind", "count"), [("minkowskinet", MinkowskiUNet, 5435284), ("spvcnn", SPVCNN, 5449316)]
 )
-def test_names_shapes_and_counts_are_the_published_ones(name: str, kind: type, count: int, shared: Path):
-    published = json.loads((shared / "facts/lidm_state_dict.json").read_text())[name]
+def test_names_shapes_and_counts_are_the_published_ones(name: str, kind: type, count: int, reference: Path):
+    published = json.loads((reference / "facts/lidm_state_dict.json").read_text())[name]
     for cr in (0.5, 1):
         with torch.device("meta"):
             network = kind(widths_of(cr))

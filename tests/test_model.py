@@ -58,10 +58,10 @@ def assert_same(one: RangeImage, two: RangeImage) -> None:
 # ---------------------------------------------------------------- generation
 
 
-def test_the_public_way_in_loads_official_weights_and_samples_as_the_reference(shared, fixture_tensors):
+def test_the_public_way_in_loads_official_weights_and_samples_as_the_reference(reference, fixture_tensors):
     """R2DM's evaluation from end to end: file, per-sample seeds 0 and 1, DDPM, clamp, metres."""
     expected = fixture_tensors("r2dm/tiny_H_trajectories")["ddpm.states"][-1]
-    model = lidarsynth.load(shared / "fixtures" / "r2dm" / "tiny_H.pth")
+    model = lidarsynth.load(reference / "fixtures" / "r2dm" / "tiny_H.pth")
     assert isinstance(model, lidarsynth.LidarModel) and not model.conditional
     images = model.generate(2, steps=3, seed=0, sampler="ddpm")
     for image, x_0 in zip(images, expected, strict=True):

@@ -26,8 +26,8 @@ def test_features_equal_the_reference(network, fixture_tensors):
     torch.testing.assert_close(stn, tensors["stn_transform"], atol=1e-4, rtol=0)
 
 
-def test_names_shapes_and_count_are_the_published_ones(shared: Path):
-    expected = json.loads((shared / "fixtures/pointnet/keys.json").read_text())
+def test_names_shapes_and_count_are_the_published_ones(reference: Path):
+    expected = json.loads((reference / "fixtures/pointnet/keys.json").read_text())
     network = PointNet()
     assert {key: list(value.shape) for key, value in network.state_dict().items()} == expected
     assert sum(p.numel() for p in network.parameters()) == 1_607_961

@@ -51,9 +51,9 @@ def of_clouds(clouds: Tensor, role) -> Statistics:
     return statistics
 
 
-def test_every_published_number_comes_out_of_files_of_statistics(fixture_tensors, shared: Path, tmp_path: Path):
+def test_every_published_number_comes_out_of_files_of_statistics(fixture_tensors, reference: Path, tmp_path: Path):
     tensors = fixture_tensors("metrics/inputs")
-    values = json.loads((shared / "fixtures/metrics/values.json").read_text())
+    values = json.loads((reference / "fixtures/metrics/values.json").read_text())
     both = []
     for role, name in (("samples", "gen"), ("real", "real")):
         statistics = of_clouds(tensors[f"clouds_{name}"], role)

@@ -51,8 +51,8 @@ def test_the_official_archive_gives_the_reference_output(shared: Path, fixture_t
 
 
 @pytest.mark.parametrize("layers", [21, 53])
-def test_names_shapes_and_counts_are_the_published_ones(layers, shared: Path):
-    published = json.loads((shared / f"fixtures/rangenet/darknet{layers}_keys.json").read_text())
+def test_names_shapes_and_counts_are_the_published_ones(layers, reference: Path):
+    published = json.loads((reference / f"fixtures/rangenet/darknet{layers}_keys.json").read_text())
     with torch.device("meta"):
         network = RangeNet(layers)
     parts = (network.backbone, network.decoder, network.head)

@@ -60,8 +60,8 @@ def test_kitti_raw_takes_the_odometry_frames_for_training_and_the_rest_for_testi
     assert len(kitti(tmp_path, "train")) == 3, "kitti recognises the raw layout"
 
 
-def test_kitti_raw_splits_are_those_of_the_published_program(shared: Path):
-    facts = json.loads((shared / "facts" / "kitti_raw_splits.json").read_text())
+def test_kitti_raw_splits_are_those_of_the_published_program(reference: Path):
+    facts = json.loads((reference / "facts" / "kitti_raw_splits.json").read_text())
     raw = {
         sequence: tuple(entry[k] for k in ("drive", "first", "last"))
         for sequence, entry in facts["odometry_to_raw"].items()

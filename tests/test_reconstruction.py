@@ -26,8 +26,8 @@ SENSOR = Sensor("test", tuple(float(-i) for i in range(16)), width=64)
 
 
 @pytest.fixture
-def values(shared: Path) -> dict:
-    return json.loads((shared / "fixtures/metrics/values.json").read_text())
+def values(reference: Path) -> dict:
+    return json.loads((reference / "fixtures/metrics/values.json").read_text())
 
 
 def image(distance: np.ndarray, reflectance: np.ndarray) -> RangeImage:

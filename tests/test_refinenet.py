@@ -109,8 +109,8 @@ def test_without_division_the_noise_level_does_not_matter(checkpoint, io):
     assert_within(network(io["input"], torch.zeros(3)), io["score_times_sigma"], 1e-4)
 
 
-def test_names_shapes_order_and_count_are_the_published_ones(shared):
-    facts = json.loads((shared / "facts" / "lidargen_state_dict.json").read_text())
+def test_names_shapes_order_and_count_are_the_published_ones(reference):
+    facts = json.loads((reference / "facts" / "lidargen_state_dict.json").read_text())
     with torch.device("meta"):
         network = RefineNet()
     assert sum(parameter.numel() for parameter in network.parameters()) == 29_694_082 == facts["n_params"]

@@ -16,13 +16,13 @@ from lidarsynth.diffusion.schedule import cosine
 
 
 @pytest.mark.parametrize("jump", [1, 2])
-def test_equals_the_reference(shared, fixture_tensors, jump):
+def test_equals_the_reference(reference, fixture_tensors, jump):
     values = fixture_tensors("r2dm/tiny_H_trajectories")
     expected = values[f"repaint.jump{jump}.states"]
     x_1, *noises = values[f"repaint.jump{jump}.noise_sequence"]
     rest = iter(noises)
     known, mask = values["repaint.known"], values["repaint.mask"]
-    denoiser = tiny_denoiser(shared)
+    denoiser = tiny_denoiser(reference)
     states = list(repaint(denoiser, x_1, known, mask, lambda x: next(rest), steps=3, resamples=3, jump=jump))
     assert_close(states[0].x_t, expected[0])
     for state, one in zip(states[jump - 1 :: jump], expected[1:], strict=True):

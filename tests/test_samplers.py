@@ -30,9 +30,9 @@ from lidarsynth.networks.efficient_unet import EfficientUNet
 DOUBLE = torch.float64
 
 
-def tiny_denoiser(shared) -> Denoiser:
+def tiny_denoiser(reference) -> Denoiser:
     """The reference's small network of config H (fixtures/r2dm/tiny_H.pth), EMA weights."""
-    checkpoint = torch.load(shared / "fixtures/r2dm/tiny_H.pth", weights_only=True)
+    checkpoint = torch.load(reference / "fixtures/r2dm/tiny_H.pth", weights_only=True)
     cfg = checkpoint["cfg"]["model"]
     network = EfficientUNet(
         resolution=checkpoint["cfg"]["data"]["resolution"],
@@ -70,12 +70,12 @@ def test_steps_equal_the_reference(fixture_tensors, name, kind, clip):
 
 
 @pytest.mark.parametrize("name", ["ddpm", "ddim_eta0", "ddim_eta0.5", "ddim_eta1"])
-def test_trajectories_equal_the_reference(shared, fixture_tensors, name):
+def test_trajectories_equal_the_reference(reference, fixture_tensors, name):
     values = fixture_tensors("r2dm/tiny_H_trajectories")
     step = ddpm if name == "ddpm" else partial(ddim, eta=float(name.removeprefix("ddim_eta")))
     x_1, *noises = values["sample.noise_sequence"]
     rest = iter(noises)
-    states = list(sample(tiny_denoiser(shared), x_1, step, 3, lambda x: next(rest)))
+    states = list(sample(tiny_denoiser(reference), x_1, step, 3, lambda x: next(rest)))
     assert next(rest, None) is None  # every noise was used, also where eta = 0
     assert_close(states[0].x_t, values[f"{name}.states"][0])
     for state, expected in zip(states, values[f"{name}.states"][1:], strict=True):

@@ -48,8 +48,8 @@ class Noise:
 
 
 @pytest.fixture
-def schedules(shared: Path) -> dict:
-    return json.loads((shared / "fixtures" / "diffusion" / "training_schedules.json").read_text())
+def schedules(reference: Path) -> dict:
+    return json.loads((reference / "fixtures" / "diffusion" / "training_schedules.json").read_text())
 
 
 def network(experiment: Experiment = TINY, seed: int = 0) -> nn.Module:

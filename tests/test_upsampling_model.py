@@ -412,7 +412,7 @@ def test_other_files_are_named_as_what_they_are(tmp_path):
         lidarsynth.load(path)
 
 
-def test_keras_weights_load_and_answer_as_stored(fixture_tensors, shared, tmp_path):
+def test_keras_weights_load_and_answer_as_stored(fixture_tensors, reference, tmp_path):
     h5py = pytest.importorskip("h5py", reason="lidarsynth[data] is not installed")
     stored = fixture_tensors("lsr_keras_small")
     order = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
@@ -421,7 +421,7 @@ def test_keras_weights_load_and_answer_as_stored(fixture_tensors, shared, tmp_pa
     path = tmp_path / "weights.h5"
 
     def write(tensors: list[Tensor]) -> None:
-        layers = json.loads((shared / "facts" / "lsr_keras_layers.json").read_text())["layers"]
+        layers = json.loads((reference / "facts" / "lsr_keras_layers.json").read_text())["layers"]
         left = iter(tensors)
         with h5py.File(path, "w") as file:
             file.attrs["layer_names"] = [name.encode() for _, name, _ in layers]

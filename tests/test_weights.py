@@ -25,8 +25,8 @@ CONTENT = np.random.default_rng(0).bytes(3_000_000)
 
 
 @pytest.fixture
-def tiny(shared) -> Path:
-    return shared / "fixtures" / "r2dm" / "tiny_H.pth"
+def tiny(reference) -> Path:
+    return reference / "fixtures" / "r2dm" / "tiny_H.pth"
 
 
 @pytest.fixture

@@ -223,8 +223,9 @@ class CascadeModel(ScanModel):
         return observed(scan, image, answer[0], projection)
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
-        """How often `generate` calls `on_step` per batch: the coarse steps and the fill."""
+        """How often `generate` calls `on_step` per batch: the coarse steps, the fill. Raises ValueError as `stream`."""
         self._sampler(sampler)
+        self._grid()
         return 1 + (STEPS_DEFAULT if steps is None else steps)
 
     def _sampler(self, sampler: str | None) -> str:
