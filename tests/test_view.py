@@ -117,10 +117,12 @@ def test_labels_boxes_and_marks_lie_beside(tmp_path: Path):
     (root / "labels" / "000000.label").write_bytes(np.full(len(scan), 40, "<u4").tobytes())
     (root / "boxes" / "000000.json").write_text(json.dumps({"boxes": [BOX | {"occlusion": 0.5}]}))
     path.with_suffix(".new").write_bytes(b"\1" * len(scan))
+    path.with_suffix(".confidence").write_bytes(scan.reflectance.tobytes())
     (shown,) = [series_of([tmp_path], Reading())[0]]
     assert shown.scan.label is not None and set(shown.scan.label.tolist()) == {9}  # road
     assert list(shown.boxes) == [BOX] and shown.notes == ()
     np.testing.assert_array_equal(shown.scan.extra["new"], np.ones(len(scan)))
+    np.testing.assert_array_equal(shown.scan.extra["confidence"], scan.reflectance)
     assert series_of([tmp_path], Reading()).count == 1, "rings/*.bin are no scans"
 
 
@@ -138,7 +140,7 @@ def test_what_does_not_fit_is_left_out_and_said(boxes: str, tmp_path: Path):
     assert shown.boxes == [] and shown.scan.label is None and "new" not in shown.scan.extra
     labels, marks = shown.notes
     assert re.search(r"labels left out: .*expected 16384 bytes.*found 12", labels)
-    assert re.search(r"a.new left out: expected 4096 bytes, found 12", marks)
+    assert re.search(r"a.new left out: expected 4096 bytes for 4096 points.* found 12 bytes", marks)
 
 
 def bag(path: Path, times: list[int]) -> Path:
