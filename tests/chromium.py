@@ -88,6 +88,18 @@ class Page:
             self.call("Input.dispatchKeyEvent", type=kind, key=name)
         self.settle()
 
+    def drag(self, start: tuple[int, int], end: tuple[int, int], button: str = "left") -> None:
+        """Press there, move there, let go."""
+        held = {"left": 1, "right": 2}[button]
+        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=held, clickCount=1)
+        self.settle()
+
+    def wheel(self, at: tuple[int, int], turned: int) -> None:
+        """Turn the wheel over a place."""
+        self.call("Input.dispatchMouseEvent", type="mouseWheel", x=at[0], y=at[1], deltaX=0, deltaY=turned)
+        self.settle()
+
     def cpu_seconds(self) -> float:
         """Processor time of all its processes so far, whatever else the machine does; 0 where there is no /proc."""
         total = 0

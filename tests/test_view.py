@@ -8,6 +8,7 @@ import struct
 import threading
 import weakref
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,8 +16,8 @@ import numpy as np
 import pytest
 
 from lidarsynth.cli.main import main
-from lidarsynth.data.bag_writer import write_bag
-from lidarsynth.data.bags import Cloud
+from lidarsynth.data.bag_writer import message_of, write_bag
+from lidarsynth.data.bags import POINTS, Cloud, cloud_of, open_bag, typestore
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
@@ -116,10 +117,12 @@ def test_labels_boxes_and_marks_lie_beside(tmp_path: Path):
     (root / "labels" / "000000.label").write_bytes(np.full(len(scan), 40, "<u4").tobytes())
     (root / "boxes" / "000000.json").write_text(json.dumps({"boxes": [BOX | {"occlusion": 0.5}]}))
     path.with_suffix(".new").write_bytes(b"\1" * len(scan))
+    path.with_suffix(".confidence").write_bytes(scan.reflectance.tobytes())
     (shown,) = [series_of([tmp_path], Reading())[0]]
     assert shown.scan.label is not None and set(shown.scan.label.tolist()) == {9}  # road
     assert list(shown.boxes) == [BOX] and shown.notes == ()
     np.testing.assert_array_equal(shown.scan.extra["new"], np.ones(len(scan)))
+    np.testing.assert_array_equal(shown.scan.extra["confidence"], scan.reflectance)
     assert series_of([tmp_path], Reading()).count == 1, "rings/*.bin are no scans"
 
 
@@ -137,7 +140,7 @@ def test_what_does_not_fit_is_left_out_and_said(boxes: str, tmp_path: Path):
     assert shown.boxes == [] and shown.scan.label is None and "new" not in shown.scan.extra
     labels, marks = shown.notes
     assert re.search(r"labels left out: .*expected 16384 bytes.*found 12", labels)
-    assert re.search(r"a.new left out: expected 4096 bytes, found 12", marks)
+    assert re.search(r"a.new left out: expected 4096 bytes for 4096 points.* found 12 bytes", marks)
 
 
 def bag(path: Path, times: list[int]) -> Path:
@@ -150,18 +153,44 @@ def bag(path: Path, times: list[int]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def sqlite(path: Path, old: Path) -> Path:
+    """The bag as a ROS 2 folder."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store = typestore("cdr")
+    with open_bag(old) as source, Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        points = writer.add_connection("/points", POINTS, typestore=store)
+        for message in source.messages():
+            data = message_of(cloud_of(message), "cdr")
+            writer.write(points, message.time, data)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ""])
 def test_a_bag_by_number_in_any_order(suffix: str, tmp_path: Path):
+    """Asked by as many threads as a server has."""
     pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
-    path = bag(tmp_path / f"drive{suffix}", [10**18 + t * 10**8 for t in (0, 1, 2, 2, 3, 4)])
+    path = bag(tmp_path / f"drive{suffix or '.bag'}", [10**18 + t * 10**8 for t in (0, 1, 2, 2, 3, 4)])
+    path = path if suffix else sqlite(tmp_path / "drive", path)
     series = series_of([path], Reading())
     assert series.count == 6
     for number in (0, 3, 1, 2, 5, 4, 0, 3):
-        distance = np.linalg.norm(series[number].scan.xyz, axis=1)
-        np.testing.assert_allclose(distance, 10 + number, rtol=1e-4)
+        with ThreadPoolExecutor(1) as thread:
+            scan = thread.submit(series.__getitem__, number).result().scan
+        np.testing.assert_allclose(np.linalg.norm(scan.xyz, axis=1), 10 + number, rtol=1e-4)
     assert list(series.names) == [f"drive/{i:06d}" for i in range(6)]
     with pytest.raises(IndexError):
         series[6]
+
+
+def test_several_bags_are_one_row_and_none_is_held(tmp_path: Path):
+    pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
+    for name in "ab":
+        bag(tmp_path / f"{name}.bag", [10**18, 10**18 + 1])
+    series = series_of([tmp_path], Reading())
+    assert isinstance(series, Stream) and series.count == 4
+    assert [round(float(np.linalg.norm(series[k].scan.xyz[0]))) for k in (3, 0, 2)] == [11, 10, 10]
+    assert list(series.names) == ["a/000000", "a/000001", "b/000000", "b/000001"]
 
 
 def test_going_back_starts_at_the_mark_and_nothing_is_held():

@@ -56,6 +56,10 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> str:
     return path.as_uri()
 
 
+REACHED = """new Promise((done) => {{
+    const wait = () => state.number === {} ? done() : setTimeout(wait, 20);
+    wait();
+}})"""
 AS_OPENED = """(state.word = 'range', $('boxes').checked = $('rings').checked = true, $('strips').hidden = false,
     look('behind'), show(''), go(0, 0))"""
 
@@ -205,6 +209,34 @@ def test_what_is_pointed_at_is_told(page: Page, alone: str):
     eye = page.run("camera.eye()")
     assert np.linalg.norm(np.subtract(found, eye)) <= np.linalg.norm(np.subtract(wanted, eye)) * 1.05
     assert "range" in page.run("told(7)")
+
+
+def test_the_pointer_turns_moves_and_nears(page: Page, alone: str):
+    opened(page, alone)
+    turn, distance = page.run("camera.turn"), page.run("camera.distance")
+    page.drag((700, 300), (800, 300))
+    assert page.run("camera.turn") == pytest.approx(turn - 0.6)
+    assert page.run("camera.distance") == distance and page.run("camera.target[1]") == 0
+    look = np.array(page.run("camera.target"))
+    page.drag((700, 300), (720, 310), "right")
+    moved = np.array(page.run("camera.target")) - look
+    assert 0.1 < np.linalg.norm(moved) < 5 and page.run("camera.turn") == pytest.approx(turn - 0.6)
+    page.wheel((700, 300), -100)
+    assert page.run("camera.distance") < distance
+    assert page.run("$('views').querySelectorAll('[aria-pressed=true]').length") == 0
+
+
+def test_play_goes_round(page: Page, alone: str):
+    opened(page, alone)
+    page.key(" ")
+    page.run(
+        "new Promise((done) => { const wait = () => state.number === 1 ? done() : setTimeout(wait, 20); wait(); })"
+    )
+    page.run(
+        "new Promise((done) => { const wait = () => state.number === 0 ? done() : setTimeout(wait, 20); wait(); })"
+    )
+    page.key(" ")
+    assert page.run("state.playing") == 0
 
 
 def test_a_narrow_window_has_everything_within_it(page: Page, alone: str):

@@ -1,4 +1,4 @@
-"""What lies beside a scan file: its labels, the boxes that `lidarsynth streets` wrote, and which points are new."""
+"""What lies beside a scan file: labels, boxes that `lidarsynth streets` wrote, which points are new and how sure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.files.fields import FileError
-from lidarsynth.files.formats import BARE, read_with_report
+from lidarsynth.files.formats import BARE, BESIDE, read_with_report
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
@@ -21,7 +21,7 @@ THREE = ("centre", "size")  # fields of a box with three numbers
 
 
 def read_shown(path: Path, intensity: str = "auto") -> Shown:
-    """A scan file with the labels, boxes and `new` marks beside it; what cannot be used of those becomes a note.
+    """A scan file with the labels, boxes, `new` and `confidence` beside it; what cannot be used becomes a note.
 
     Labels: NAME.label beside it or in ../labels, as SemanticKITTI has them. Boxes: NAME.json beside it or in a folder
     `boxes` up to three levels up, as `lidarsynth streets` writes them. Raises FileError for the scan itself.
@@ -37,10 +37,10 @@ def read_shown(path: Path, intensity: str = "auto") -> Shown:
         notes.append(_why(labels, len(scan) + dropped))
     if dropped:
         notes.append(f"{dropped} points without a return or not finite were dropped")
-    marks = path.with_suffix(".new")
-    if path.name.lower().endswith(BARE) and marks.is_file():
-        scan, note = _with_marks(scan, marks, dropped)
-        notes += note
+    for name in BESIDE if path.name.lower().endswith(BARE) else ():
+        if (marks := path.with_suffix(f".{name}")).is_file():
+            scan, note = _with_marks(scan, name, marks, dropped)
+            notes += note
     boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])
     return Shown(scan, boxes, tuple(notes))
 
@@ -93,8 +93,10 @@ def _are_numbers(values: Any, count: int) -> bool:
     return plain and all(math.isfinite(v) for v in values)
 
 
-def _with_marks(scan: Scan, marks: Path, dropped: int) -> tuple[Scan, list[str]]:
-    """The scan with `extra["new"]` of its .new file, a byte a point."""
-    if dropped or marks.stat().st_size != len(scan):
-        return scan, [f"{marks.name} left out: expected {len(scan) + dropped} bytes, found {marks.stat().st_size}"]
-    return replace(scan, extra={**scan.extra, "new": np.fromfile(marks, np.uint8)}), []
+def _with_marks(scan: Scan, name: str, path: Path, dropped: int) -> tuple[Scan, list[str]]:
+    """The scan with a field that has a file of its own, such as .new with a byte a point."""
+    kind, count = BESIDE[name], len(scan) + dropped
+    if dropped or path.stat().st_size != count * kind.itemsize:
+        return scan, [f"{path.name} left out: expected {count * kind.itemsize} bytes for {count} points, none of them "
+                      f"dropped, found {path.stat().st_size} bytes and {dropped} dropped"]  # fmt: skip
+    return replace(scan, extra={**scan.extra, name: np.fromfile(path, kind)}), []

@@ -43,7 +43,8 @@ def colourings(first: Scan) -> dict[str, dict[str, Any]]:
         "label": {"title": "Class", "fields": ["label"], "classes": [[name, list(rgb)] for name, rgb in CLASSES]},
         "new": {"title": "Measured or new", "fields": ["new"],
                 "classes": [["measured", list(MEASURED)], ["filled in", list(NEW)]]},
-        "confidence": _scale("Confidence", "0 to 1", "linear", 0, 1, viridis(unit), [0, 0.25, 0.5, 0.75, 1]),
+        "confidence": _scale("Confidence", "chance of being right", "linear", 0, 1, viridis(unit),
+                             [0, 0.25, 0.5, 0.75, 1]),
     }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from lidarsynth.lidar.sensor import SENSORS
 
 EVEN = 64  # rows of a scan that tells nothing of its beams
 WIDTHS = (512, 1024, 2048, 4096)  # columns that a strip may have
-FULL = 0.75  # of the points of the fullest beam are columns, at least: two returns, or points a pixel twice, add none
+FULL = 0.75  # columns, at least, by the points of a full beam: two returns, or points a pixel twice, add none
 MOST = 1024  # rows; more are no beams
 
 
@@ -47,8 +47,9 @@ def rows_of(scan: Scan) -> Rows:
 
 
 def _rows(row: np.ndarray, height: int, origin: str) -> Rows:
-    fullest = int(np.bincount(row[row >= 0], minlength=1).max())
-    width = next((width for width in WIDTHS if width >= FULL * fullest), WIDTHS[-1])
+    counts = np.bincount(row[row >= 0], minlength=1)
+    full = float(np.percentile(counts[counts > 0], 75)) if counts.any() else 0.0
+    width = next((width for width in WIDTHS if width >= FULL * full), WIDTHS[-1])
     return Rows(row.astype(np.int32), height, width, origin)
 
 

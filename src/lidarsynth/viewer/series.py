@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -12,7 +12,7 @@ from typing import Protocol
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.folder import scan_files
 from lidarsynth.lidar.frame import transformed
-from lidarsynth.verbs.inputs import Input, MessageInput, Reading, inputs_of, is_stream
+from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.packing import Shown
 
@@ -67,14 +67,12 @@ class Stream:
         self.open_at, self.count = open_at, count
         self.names: list[str] = []
         self._marks: list[int] = []
-        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1)  # a bag of SQLite may be read by the thread only that opened it
         self._stream: Iterator[tuple[int, Input]] | None = None
         self._next = 0  # what the stream gives next
 
     def __getitem__(self, index: int) -> Shown:
-        with self._lock:
-            item = self._at(index)
-        loaded = item.read()
+        loaded = self._thread.submit(self._at, index).result().read()
         dropped = (f"{loaded.dropped} points without a return or not finite were dropped",) if loaded.dropped else ()
         return Shown(loaded.scan, notes=dropped)
 
@@ -85,14 +83,16 @@ class Stream:
         start = bisect_left(self._marks, mark)  # the first scan of that mark
         if self._stream is None or index < self._next or start > self._next:
             self._stream, self._next = self.open_at(mark, start), start
-        for mark, item in self._stream:
+        stream, self._stream = self._stream, None  # not to be gone on with where it ends, or breaks
+        for mark, item in stream:
             if self._next == len(self._marks):
                 self._marks.append(mark)
                 self.names.append(item.name)
             self._next += 1
             if self._next == index + 1:
+                self._stream = stream
                 return item
-        self.count, self._stream = len(self._marks), None
+        self.count = len(self._marks)
         raise IndexError(index)
 
 
@@ -101,12 +101,12 @@ def series_of(paths: Sequence[Path], reading: Reading) -> Series:
     if len(paths) == 1 and is_bag(paths[0]):
         return _bag(paths[0], reading)
     inputs = inputs_of([found for path in paths for found in _scans_only(path)], reading)
-    if any(is_stream(path) for path in paths) or inputs.count is None:
-        return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count)
-    items = list(inputs.stream())
-    if any(is_stream(item.path) for item in items):
-        return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count)
-    return Files([item.name for item in items], [item.path for item in items], reading)
+    files: list[FileInput] = []
+    for item in inputs.stream():
+        if not isinstance(item, FileInput):  # of a capture, or of one bag of several
+            return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count)
+        files.append(item)
+    return Files([item.name for item in files], [item.path for item in files], reading)
 
 
 def _scans_only(path: Path) -> list[Path]:

@@ -1,7 +1,7 @@
 // When to draw: on a change, once; while the camera moves, as many points as the machine draws 60 times a second.
 
 const SMOOTH = 1000 / 60, STILL = 160; // milliseconds: of a frame, and until the camera counts as standing still
-const FEWEST = 1 / PASSES.length; // share of the points
+const FEWEST = 0.25; // share of the points
 
 class Motion {
   constructor(scene, camera) {
