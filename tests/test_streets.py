@@ -5,6 +5,7 @@ import pytest
 
 from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.streets.actors import actors_of
 from lidarsynth.streets.areas import Density
 from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.drive import draw_drive
@@ -241,3 +242,16 @@ def test_a_perfect_sensor_reports_what_its_beams_meet(still: list[Frame]):
     assert [b.centre for b in perfect.boxes] == [b.centre for b in real.boxes]
     with pytest.raises(ValueError, match="expected clear weather"):
         Options(perfect=True, weather=Weather(rain=1))
+
+
+def test_more_comes_beside_what_is_there():
+    """People in groups, motorcycles and works: all else of the world stays where it was, to the bit."""
+    plain = LabelledStreets(0, 2, SMALL)._worlds[0][0]
+    crowded = LabelledStreets(0, 2, SMALL, Options(density=Density(groups=3, motorcycles=3, works=2)))._worlds[0][0]
+    before = {corners.tobytes() for corners in plain.corners}
+    after = {corners.tobytes() for corners in crowded.corners}
+    assert before <= after and len(after) > len(before) + 1000
+    np.testing.assert_array_equal(plain.poses, crowded.poses)
+    kinds = [[str(kind) for kind in actors_of(world).kind] for world in (plain, crowded)]
+    for kind in ("person", "motorcycle"):
+        assert kinds[1].count(kind) > kinds[0].count(kind) + 3

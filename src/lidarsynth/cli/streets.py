@@ -33,6 +33,9 @@ def streets(
     parking: Annotated[float, arg(help="parked vehicles, likewise.")] = 1.0,
     pedestrians: Annotated[float, arg(help="likewise.")] = 1.0,
     vegetation: Annotated[float, arg(help="trees and bushes, likewise.")] = 1.0,
+    groups: Annotated[float, arg(help="of people who stand together, per 100 m and side of the street.")] = 0.0,
+    motorcycles: Annotated[float, arg(help="places with parked ones, likewise.")] = 0.0,
+    works: Annotated[float, arg(help="construction sites, likewise.")] = 0.0,
     rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
     fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
     workers: Annotated[int | None, arg(metavar="INT", help="processes, one per processor core if not given.")] = None,
@@ -46,7 +49,10 @@ def streets(
     from lidarsynth.streets.frame import LabelledStreets, Options
     from lidarsynth.streets.weather import Weather
 
-    density, weather = Density(traffic, parking, pedestrians, vegetation), Weather(rain, fog)
+    density, weather = (
+        Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works),
+        Weather(rain, fog),
+    )
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
     made = LabelledStreets(seed, count, get_sensor(sensor), options)
     workers = os.cpu_count() or 1 if workers is None else workers

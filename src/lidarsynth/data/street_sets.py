@@ -96,8 +96,10 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    if not streets.options.perfect:
-        del options["perfect"]  # sets of before there was a choice go on
+    for of, later in ((options, ("perfect",)), (options["density"], ("groups", "motorcycles", "works"))):
+        for name in later:
+            if not of[name]:
+                del of[name]  # a set of before there was this choice goes on
     return {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
 
 

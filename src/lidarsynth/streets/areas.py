@@ -41,6 +41,9 @@ class Area:
     kerb_bushes: float = 0.6  # per 100 m and side
     on_road: float = 1.5  # pedestrians on the main road
     woods: float = 1.0  # size of those that close a view
+    groups: float = 0.0  # of people who stand together, per 100 m and side; these three only where asked for
+    motorcycles: float = 0.0
+    works: float = 0.0
 
 
 # fmt: off
@@ -84,12 +87,18 @@ AREAS: dict[str, Area] = {
 
 @dataclass(frozen=True)
 class Density:
-    """How much of what there is, as factors of what the kind of street has; 1 leaves a world as it is."""
+    """How much of what there is, as factors of what the kind of street has; 1 leaves a world as it is.
+
+    groups, motorcycles, works  more, per 100 m and side: groups of people, parked motorcycles, road works
+    """
 
     traffic: float = 1.0  # moving vehicles and cyclists
     parking: float = 1.0  # parked vehicles
     pedestrians: float = 1.0
     vegetation: float = 1.0  # trees, bushes, thickets
+    groups: float = 0.0
+    motorcycles: float = 0.0
+    works: float = 0.0
 
     def of(self, area: Area) -> Area:
         """The kind of street with these factors. Raises ValueError for a factor below 0."""
@@ -97,12 +106,13 @@ class Density:
             return area
         for name, factor in vars(self).items():
             if not 0 <= factor <= 100:
-                raise ValueError(f"expected {name} as a factor of 0 to 100, found {factor}")
+                raise ValueError(f"expected {name} of 0 to 100, found {factor}")
         times = {"traffic": ("traffic",), "pedestrians": ("people",), "vegetation": ("trees", "garden", "thicket")}
         new = {f: _scaled(getattr(area, f), getattr(self, word)) for word, fields in times.items() for f in fields}
         low, high = _scaled(area.parked, self.parking)
         new["parked"] = (min(low, 1.0), min(high, 1.0))
         green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
+        new |= {name: getattr(self, name) for name in ("groups", "motorcycles", "works")}
         return replace(area, **new, **green, on_road=area.on_road * self.pedestrians)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from lidarsynth.streets.areas import AREAS, TODAY, Area, Density
 from lidarsynth.streets.ground import KERB, Road
+from lidarsynth.streets.more import more
 from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground, draw_poses
 
 Array = np.ndarray
@@ -43,6 +44,7 @@ def fill(builder: WorldBuilder, places: Array, lane: Array | None = None) -> Non
             if number == 0:
                 parked(builder, road, side, places if lane is None else lane)
                 moving(builder, road, side, places)
+    more(builder)
 
 
 def _count(builder: WorldBuilder, per_100: float, road: Road) -> int:

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lidarsynth.streets import shapes
+from lidarsynth.streets import shapes, works
 from lidarsynth.streets.shapes import Mesh, box, extrusion, frustum, join, leaves, moved, wheel
 
 
@@ -272,4 +272,5 @@ def library() -> dict[str, list[Mesh]]:
         "bin": [box((-0.3, 0.3), (-0.3, 0.3), (0, 1.1), "door", "unlabeled"),
                 box((-0.7, 0.7), (-0.5, 0.5), (0, 1.3), "door", "unlabeled"),
                 box((-0.35, 0.35), (-0.2, 0.2), (0, 1.5), "canvas", "unlabeled")],
+        **works.things(),
     }  # fmt: skip

@@ -309,7 +309,7 @@ class CascadeModel(ScanModel):
         """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         told = known | (self._blocked & ~image.mask)
         pixels = known_of(image.range[None], image.reflectance[None], told[None], True, padded(self.sensor))
-        filled, rays = self._network(pixels, None, 0, doubt=True)
+        filled, rays = self._network(pixels, None, doubt=True)
         return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
 
     def _fill(
@@ -331,8 +331,7 @@ class CascadeModel(ScanModel):
         surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
-        grain = GRAIN if surely is None else 1.0
-        filled, rays = self._network(known, rng, grain, doubt=weights is not None, classify=self.labelled)
+        filled, rays = self._network(known, rng, doubt=weights is not None, classify=self.labelled)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
@@ -346,16 +345,15 @@ class CascadeModel(ScanModel):
         self,
         known: Known,
         rng: list[torch.Generator] | None,
-        grain: float,
         doubt: bool = False,
         classify: bool = False,
     ) -> tuple[Filled, Rays]:
-        """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told; `grain` of a unit of noise."""
+        """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
-            noise = grain * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
+            noise = GRAIN * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))

@@ -1,0 +1,82 @@
+"""How good the classes are that `--labels` gives: of generated scans by another network, of known ones by the truth.
+
+python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--model default]
+
+generated  scans from noise: how often street-1's RangeNet, which saw the same scan, gives the same class
+streets    held-out worlds as hdl-64e-kitti sees them: whole, and of every fourth beam alone, against the truth; beside
+           them the RangeNet on the whole scans
+real       folders of labelled real scans, read as `benchmarks/street.py --classes` reads them
+
+mIoU is over the classes that occur in the truth, or, of generated scans, that the RangeNet finds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from street import HELD_OUT, SENSOR, WORD, labelled, streets
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.metrics.reconstruction import class_iou, confusion_matrix
+from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.systems.segmentation.training import classify
+from lidarsynth.weights.load import load, load_parts
+
+
+def cells(pairs: Iterable[tuple[RangeImage, RangeImage]]) -> str:
+    """Two cells of (truth, answer): share of the labelled pixels with the same class, and mIoU."""
+    counts = np.zeros((20, 20), np.int64)
+    for truth, answer in pairs:
+        assert truth.label is not None and answer.label is not None
+        both = truth.mask & (truth.label > 0)
+        counts += confusion_matrix(np.where(both, truth.label, 0), answer.label)
+    there = np.flatnonzero(counts.sum(1)[1:]) + 1
+    share = np.trace(counts[1:, 1:]) / max(counts[1:].sum(), 1)
+    return f"{100 * share:.1f} % | {class_iou(counts, (0,))[there].mean():.3f} ({len(there)})"
+
+
+def answered(model: ScanModel, image: RangeImage, every: int = 1) -> RangeImage:
+    """The image with the model's classes, told every so many-th beam."""
+    known = np.zeros(image.shape, bool)
+    known[::every] = True
+    bare = replace(image, label=None).keep(known)
+    return model.complete(bare, known)
+
+
+def rows(model: ScanModel, args: argparse.Namespace) -> Iterator[str]:
+    """Lines of a Markdown table."""
+    network = load_parts(WORD)[1]
+    assert isinstance(network, RangeNet)
+    yield "| classes of | pixels right | mIoU (classes) |\n|---|---:|---:|"
+    if args.generated:
+        made = model.generate(args.generated)
+        both = cells((classify(network, image), image) for image in made)
+        yield f"| {args.generated} generated scans, against RangeNet | {both} |"
+    sets = {f"{args.streets} held-out streets": list(streets(HELD_OUT, args.streets))} if args.streets else {}
+    sets |= {f"{folder.name} (real)": labelled(folder) for folder in args.real}
+    for name, images in sets.items():
+        yield f"| {name} | {cells((i, answered(model, i)) for i in images)} |"
+        yield f"| {name}, every fourth beam | {cells((i, answered(model, i, 4)) for i in images)} |"
+        yield f"| {name}, RangeNet of {WORD} | {cells((i, classify(network, i)) for i in images)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--generated", type=int, default=0, help="how many scans")
+    parser.add_argument("--streets", type=int, default=0, help="how many scans")
+    parser.add_argument("--real", type=Path, nargs="+", default=[], help="folders of labelled scans")
+    parser.add_argument("--model", default="default")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    for line in rows(load(args.model).into(SENSOR).with_labels(), args):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""What a street has more of when it is asked for: people who stand together, parked motorcycles, road works.
+
+All of it is drawn after everything else, so that the rest of a world is the same with and without.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsynth.streets.ground import KERB, Road
+from lidarsynth.streets.world import WorldBuilder
+
+
+def more(builder: WorldBuilder) -> None:
+    """Draws what the area asks for, per 100 m and side; an area that asks for nothing draws nothing."""
+    for road in builder.ground.roads:
+        for side in (-1, 1):
+            for per_100, put in ((builder.area.groups, _group), (builder.area.motorcycles, _motorcycles),
+                                 (builder.area.works, _works)):  # fmt: skip
+                if per_100 > 0:
+                    count = int(builder.rng.poisson(per_100 * (road.stop - road.start) / 100))
+                    for s in builder.rng.uniform(road.start, road.stop, count):
+                        put(builder, road, side, float(s))
+
+
+def _group(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """Two to five people on the sidewalk who face one another."""
+    rng = builder.rng
+    count = int(rng.integers(2, 6))
+    around = rng.uniform(0, 6.28) + np.arange(count) * 2 * np.pi / count + rng.normal(0, 0.2, count)
+    far = rng.uniform(0.4, 0.6) * max(1.0, count / 3)
+    middle = road.half + max(road.walk, 1.5) * rng.uniform(0.4, 0.8)
+    x, y, _ = road.at(s + far * np.cos(around), side * middle + far * np.sin(around))
+    cx, cy, _ = road.at(np.array([s]), np.array([side * middle]))
+    yaw = np.arctan2(cy - y, cx - x) + rng.normal(0, 0.3, count)
+    builder.put("person", x, y, yaw, up=KERB if road.walk > 0 else 0.0, clear=0.0)
+
+
+def _motorcycles(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """One to four, side by side, across the edge of the sidewalk."""
+    rng = builder.rng
+    count = int(rng.integers(1, 5))
+    place = s + 0.95 * np.arange(count)
+    x, y, along = road.at(place, np.full(count, side * (road.half + 1.1)))
+    yaw = along + rng.choice([0.5, np.pi / 2]) + rng.normal(0, 0.08, count)
+    builder.put("motorcycle", x, y, yaw, up=KERB if road.walk > 0 else 0.0, clear=0.0)
+
+
+def _works(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """A fenced piece of sidewalk and gutter with a heap and a box, and cones that lead the traffic past it."""
+    rng = builder.rng
+    boards, deep = int(rng.integers(4, 10)), max(road.walk * 0.8, 1.6)
+    length, near = 2.0 * boards, road.half - 0.3
+    front = [(s + 1 + 2.0 * k, near, 0.0) for k in range(boards)]
+    ends = [(s + end, near + 1 + 2.0 * k, np.pi / 2) for end in (0, length) for k in range(max(1, round(deep / 2)))]
+    place, out, turn = np.array(front + ends).T
+    x, y, along = road.at(place, side * out)
+    builder.put("barrier board", x, y, along + turn, clear=None, size=(1.0, 1.0))
+    towards = -1 if side < 0 else 1  # the traffic of the right side comes from behind
+    cones = np.arange(5)
+    x, y, _ = road.at(s + (length if towards > 0 else 0) + towards * (1 + 1.8 * cones), side * (near + 0.1 * cones))
+    builder.put("cone", x, y, rng.uniform(0, 6.28, 5), clear=None)
+    inside = s + length * rng.uniform(0.25, 0.75, 2)
+    for kind, at in zip(("heap", "site box"), inside, strict=True):
+        x, y, along = road.at(np.array([at]), np.array([side * (road.half + deep / 2)]))
+        builder.put(kind, x, y, along, clear=None, size=(0.7, 1.2))
