@@ -3,8 +3,8 @@
 python examples/ray_complete.py SCANS OUT                        this machine, with as many workers as it has cores
 python examples/ray_complete.py SCANS OUT --workers 32 --gpus 1  32 workers of a running cluster, a GPU each
 
-SCANS and OUT must be reachable from every machine: a shared disk. A file that is there already is left out, so a job that
-was stopped goes on where it was; a broken scan is named in the summary and not the end.
+SCANS and OUT must be reachable from every machine: a shared disk. A file that is there already is left out, so a job
+that was stopped goes on where it was; a broken scan is named in the summary and not the end.
 """
 
 from __future__ import annotations
