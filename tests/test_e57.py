@@ -1,4 +1,4 @@
-"""E57 files: what pye57 wrote comes back in the scanner's frame; several scans and broken files are refused in a line."""
+"""E57 files: what pye57 wrote comes back in the scanner's frame; several scans and broken files are refused."""
 
 from pathlib import Path
 
@@ -16,6 +16,7 @@ def columns(count: int = 500) -> dict[str, np.ndarray]:
     return points | {
         "intensity": rng.random(count).astype(np.float32),
         "rowIndex": np.arange(count, dtype=np.int32) % 9,
+        "columnIndex": np.arange(count, dtype=np.int32) // 9,
     }
 
 
