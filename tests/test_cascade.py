@@ -306,3 +306,18 @@ def test_classes_come_with_generated_and_completed_scans(learned: CascadeModel):
     assert filled.label is not None and filled.label.min() >= 1
     own = learned.into(SMALL).with_labels().complete(perfect(SMALL)[::3]).to_scan()
     assert own.label is not None and np.all(own.label[own.extra["new"] == 0] == 9)
+
+
+def test_bf16_errs_little_and_auto_asks_the_processor(model: CascadeModel, monkeypatch: pytest.MonkeyPatch):
+    image = SyntheticStreets(3, 1, SMALL).image(0)
+    known = corrupt(image, "beams:4")
+    exact, quick = (model.at_precision(word).complete(image.keep(known), known) for word in ("fp32", "bf16"))
+    both = exact.mask & quick.mask & ~known
+    off = np.abs(exact.range - quick.range)[both] / exact.range[both]
+    assert 0 < np.median(off) < 2e-3 and (exact.mask == quick.mask).mean() > 0.99
+    np.testing.assert_array_equal(quick.range[known], exact.range[known])
+    for has in (False, True):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {"amx_bf16": has}, raising=False)
+        assert model.at_precision("auto").precision == ("bf16" if has else "fp32")
+    with pytest.raises(ValueError, match="expected a precision of auto, fp32, bf16, found 'fp8'"):
+        model.at_precision("fp8")

@@ -19,6 +19,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.calibration import held_out, judged, right
 from lidarsynth.systems.cascade.confidence import confidence, fitted, reliability, signals
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.verbs.inputs import message_fields
 
 SENSOR = ls.Sensor("small", tuple(np.linspace(5, -25, 32).tolist()), 256, 0.5, 120.0)
 
@@ -145,3 +146,19 @@ def test_what_has_no_confidence_says_so(model: CascadeModel, street: RangeImage)
         draw.surer_than(2)
     with pytest.raises(ValueError, match="spread"):
         from_dict({"name": "x", "confidence": {"spread": 1.0}})
+
+
+def test_bags_get_a_column_of_confidences(model: CascadeModel, street: RangeImage):
+    sparse = street.keep(corrupt(street, "beams:4")).to_scan()
+    given = {"x": sparse.xyz[:, 0], "y": sparse.xyz[:, 1], "z": sparse.xyz[:, 2]}
+    numbered = replace(sparse, extra={"point": np.arange(len(sparse))})
+    filled = model.into(SENSOR).complete(numbered).to_scan()
+    columns = message_fields(filled, given)
+    np.testing.assert_array_equal(columns["confidence"], filled.extra["confidence"])
+    assert columns["confidence"].dtype == np.float32 and (columns["confidence"][columns["new"] == 0] == 1).all()
+
+
+def test_denser_scans_have_confidences_too(model: CascadeModel, street: RangeImage):
+    points = model.upsample(street.to_scan(), sensor_in=SENSOR, times=2).to_scan()
+    new = points.extra["new"] > 0
+    assert new.any() and (points.extra["confidence"][new] < 1).all() and (points.extra["confidence"][~new] == 1).all()

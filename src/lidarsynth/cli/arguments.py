@@ -19,6 +19,10 @@ Source = Annotated[
 ]
 Seed = Annotated[int, arg(help="of all randomness.")]
 NoSeed = Annotated[int, arg(help="not used; every verb takes it.")]
+Precision = Annotated[
+    Literal["auto", "fp32", "bf16"],
+    arg(help="of a cascade's network; auto is bf16 where the processor has it, which is a little less exact."),
+]
 Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
 Method = Annotated[
     Literal["auto", "conditional", "sample", "repaint", "posterior", "inversion", "network", "monte-carlo"],

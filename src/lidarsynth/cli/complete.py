@@ -13,6 +13,7 @@ from lidarsynth.cli.arguments import (
     Method,
     Picture,
     Positional,
+    Precision,
     Recipe,
     Resamples,
     Seed,
@@ -36,6 +37,7 @@ def complete(
     min_confidence: Least = None,
     seed: Seed = 0,
     device: Device = "cpu",
+    precision: Precision = "fp32",
     intensity: Intensity = "auto",
     sensor: SensorWord = None,
     labels: Labels = False,
@@ -64,6 +66,7 @@ def complete(
         picture=picture,
         least=min_confidence,
         labels=labels,
+        precision=precision,
     )
     results = [result for result in work_through(job, scans, out, many, intensity) if result.errors]
     if len(results) <= PICTURES:

@@ -18,8 +18,7 @@ def export(
 ) -> None:
     """Write a model as ONNX: completion in one step of default, kitti, kitti-streets; of others a denoising step.
 
-    It takes a minute. With the extra onnx; to run the file, onnxruntime and numpy are enough:
-    examples/onnx_complete.py.
+    It takes a minute, and needs the extra onnx. To run the file, onnxruntime and numpy are enough: docs/onnx.md.
     """
     from lidarsynth.verbs.export import export_onnx
 

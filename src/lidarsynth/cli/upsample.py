@@ -14,6 +14,7 @@ from lidarsynth.cli.arguments import (
     Output,
     Picture,
     Positional,
+    Precision,
     Resamples,
     Seed,
     SensorOut,
@@ -43,6 +44,7 @@ def upsample(
     min_confidence: Least = None,
     seed: Seed = 0,
     device: Device = "cpu",
+    precision: Precision = "fp32",
     intensity: Intensity = "auto",
     labels: Labels = False,
     picture: Picture = True,
@@ -66,5 +68,6 @@ def upsample(
         picture=picture,
         least=min_confidence,
         labels=labels,
+        precision=precision,
     )
     work_through(job, scans, out, many, intensity)

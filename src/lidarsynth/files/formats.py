@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.files import arrays, feather, las, pcd, ply, text
+from lidarsynth.files import arrays, e57, feather, las, pcd, ply, text
 from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
 from lidarsynth.files.labels import read_labels, read_words
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -30,6 +30,7 @@ READERS: dict[str, Callable[[bytes], Fields]] = {
     ".las": las.read_las,
     ".laz": las.read_las,
     ".feather": feather.read_feather,
+    ".e57": e57.read_e57,
     ".csv": text.read_text,
     ".txt": text.read_text,
     ".xyz": text.read_text,

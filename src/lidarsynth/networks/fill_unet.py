@@ -221,8 +221,8 @@ def draw_noise(shape: tuple[int, int, int], rng: torch.Generator | None = None) 
 
 def _to_patches(x: Tensor) -> Tensor:
     b, c, h, w = x.shape
-    x = x.reshape(b, c, h // STEM[0], STEM[0], w // STEM[1], STEM[1]).permute(0, 3, 5, 1, 2, 4)
-    return x.reshape(b, -1, h // STEM[0], w // STEM[1]).contiguous(memory_format=torch.channels_last)
+    x = x.reshape(b, c, h // STEM[0], STEM[0], w // STEM[1], STEM[1]).permute(0, 2, 4, 3, 5, 1)
+    return x.reshape(b, h // STEM[0], w // STEM[1], -1).permute(0, 3, 1, 2)  # channels last in memory, in one copy
 
 
 def _to_pixels(x: Tensor) -> Tensor:

@@ -273,6 +273,13 @@ class ScanModel(ABC):
         """
         return self if sensor in (None, self.sensor, self.sensor.name) else self.into(sensor)  # type: ignore[arg-type]
 
+    def at_precision(self, word: str) -> ScanModel:
+        """The same model, its network at `fp32`, or `auto`, the fastest it knows. Raises ValueError for other words."""
+        if word not in ("auto", "fp32"):
+            raise ValueError(f"{self.experiment.name}: expected precision fp32, or a cascade such as default for bf16, "
+                             f"found {word!r}")  # fmt: skip
+        return self
+
     def at_once(self, batch_size: int) -> int:
         """How many scans to make at once: one on a CPU, where more are no faster and differ by rounding."""
         return 1 if next(self.network.parameters()).device.type == "cpu" else batch_size

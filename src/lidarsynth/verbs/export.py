@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,8 +75,7 @@ def _program(graph: Graph) -> Any:
     columns = torch.export.Dim("blocks", min=2, max=LONGEST // graph.multiple) * graph.multiple
     shapes = {name: {3: columns} for name in graph.inputs} if graph.open_columns else None
     module = graph.module.cpu()
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # of the exporter about itself
+    with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             module,
             kwargs=dict(graph.inputs),
@@ -90,6 +91,20 @@ def _program(graph: Graph) -> Any:
     optimizer.fold_constants(program.model)
     optimizer.remove_unused_nodes(program.model)
     return program.model_proto
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's warnings about itself."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _shapes(values: Any) -> dict[str, tuple[int | str, ...]]:

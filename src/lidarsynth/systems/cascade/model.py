@@ -31,6 +31,7 @@ from lidarsynth.systems.cascade.known import best_known, known_of, spread, unans
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, sensor_that_made, with_known
 
 METHODS = ("auto", "conditional", "sample", "repaint")
@@ -51,6 +52,7 @@ class CascadeModel(ScanModel):
     network.fill     known pixels and rays -> all pixels, in one step
     own              whether scans are completed, and made denser, in the sensor that made them: until `into`
     labelled         whether its images have classes: after `with_labels`
+    precision        of the fill's matrix products: fp32 | bf16
     """
 
     network: Cascade
@@ -58,6 +60,7 @@ class CascadeModel(ScanModel):
     experiment: Experiment
     own: bool = True
     labelled: bool = False
+    precision: str = "fp32"
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     any_sensor: ClassVar[bool] = True
@@ -66,6 +69,10 @@ class CascadeModel(ScanModel):
         """The same model with images of another sensor."""
         sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
         return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor), own=False)
+
+    def at_precision(self, word: str) -> CascadeModel:
+        """The same model, its fill at `fp32`, `bf16`, or `auto`: bf16 where the processor multiplies it itself."""
+        return replace(self, precision=resolved_precision(word, self._device))
 
     def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> CascadeModel:
         """The model with images of the sensor that made the scan; itself after `into`.
@@ -357,7 +364,8 @@ class CascadeModel(ScanModel):
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
-        return self.network.fill(known, rays, noise.to(device), classify=classify, doubt=doubt), rays
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+            return self.network.fill(known, rays, noise.to(device), classify=classify, doubt=doubt), rays
 
     def _image(
         self, distance: np.ndarray, reflectance: Tensor, logit: Tensor, classes: Tensor | None, sure: Tensor | None

@@ -47,7 +47,9 @@ class FillObjective(nn.Module):
         draws = [draw_noise(shape, sample_rng(s, 0, k)) for k in (0, 1) for s in crops.seeds[:n]]
         twice = (type(part)(*(torch.cat([t, t]) for t in part)) for part in (known, rays))
         filled = self.network(*twice, torch.cat(draws).to(metres))
-        first, second = (joined(Filled(*(p[h] for p in filled)), known, rays) for h in (slice(None, n), slice(n, None)))
+        first, second = (
+            joined(Filled(*(p[h] for p in filled[:3])), known, rays) for h in (slice(None, n), slice(n, None))
+        )
         return energy_score(first, second, truth(metres, reflectance, rays))
 
     def _median(self, crops: Crops, n: int) -> Tensor:
