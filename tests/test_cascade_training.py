@@ -13,7 +13,7 @@ from lidarsynth.networks.fill_unet import Filled, Known
 from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import crop, pattern
-from lidarsynth.systems.cascade.training import absolute_errors, energy_score, fit_standard
+from lidarsynth.systems.cascade.training import absolute_errors, energy_score, fit_standard, misnamed
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
 
@@ -58,17 +58,42 @@ def test_absolute_errors_count_hidden_returns_of_the_sensor_alone():
     assert absolute_errors(Filled(code, *filled[1:]), known, rays, metres, metres / 50).item() > 0
 
 
-@pytest.mark.parametrize("index", range(0, 32, 4))
-def test_crops_tell_the_truth_and_nothing_else(index: int):
-    image = VirtualStreets(6, 32).image(index)
-    known, rays, (metres, reflectance) = crop(image, np.random.default_rng(index), index % 8 == 0)
-    assert metres.shape == reflectance.shape == rays.ground.shape == (1, 1, 64, 256)
-    assert torch.equal(known.metres, metres * known.returned)
-    assert not bool((known.returned & ~known.told).any())
-    assert not bool((known.lit & ~known.returned).any())
+@pytest.mark.parametrize("seed", range(12))
+def test_crops_tell_the_truth_and_nothing_else(seed: int):
+    image = VirtualStreets(6, 32).image(4 * (seed % 8))
+    known, rays, (metres, reflectance, label) = crop(image, np.random.default_rng(seed), seed % 2 == 0)
+    assert metres.shape == reflectance.shape == label.shape == rays.ground.shape == (1, 1, 64, 256)
+    assert torch.equal(known.metres[known.told], (metres * known.returned)[known.told])
+    assert not bool((known.lit & ~known.returned).any()) and not bool((known.lit & ~known.told).any())
     assert bool(known.told[rays.inside == 0].all())
     assert not bool(((metres > 0) & (rays.inside == 0)).any())
     assert not bool((rays.blocked.bool() & (metres > 0)).any())
+    assert not bool((label.bool() & (metres == 0) & known.told).any())
+
+
+def test_some_crops_are_of_perfect_scans_and_some_are_wholly_known():
+    image = VirtualStreets(6, 32).image(0)
+    crops = [crop(image, np.random.default_rng(seed), seed % 2 == 0) for seed in range(80)]
+    perfect = [(known, metres) for known, _, (metres, _, _) in crops if bool((known.returned & ~known.told).any())]
+    assert 4 <= len(perfect) <= 22  # of 80: a fifth of those to be drawn, a tenth of the others
+    for known, metres in perfect:
+        assert bool(((metres == 0) | known.returned)[~known.told].all())  # nothing returns but from a surface
+        assert torch.equal(metres[metres > 0], known.metres[metres > 0]) and not bool(known.lit.any())
+        assert bool((known.returned & (metres == 0)).any()) and bool((metres > 0).any())
+    assert any(bool(known.told.all()) for known, _, _ in crops)
+
+
+def test_classes_are_learned_where_somebody_has_said_them():
+    sensor = SENSORS["vlp-16"]
+    rays = rays_of(sensor, sensor.blocked_rays(), np.arange(64))
+    classes = torch.zeros(rays.elevation.shape, dtype=torch.long)
+    classes[:, :, :8] = 9
+    classes[:, :, 20:] = 3  # padding
+    logits = torch.zeros(1, 20, *classes.shape[2:])
+    filled = Filled(*(torch.zeros(classes.shape) for _ in range(3)), classes=logits)
+    assert_close(misnamed(filled, rays, classes), torch.tensor([np.log(20.0)]).float())
+    logits[:, 9] = 50
+    assert misnamed(filled, rays, classes).item() < 1e-6
 
 
 def test_patterns_leave_something_known_and_something_to_learn():

@@ -194,6 +194,7 @@ def default() -> Experiment:
             channel_multipliers=(1, 2, 4, 4),
             num_residual_blocks=(2, 2, 2, 2),  # of the coarse stage
             coords_encoding=None,  # both are told each pixel's rays
+            classes=20,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
         training=Training(

@@ -87,6 +87,8 @@ class RangeImage:
     completed    every point of the scan that was completed to this image, bit by bit, with the new ones, or None
     confidence   (H, W) float32 in [0, 1]: of a filled pixel the estimated chance that its ray returns, and from no
                  farther than 0.3 m + 2 % from the pixel's range; 1 where measured. None where the model gives none
+    surface      (H, W) float32, metres: of virtual streets, where exactly each ray meets something, whether it returned
+                 or not, 0 for nothing; or None. It is not saved
 
     Raises ValueError when a shape does not fit.
     """
@@ -99,10 +101,11 @@ class RangeImage:
     xyz: np.ndarray | None = None
     completed: Scan | None = None
     confidence: np.ndarray | None = None
+    surface: np.ndarray | None = None
 
     def __post_init__(self):
         shape = (self.sensor.height, self.sensor.width)
-        for name in ("range", "reflectance", "mask", "label", "confidence"):
+        for name in ("range", "reflectance", "mask", "label", "confidence", "surface"):
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} must be {shape}, the sensor's beams and columns, got {value.shape}")

@@ -7,9 +7,11 @@ import math
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.efficient_unet import EfficientUNet
+from lidarsynth.networks.fill_unet import ring
 from lidarsynth.networks.rays import decode_range, encode_range, ground_range, level_sines
 
 ROWS, COLUMNS = 16, 128
@@ -72,11 +74,12 @@ class CoarseUNet(nn.Module):
             coords_encoding=None,
             stem=(2, 2),
         )
+        self.detail = Detail()
         self.register_buffer("standard", torch.stack([torch.zeros(2, BINS), torch.ones(2, BINS)]))
 
     def forward(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         x = torch.cat([x_t, rays], 1).contiguous(memory_format=torch.channels_last)
-        return self.unet(x, log_snr)
+        return self.detail(x_t, rays, self.unet(x, log_snr), log_snr)
 
     def standards(self, standing: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and spread (B, 2, H, W) of range code and of 2 reflectance - 1, at standing elevations (B, H, W)."""
@@ -102,6 +105,34 @@ class CoarseUNet(nn.Module):
         code, reflectance = (x_0[:, :2] * spread + mean).unbind(1)
         returned = x_0[:, 2] > 0
         return decode_range(code) * returned, ((reflectance + 1) / 2).clamp(0, 1) * returned
+
+
+class Detail(nn.Module):
+    """Corrects a velocity (B, 3, H, W) pixel by pixel, where the U-Net sees patches; of no effect before training.
+
+    Told x_t, the rays, the velocity and the x_0 that it means: three convolutions on a ring, modulated by the noise.
+    """
+
+    def __init__(self, channels: int = 32):
+        super().__init__()
+        self.noise = nn.Sequential(nn.Linear(3, 64), nn.SiLU(), nn.Linear(64, 2 * channels + 3))
+        self.first = nn.Conv2d(9 + RAY_CHANNELS, channels, 3, padding=(1, 0))
+        self.second = nn.Conv2d(channels, channels, 3, padding=(1, 0))
+        self.last = nn.Conv2d(channels, 3, 3, padding=(1, 0))
+        for layer in (self.noise[2], self.last):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, x_t: Tensor, rays: Tensor, velocity: Tensor, log_snr: Tensor) -> Tensor:
+        t = torch.sigmoid(-log_snr / 2)
+        x_0 = x_t - t[:, None, None, None] * velocity
+        scale, shift, gate = self.noise(torch.stack([t, log_snr / 8, t * (1 - t)], 1))[..., None, None].split(
+            [self.second.in_channels, self.second.in_channels, 3], 1
+        )
+        h = torch.cat([x_t, velocity, x_0, rays], 1).contiguous(memory_format=torch.channels_last)
+        h = F.silu(self.first(ring(h, 1)) * (1 + scale) + shift)
+        h = h + F.silu(self.second(ring(h, 1)))
+        return velocity + self.last(ring(h, 1)) + gate * x_0
 
 
 def left_filled(values: Tensor, returned: Tensor) -> Tensor:

@@ -50,8 +50,9 @@ class VirtualStreets:
         return draw_sensor(np.random.default_rng((self.seed, index // SHARING, 2)))
 
     def image(self, index: int) -> RangeImage:
-        """(H, W) image of scan `index`, in the sensor of it."""
-        return self._of(index).image(index)
+        """(H, W) image of scan `index`, in the sensor of it, with the surfaces that its rays meet."""
+        perfect, seen = self.pair(index)
+        return replace(seen, surface=perfect.range)
 
     def pair(self, index: int) -> tuple[RangeImage, RangeImage]:
         """`(perfect, seen)` of scan `index`, as `SyntheticStreets.pair`."""

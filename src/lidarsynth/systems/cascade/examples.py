@@ -33,6 +33,7 @@ class Crops(NamedTuple):
     rays: Rays
     metres: Tensor  # (b, 1, H, W), 0 where nothing returned
     reflectance: Tensor  # (b, 1, H, W)
+    classes: Tensor  # (b, 1, H, W) int64, 0 where nobody has said
     seeds: tuple[int, ...]
     samples: int
 
@@ -66,16 +67,17 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
     return CascadeBatch(
-        Crops(Known(*known), rays, truth[0], truth[1], seeds, count),
+        Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
         Grids(*(torch.stack(part) for part in zip(*grids, strict=True))),
     )
 
 
-def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Known, Rays, tuple[Tensor, Tensor]]:
-    """Known pixels, rays, and the truth (metres, reflectance), each (1, 1, 64, 256), of a part of an image.
+def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Known, Rays, tuple[Tensor, ...]]:
+    """Known pixels, rays, and the truth (metres, reflectance, class), each (1, 1, 64, 256), of a part of an image.
 
     A world somewhat larger or smaller, seen in a mirror half of the time, with reflectances of another response; the
-    carrier is unknown at times, and the tilt and the beams' dimness, since users do not know theirs either.
+    carrier is unknown at times, and the tilt and the beams' dimness, since users do not know theirs either. At times
+    all surfaces are known but not which of them return, as in a simulator's scan; or everything is, for the classes.
     """
     sensor, rows = _window(image.sensor, rng)
     columns = (int(rng.integers(sensor.width)) + np.arange(WIDTH)) % sensor.width
@@ -90,23 +92,34 @@ def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Kn
     reflectance, hole = image.reflectance[rows][:, columns], blocked[:, columns]
     metres = np.where(metres < 250, metres, np.float32(0))
     told = pattern(metres.shape, sensor.width, rng, sampled)
-    if rng.random() < 0.4:
+    surface, kind = image.surface, rng.random()
+    perfect = surface is not None and kind < (0.2 if sampled else 0.1)
+    told[:] = ~np.bool_(perfect) & (told | (not sampled and kind > 0.94))
+    if rng.random() < 0.4 and kind <= 0.94:
         told &= metres > 0
     told = told & ~hole if unaware else told | hole
     lit = told & (metres > 0) & (rng.random() >= 0.1)
     if rng.random() < 0.3:
         reflectance = np.minimum(reflectance ** math.exp(rng.normal(0, 0.25)) * rng.uniform(0.6, 1.2), 1)
-    arrays = [metres, reflectance * (metres > 0), told, told & (metres > 0), lit]
+    near, returned = metres, told & (metres > 0)
+    if perfect:
+        assert surface is not None
+        near = surface[rows][:, columns] * np.float32(scale)
+        near = np.where(near < 250, near, np.float32(0))
+        returned = near > 0
+        metres = np.where((metres > 0) & (np.abs(metres - near) < 0.3 + 0.03 * near), near, np.float32(0))
+    label = np.zeros(metres.shape) if image.label is None else image.label[rows][:, columns]
+    arrays = [metres, reflectance * (metres > 0), told, returned, lit & (metres > 0), near, label]
     below = HEIGHT - len(metres)
     full = [np.pad(a, ((0, below), (0, 0)), constant_values=a is told) for a in arrays]
     if rng.random() < 0.5:
         full = [a[:, ::-1] for a in full]
         rays = Rays(*(part.flip(3) for part in rays))
-    r, f, told, returned, lit = (
+    r, f, told, returned, lit, near, label = (
         torch.from_numpy(np.ascontiguousarray(a, a.dtype if a.dtype == bool else np.float32))[None, None] for a in full
     )
     rays = Rays(*(_to_height(part, below) for part in rays))
-    return Known(r * returned, f * lit, told, returned, lit), rays, (r, f)
+    return Known(near * returned, f * lit, told, returned, lit), rays, (r, f, label.long())
 
 
 def _to_height(part: Tensor, below: int) -> Tensor:

@@ -42,7 +42,7 @@ class FillObjective(nn.Module):
     def _sample(self, crops: Crops, n: int) -> Tensor:
         if n == 0:
             return crops.metres[:0, 0, 0, 0]
-        known, rays, metres, reflectance = _part(crops, slice(None, n))
+        known, rays, metres, reflectance, _ = _part(crops, slice(None, n))
         shape = (1, metres.shape[2], metres.shape[3])
         draws = [draw_noise(shape, sample_rng(s, 0, k)) for k in (0, 1) for s in crops.seeds[:n]]
         twice = (type(part)(*(torch.cat([t, t]) for t in part)) for part in (known, rays))
@@ -53,11 +53,14 @@ class FillObjective(nn.Module):
         return energy_score(first, second, truth(metres, reflectance, rays))
 
     def _median(self, crops: Crops, n: int) -> Tensor:
-        known, rays, metres, reflectance = _part(crops, slice(n, None))
+        known, rays, metres, reflectance, classes = _part(crops, slice(n, None))
         noise = metres.new_zeros(len(metres), 3, *metres.shape[2:])
         if not len(metres):
             return metres[:, 0, 0, 0]
-        return absolute_errors(self.network(known, rays, noise), known, rays, metres, reflectance)
+        learns = self.network.classes is not None
+        filled = self.network(known, rays, noise, classify=learns)
+        errors = absolute_errors(filled, known, rays, metres, reflectance)
+        return errors + 0.2 * misnamed(filled, rays, classes) if learns else errors
 
 
 class CoarseObjective(nn.Module):
@@ -77,9 +80,9 @@ class CoarseObjective(nn.Module):
         return {"layout": denoiser.loss(x_0, t, eps, gamma=None)}
 
 
-def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor]:
+def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor, Tensor]:
     known, rays = (type(part)(*(t[chosen] for t in part)) for part in (crops.known, crops.rays))
-    return known, rays, crops.metres[chosen], crops.reflectance[chosen]  # type: ignore[return-value]
+    return known, rays, crops.metres[chosen], crops.reflectance[chosen], crops.classes[chosen]  # type: ignore[return-value]
 
 
 def absolute_errors(filled: Filled, known: Known, rays: Rays, metres: Tensor, reflectance: Tensor) -> Tensor:
@@ -89,11 +92,19 @@ def absolute_errors(filled: Filled, known: Known, rays: Rays, metres: Tensor, re
     """
     inside, returned = rays.inside > 0, metres > 0
     hidden = ~known.told & inside
-    code = _mean((filled.code - encode_range(metres)).abs(), hidden & returned)
-    far = _mean((decode_range(filled.code) - metres).abs(), hidden & returned)
+    sought = hidden & returned & ~known.returned
+    code = _mean((filled.code - encode_range(metres)).abs(), sought)
+    far = _mean((decode_range(filled.code) - metres).abs(), sought)
     shade = _mean((filled.reflectance - reflectance).abs(), ~known.lit & inside & returned)
     drop = _mean(F.binary_cross_entropy_with_logits(filled.logit, returned.float(), reduction="none"), hidden)
-    return 2 * code + 0.1 * far + 2 * shade + 0.5 * drop
+    return 2 * code + 0.1 * far + 4 * shade + 0.5 * drop
+
+
+def misnamed(filled: Filled, rays: Rays, classes: Tensor) -> Tensor:
+    """(b,): cross-entropy of the classes (b, 1, H, W) of all pixels of which somebody has said one."""
+    assert filled.classes is not None
+    entropy = F.cross_entropy(filled.classes, classes[:, 0], reduction="none")[:, None]
+    return _mean(entropy, (classes > 0) & (rays.inside > 0))
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
