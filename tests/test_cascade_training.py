@@ -79,7 +79,8 @@ def test_some_crops_are_of_perfect_scans_and_some_are_wholly_known():
     for known, metres in perfect:
         assert bool(((metres == 0) | known.returned)[~known.told].all())  # nothing returns but from a surface
         assert torch.equal(metres[metres > 0], known.metres[metres > 0]) and not bool(known.lit.any())
-        assert bool((known.returned & (metres == 0)).any()) and bool((metres > 0).any())
+    dropped = torch.stack([(known.returned & (metres == 0)).float().mean() for known, metres in perfect])
+    assert 0.001 < dropped.mean().item() < 0.9
     assert any(bool(known.told.all()) for known, _, _ in crops)
 
 
