@@ -140,5 +140,5 @@ def test_the_example_needs_no_torch(exported: Exported, tmp_path: Path):
     dense = np.load(tmp_path / "dense.npy")
     np.testing.assert_array_equal(dense[: len(scan), :3], scan.xyz)
     assert dense.shape[1] == 5 and len(dense) > len(scan)
-    filled = cascade().complete(scan)
+    filled = cascade().into(SENSOR).complete(scan)
     assert abs(len(dense) - len(filled.to_scan())) < 0.1 * len(filled.to_scan())

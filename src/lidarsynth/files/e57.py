@@ -55,4 +55,5 @@ def _fields(file) -> Fields:
     if "cartesianX" not in found:
         raise FileError(f"expected cartesian points, found {', '.join(found)}")
     valid = found.pop(INVALID, np.zeros(count)) == 0
-    return {OURS.get(name, name): values[valid] for name, values in found.items() if values.dtype.kind in "fiu"}
+    numeric = {str(name): values[valid] for name, values in found.items() if values.dtype.kind in "fiu"}
+    return {OURS.get(name, name): values for name, values in numeric.items()}
