@@ -1,6 +1,7 @@
 """What a model for any sensor does with other sensors' scans: errors, phantoms, the shadow of KITTI's car, VLP-16 x 4.
 
 python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of real scans, against the best interpolation
+    --returned: hidden pixels where the truth returned alone, empty ones in the result counting as 0 m
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
 python benchmarks/any_sensor.py dense [--sensor vlp-16]   held-out streets in four times as many beams
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 import lidarsynth as ls
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.streets import hdl64e
 from lidarsynth.streets.reader import SyntheticStreets
 
 RIVALS = ("nearest", "bilinear", "bicubic")
@@ -53,20 +54,21 @@ def completed(word: str, image: RangeImage, known: np.ndarray) -> RangeImage:
     return model.complete(image.keep(known), known)
 
 
-def mean_errors(filled: RangeImage, image: RangeImage, known: np.ndarray) -> np.ndarray:
-    """(2,) metres and reflectance, over hidden pixels; empty ones count as 0."""
+def mean_errors(filled: RangeImage, image: RangeImage, hidden: np.ndarray) -> np.ndarray:
+    """(2,) metres and reflectance, over `hidden` (H, W) bool; empty ones count as 0."""
     pairs = ((filled.range, image.range), (filled.reflectance, image.reflectance))
-    return np.array([np.abs(a - b)[~known].mean() for a, b in pairs])
+    return np.array([np.abs(a - b)[hidden].mean() for a, b in pairs])
 
 
-def errors(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+def errors(paths: Sequence[Path], models: Sequence[str], returned: bool = False) -> Iterator[str]:
     """Metres / reflectance of each, and of the last model against the best of the interpolations."""
     yield "| scan, beams kept | " + " | ".join((*RIVALS, *models)) + " | against the best |"
     yield "|---" * (len(RIVALS) + len(models) + 2) + "|"
     for image, name in ((own_image(path), path.name) for path in paths):
         for step in (2, 4):
             known = every(image, step)
-            cells = [mean_errors(completed(word, image, known), image, known) for word in (*RIVALS, *models)]
+            hidden = ~known & (image.mask | (not returned))
+            cells = [mean_errors(completed(word, image, known), image, hidden) for word in (*RIVALS, *models)]
             gain = 100 * (cells[-1] / np.min(cells[: len(RIVALS)], 0) - 1)
             shown = " | ".join(f"{a:.3f} / {b:.4f}" for a, b in cells)
             yield f"| {name} 1/{step} | {shown} | {gain[0]:+.0f} %, {gain[1]:+.0f} % |"
@@ -92,7 +94,7 @@ def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
 def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
     """Of unknown pixels that KITTI's car would hide, and of others of the same beams: the share that stays empty."""
     kitti = ls.get_sensor("hdl-64e-kitti")
-    mask, elevations = hidden(kitti), np.asarray(kitti.elevations)
+    mask, elevations = hdl64e.hidden(kitti), np.asarray(kitti.elevations)
     yield "| scan | model | empty where KITTI's car stands | truly so | elsewhere in these beams | truly so |"
     yield "|---" * 6 + "|"
     for image, name in ((own_image(path), path.name) for path in paths):
@@ -114,7 +116,7 @@ def dense(name: str, models: Sequence[str], count: int = 24) -> Iterator[str]:
     for image in (reader.image(16 * i + 5) for i in range(count)):
         known = every(image, 4)
         for word, total in totals.items():
-            total += mean_errors(completed(word, image, known), image, known) / count
+            total += mean_errors(completed(word, image, known), image, ~known) / count
     yield f"| {name} x 4, {count} held-out streets | range (m) | reflectance |"
     yield "|---|---|---|"
     yield from (f"| {word} | {a:.3f} | {b:.4f} |" for word, (a, b) in totals.items())
@@ -133,7 +135,9 @@ def main() -> None:
     parser.add_argument("scans", nargs="*", type=Path)
     parser.add_argument("--models", nargs="+", default=["default"])
     parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--returned", action="store_true")
     args = parser.parse_args()
+    REPORTS["errors"] = partial(errors, returned=args.returned)
     lines = dense(args.sensor, args.models) if args.what == "dense" else REPORTS[args.what](args.scans, args.models)
     for line in lines:
         print(line, flush=True)

@@ -20,7 +20,7 @@ def assert_net(actual: Tensor, expected: Tensor) -> None:
 
 
 @pytest.fixture
-def reference(fixture_tensors):
+def trajectories(fixture_tensors):
     return fixture_tensors("lidargen/langevin")
 
 
@@ -44,17 +44,19 @@ def sequence(noise: Tensor):
     return lambda x: next(draws)
 
 
-def test_the_levels_of_ve_are_lidargens(reference):
+def test_the_levels_of_ve_are_lidargens(trajectories):
     _, _, sigma = ve().at(torch.linspace(1, 0, 232), torch.zeros(232, 1))
-    torch.testing.assert_close(sigma[:, 0], reference["sigmas_full"], atol=0, rtol=5e-6)
+    torch.testing.assert_close(sigma[:, 0], trajectories["sigmas_full"], atol=0, rtol=5e-6)
 
 
 @pytest.mark.parametrize("level", [0, 100, 231])
-def test_one_step_equals_the_reference(reference, level):
-    sigma = reference["sigmas_full"][level].item()
-    fixed = Denoiser(lambda x, log_snr: reference["score"], ve(1e-9, sigma) if sigma > 1 else at(sigma), "score", False)
-    step = next(langevin(fixed, reference["x"], lambda x: reference["noise"]))
-    assert_net(step.x_s, reference[f"one_step.level{level}"])
+def test_one_step_equals_the_reference(trajectories, level):
+    sigma = trajectories["sigmas_full"][level].item()
+    fixed = Denoiser(
+        lambda x, log_snr: trajectories["score"], ve(1e-9, sigma) if sigma > 1 else at(sigma), "score", False
+    )
+    step = next(langevin(fixed, trajectories["x"], lambda x: trajectories["noise"]))
+    assert_net(step.x_s, trajectories[f"one_step.level{level}"])
 
 
 def at(sigma: float):
@@ -63,20 +65,20 @@ def at(sigma: float):
     return type(whole)(lambda t: whole.log_snr(t) - 2 * math.log(sigma), whole.t, whole.alpha_sigma)
 
 
-def test_the_chain_equals_the_reference(reference, denoiser, numbers):
-    states = [*langevin(denoiser, reference["chain.init"], sequence(reference["chain.noise"]), **numbers)]
-    expected = reference["chain.states_then_denoised"]
+def test_the_chain_equals_the_reference(trajectories, denoiser, numbers):
+    states = [*langevin(denoiser, trajectories["chain.init"], sequence(trajectories["chain.noise"]), **numbers)]
+    expected = trajectories["chain.states_then_denoised"]
     assert len(states) == len(expected) == evaluations(numbers["levels"], numbers["steps"])
     for state, image in zip(states, expected, strict=True):
         assert_net(state.x_s, image)
 
 
-def test_densification_equals_the_reference(reference, denoiser, numbers):
-    known, mask = reference["densify.reference"], torch.zeros(2, 1, 64, 32)
+def test_densification_equals_the_reference(trajectories, denoiser, numbers):
+    known, mask = trajectories["densify.reference"], torch.zeros(2, 1, 64, 32)
     mask[:, :, ::4] = 1
-    noise = sequence(reference["densify.noise"])
-    states = [*langevin_posterior(denoiser, reference["chain.init"], known, mask, noise, **numbers)]
-    expected = reference["densify.states_denoised_final"]
+    noise = sequence(trajectories["densify.noise"])
+    states = [*langevin_posterior(denoiser, trajectories["chain.init"], known, mask, noise, **numbers)]
+    expected = trajectories["densify.states_denoised_final"]
     for state, image in zip(states, expected, strict=True):
         assert_net(state.x_s, image)
     torch.testing.assert_close(states[-1].x_s[:, :, ::4], known[:, :, ::4], atol=1e-6, rtol=0)

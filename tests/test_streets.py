@@ -177,7 +177,7 @@ def test_density_does_what_it_says():
     kinds = set(bare.things["kind"])
     assert not kinds & {"person", "tree", "bush", "thicket"}
     assert len(bare.things) < len(base.things)
-    with pytest.raises(ValueError, match="expected traffic as a factor"):
+    with pytest.raises(ValueError, match=r"expected traffic of 0 to 100, found -1"):
         Density(traffic=-1).of(None)  # type: ignore[arg-type]
 
 

@@ -40,9 +40,8 @@ BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
 # Of the noise that training draws: its energy scores leave samples rougher than streets are. Chosen by street-2 among
-# 0.25, 0.4 and 1 on grids of true streets (docs/training-default.md).
+# 0.25, 0.4 and 1 on grids of true streets, and right for realise on streets too (docs/training-default.md).
 GRAIN = 0.4
-REALISED = 0.7  # likewise, of realise: chosen among 0.4, 0.7 and 1 on six real training scans (docs/simulation.md)
 
 
 @dataclass(frozen=True, repr=False)
@@ -317,7 +316,7 @@ class CascadeModel(ScanModel):
         """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         told = known | (self._blocked & ~image.mask)
         pixels = known_of(image.range[None], image.reflectance[None], told[None], True, padded(self.sensor))
-        filled, rays = self._network(pixels, None, 0, doubt=True)
+        filled, rays = self._network(pixels, None, doubt=True)
         return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
 
     def _fill(
@@ -339,8 +338,7 @@ class CascadeModel(ScanModel):
         surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
-        grain = GRAIN if surely is None else REALISED
-        filled, rays = self._network(known, rng, grain, doubt=weights is not None, classify=self.labelled)
+        filled, rays = self._network(known, rng, doubt=weights is not None, classify=self.labelled)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
@@ -354,16 +352,15 @@ class CascadeModel(ScanModel):
         self,
         known: Known,
         rng: list[torch.Generator] | None,
-        grain: float,
         doubt: bool = False,
         classify: bool = False,
     ) -> tuple[Filled, Rays]:
-        """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told; `grain` of a unit of noise."""
+        """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
-            noise = grain * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
+            noise = GRAIN * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
