@@ -115,12 +115,14 @@ class Detail(nn.Module):
 
     def __init__(self, channels: int = 32):
         super().__init__()
-        self.noise = nn.Sequential(nn.Linear(3, 64), nn.SiLU(), nn.Linear(64, 2 * channels + 3))
+        modulation = nn.Linear(64, 2 * channels + 3)
+        self.noise = nn.Sequential(nn.Linear(3, 64), nn.SiLU(), modulation)
         self.first = nn.Conv2d(9 + RAY_CHANNELS, channels, 3, padding=(1, 0))
         self.second = nn.Conv2d(channels, channels, 3, padding=(1, 0))
         self.last = nn.Conv2d(channels, 3, 3, padding=(1, 0))
-        for layer in (self.noise[2], self.last):
+        for layer in (modulation, self.last):
             nn.init.zeros_(layer.weight)
+            assert layer.bias is not None
             nn.init.zeros_(layer.bias)
 
     def forward(self, x_t: Tensor, rays: Tensor, velocity: Tensor, log_snr: Tensor) -> Tensor:
