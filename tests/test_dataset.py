@@ -477,3 +477,12 @@ def test_a_range_that_does_not_fit_is_refused():
     far = RangeImage(*(np.full((8, 32), v, np.float32) for v in (140.0, 0.5)), np.ones((8, 32), bool), SENSOR)
     with pytest.raises(ValueError, match=r"expected ranges up to 131.07 m, found 140"):
         cache.pack(far)
+
+
+@pytest.mark.parametrize("step", ["2 mm", True, 0.0, -0.002, 7.0])
+def test_an_index_with_a_step_that_is_none_is_refused(tmp_path: Path, step: object):
+    list(write_cache(tmp_path, image, 1, SENSOR, WHAT))
+    index = json.loads((tmp_path / "index.json").read_text()) | {"step": step}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    with pytest.raises(ValueError, match=r"expected a step of 0 to 1 m, found"):
+        CachedImages(tmp_path)

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.index import close_index, open_index, resumable_file, stored_step, write_index
+from lidarsynth.data.index import RANGE_STEP, close_index, open_index, resumable_file, stored_step, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 
-RANGE_STEP = 0.002  # metres per unit of the stored uint16, 0 = nothing returned; of sensors that see beyond 131 m more
 NO_LABEL = 255  # in every pixel of an image without labels
 SHARD = 64  # images per shard
 INDEX_EVERY = 2.0  # seconds between two writings of the index: what a kill can cost

@@ -12,6 +12,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import sweep, whole_file
 
+RANGE_STEP = 0.002  # metres per unit of the stored uint16, 0 = nothing returned; of sensors that see beyond 131 m more
 INDEX, REPORT = "index.json", "report.json"
 PLACE = ("root", "missing")  # of a source: where it lies on this disk, not what it is
 
@@ -37,10 +38,9 @@ def _check(index: Any, path: Path) -> None:
     for key, kind in KINDS.items():
         if type(index[key]) is not kind:
             raise ValueError(f"{path}: expected {key} as {kind.__name__}, found {index[key]!r:.60}")
-    if isinstance(index.get("step", 0.002), bool) or not isinstance(index.get("step", 0.002), (int, float)):
-        raise ValueError(f"{path}: expected step in metres, found {index['step']!r:.60}")
-    if not 0 < index.get("step", 0.002) < 1:
-        raise ValueError(f"{path}: expected a step of 0 to 1 m, found {index['step']}")
+    step = index.get("step", RANGE_STEP)
+    if type(step) is not float or not 0 < step < 1:
+        raise ValueError(f"{path}: expected a step of 0 to 1 m, found {step!r:.60}")
     if not isinstance(index["source"].get("name", ""), str) or not isinstance(index["source"].get("missing", []), list):
         raise ValueError(f"{path}: expected a source with a name, found {index['source']!r:.60}")
     for name, shard in index["shards"].items():
@@ -60,7 +60,7 @@ def _words(row: Any, size: int) -> bool:
 
 def stored_step(index: dict[str, Any]) -> float:
     """Metres per unit of the ranges of a cache; 2 mm where its index is older than this field."""
-    return float(index.get("step", 0.002))
+    return index.get("step", RANGE_STEP)
 
 
 def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int, step: float) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.evaluation.protocol import Clouds
-from lidarsynth.files.arrays import image_of, unzip
+from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import MAX_BYTES
 from lidarsynth.files.formats import READERS, holds_image, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
@@ -132,7 +131,7 @@ def _numbers(path: Path) -> Sequence[int | None]:
             version = np.lib.format.read_magic(file)
             read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
             shape = read_header[version](file)[0]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error):
+    except ZIP_ERRORS:
         return [None]  # something else, or damaged: reading it says so
     return range(shape[0]) if len(shape) == 3 else [None]
 

@@ -39,7 +39,7 @@ SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
-# Of the noise that training draws: its energy scores leave samples rougher than streets are. Chosen by street-2 among
+# Of the noise that training draws: its energy scores leave samples rougher than streets are. Chosen by street-1 among
 # 0.25, 0.4 and 1 on grids of true streets, and right for realise on streets too (docs/training-default.md).
 GRAIN = 0.4
 
