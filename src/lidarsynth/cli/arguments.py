@@ -10,8 +10,7 @@ import tyro
 
 arg = tyro.conf.arg
 Positional = tyro.conf.Positional
-Format = Literal["ply", "pcd", "bin", "npy", "npz"]
-Sampler = Literal["ddpm", "ddim", "dpmpp-2m", "heun", "langevin"]
+# Words that a table of the library lists are plain text here: the library refuses a wrong one, and lists the others.
 Count = Annotated[int, arg(aliases=["-n"], help="how many scans.")]
 From = Annotated[str | None, arg(name="from")]
 Source = Annotated[
@@ -25,12 +24,18 @@ Precision = Annotated[
 ]
 Device = Annotated[str, arg(help="cpu, or cuda for a GPU.")]
 Method = Annotated[
-    Literal["auto", "conditional", "sample", "repaint", "posterior", "inversion", "network", "monte-carlo"],
+    str,
     arg(
+        metavar="METHOD",
         help="conditional tells the network what is known, and errs least; sample, of a cascade, is one of many "
         "possible scans, with the grain of a recorded one; repaint and LiDARGen's posterior need no such network, "
-        "and take minutes; inversion is that of GANs; LiDAR-SR has network, one pass, and monte-carlo, many."
+        "and take minutes; inversion is that of GANs; LiDAR-SR has network, one pass, and monte-carlo, many.",
     ),
+]
+Format = Annotated[str, arg(metavar="FORMAT", help="of the files: ply, pcd, bin, npy or npz.")]
+Sampler = Annotated[
+    str | None,
+    arg(metavar="SAMPLER", help="such as ddpm, ddim, dpmpp-2m, heun; a wrong word lists all; default the model's."),
 ]
 GenerationSteps = Annotated[
     int | None, arg(metavar="INT", help="of the sampler, per scan; default 16 of a cascade, 32, or 1161 of langevin.")

@@ -12,12 +12,12 @@ MOST = 10_000_000  # synthetic scans of one cache; more fit on no disk
 
 
 def data(
-    source: Positional[Literal["synthetic", "files", "kitti", "kitti360", "nuscenes", "nuscenes-sweeps"]],
+    source: Positional[str],
     root: Positional[Path],
     cache: Positional[Path | None] = None,
     split: str | None = None,
     sensor: str | None = None,
-    projection: Literal["auto", "spherical", "unfolding"] | None = None,
+    projection: str | None = None,
     width: int | None = None,
     workers: int | None = None,
     count: Count = 1000,
@@ -29,13 +29,13 @@ def data(
     """Prepare a cache of range images for training; killed at any moment, the same command goes on.
 
     Args:
-        source: synthetic streets, a folder of scan files, or a data set.
+        source: synthetic, files of a folder, or a data set such as kitti, kitti360, nuscenes; a wrong word lists all.
         root: where the files are; the cache itself for synthetic streets.
         cache: folder to write.
         split: train, val, test or all; of nuscenes mini, trainval or test.
         sensor: whose images: hdl-64e, ... or a .toml/.json file. This, projection and width have defaults by source;
             the sensor of files is recognised from the first.
-        projection: how points become rows.
+        projection: how points become rows: auto, spherical or unfolding.
         width: columns; below 1024 they are chosen from 1024, or 2048 when unfolding, as in R2DM.
         workers: processes, one per processor core if not given.
         count: synthetic scans.

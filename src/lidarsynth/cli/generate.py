@@ -13,11 +13,11 @@ def generate(
     count: Count = 4,
     out: Annotated[Path, arg(help="folder to write to.")] = Path("out"),
     model: Source = "default",
-    format: Annotated[Format, arg(help="of the files.")] = "ply",
+    format: Format = "ply",
     sensor: Annotated[SensorWord, arg(help="of the scans, for a model of any sensor; default the model's.")] = None,
     labels: Annotated[bool, arg(help="the class of each point too: as a field, and SemanticKITTI's .label.")] = False,
     steps: GenerationSteps = None,
-    sampler: Annotated[Sampler | None, arg(help="of the reverse process; default the model's.")] = None,
+    sampler: Sampler = None,
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one, as fast.")] = 4,
     device: Device = "cpu",
@@ -26,17 +26,17 @@ def generate(
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.generation import LABEL, batches, claim, generate_into
+    from lidarsynth.verbs.generation import batches, claim, endings_of, generate_into
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
     at_least(0, {"seed": seed})
+    endings = endings_of(format, labels, picture)
     loaded = load_with_bar(model, device)
     loaded = loaded.into(sensor) if sensor else loaded
     loaded = loaded.with_labels() if labels else loaded
     steps = loaded.generation_steps(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
     settings |= {"labels": True} if labels else {}
-    endings = (f".{format}", *([LABEL] if labels else []), *([".png"] if picture else []))
     with only_writer(out, "generation"):
         claim(out, settings)
         runs = batches(out, count, endings, loaded.at_once(batch_size))

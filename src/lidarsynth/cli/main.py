@@ -1,44 +1,25 @@
-"""The command line: one table word -> verb. Heavy imports are inside the verbs, so that --help is instant."""
+"""The command line: a verb is a file of this folder that holds a function of the file's name. Nothing lists them."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from types import FunctionType
 
 from lidarsynth.cli.arguments import fields_joined
-from lidarsynth.cli.benchmark import benchmark
-from lidarsynth.cli.complete import complete
-from lidarsynth.cli.data import data
-from lidarsynth.cli.demo import demo
-from lidarsynth.cli.evaluate import evaluate
-from lidarsynth.cli.export import export
-from lidarsynth.cli.generate import generate
-from lidarsynth.cli.info import info
-from lidarsynth.cli.project import project
-from lidarsynth.cli.realise import realise
-from lidarsynth.cli.sensor import sensor
-from lidarsynth.cli.streets import streets
 from lidarsynth.cli.terminal import answer, say
-from lidarsynth.cli.train import train
-from lidarsynth.cli.upsample import upsample
-from lidarsynth.cli.view import view
 
-VERBS = {
-    "demo": demo,
-    "generate": generate,
-    "complete": complete,
-    "upsample": upsample,
-    "realise": realise,
-    "project": project,
-    "view": view,
-    "sensor": sensor,
-    "data": data,
-    "streets": streets,
-    "train": train,
-    "evaluate": evaluate,
-    "benchmark": benchmark,
-    "export": export,
-    "info": info,
-}
+
+def _verbs() -> dict[str, Callable[..., None]]:
+    """Word -> verb, by the alphabet. Heavy imports are inside the verbs, so that --help is instant."""
+    words = sorted(path.stem for path in Path(__file__).parent.glob("[a-z]*.py") if path.stem != "main")
+    held = {word: vars(import_module(f"lidarsynth.cli.{word}")).get(word) for word in words}
+    return {word: verb for word, verb in held.items() if isinstance(verb, FunctionType)}
+
+
+VERBS = _verbs()
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-from lidarsynth.cli.arguments import Format, arg
+from lidarsynth.cli.arguments import arg
 from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
 
 if TYPE_CHECKING:
@@ -38,7 +38,10 @@ class Many:
         float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0, where that is the ground.")
     ] = None
     strict: Annotated[bool, arg(help="refuse points that are not in the sensor's frame, instead of a warning.")] = False
-    format: Annotated[Format | None, arg(help="of files in a folder; default ply, of project npz.")] = None
+    format: Annotated[
+        str | None,
+        arg(metavar="FORMAT", help="of files in a folder: ply, pcd, bin, npy or npz; default ply, of project npz."),
+    ] = None
     workers: Annotated[int, arg(help="processes.")] = 1
     skip_existing: Annotated[bool, arg(help="leave out scans whose file is there: goes on where it was.")] = False
     shard: Annotated[str | None, arg(metavar="I/N", help="only every N-th scan, from the I-th: one of N machines.")] = (

@@ -6,14 +6,12 @@ import codecs
 import errno
 import io
 import os
-import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr
-from functools import partial, wraps
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, NoReturn
 
-import tyro
+from lidarsynth.cli.parsing import parsed
 
 if TYPE_CHECKING:
     from lidarsynth.systems.scan_model import ScanModel
@@ -154,7 +152,7 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)  # the help of a narrower terminal would never be laid out
     try:
-        _parsed(verbs, argv)()
+        parsed(verbs, sys.argv[1:] if argv is None else argv)()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         sys.exit(UNHEARD)
@@ -171,38 +169,6 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise  # a fault of ours
         _refuse(f"expected enough memory, found too little: {error}".partition("\n")[0])
-
-
-def _parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> Callable[[], None]:
-    """The verb with its arguments, not yet run; tyro's box of complaints becomes one line.
-
-    Only the verb that is named is given to tyro, which takes as long as there are verbs to describe.
-    """
-    box = io.StringIO()
-    try:
-        with redirect_stderr(box):
-            if argv and argv[0] in verbs:
-                return tyro.cli(_later(verbs[argv[0]]), prog=f"lidarsynth {argv[0]}", args=argv[1:])
-            return tyro.extras.subcommand_cli_from_dict(
-                {name: _later(verb) for name, verb in verbs.items()},
-                prog="lidarsynth",
-                description="Generate, complete and judge LiDAR scans.",
-                args=argv or ["--help"],
-            )
-    except SystemExit as end:
-        if end.code:
-            lines = [line.strip(" \u2502") for line in box.getvalue().splitlines() if line[:1] not in "\u256d\u2570"]
-            text = " ".join(line for line in lines if line.strip("\u2500-"))
-            _refuse(re.split("Argument helptext:|For full helptext", text)[0])
-        raise
-
-
-def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    @wraps(verb)
-    def _with_arguments(*args, **kwargs):
-        return partial(verb, *args, **kwargs)
-
-    return _with_arguments
 
 
 def _sayable(error: UnicodeError) -> tuple[str, int]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.files.formats import write, write_labels
+from lidarsynth.files.formats import WRITERS, write, write_labels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep, write_whole
@@ -21,6 +21,14 @@ from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 RECORD = "generate.json"
 LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
+
+
+def endings_of(format: str, labels: bool, picture: bool) -> tuple[str, ...]:
+    """Of a finished scan's files, such as (".ply", ".png"). Raises ValueError for a format that is not written."""
+    if f".{format}" not in WRITERS:
+        words = ", ".join(ending.removeprefix(".") for ending in WRITERS)
+        raise ValueError(f"expected a format of {words}, found {format!r}")
+    return (f".{format}", *([LABEL] if labels else []), *([".png"] if picture else []))
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:

@@ -1,0 +1,84 @@
+"""The words of a command line become a verb with its arguments; what does not fit becomes a line of ours."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from difflib import get_close_matches
+from functools import partial, wraps
+from typing import TYPE_CHECKING, NoReturn
+
+import tyro
+
+if TYPE_CHECKING:
+    from tyro import _errors as events
+else:
+    try:  # what a refusal is about, as types and fields; tyro may move it some day: then its own text is printed
+        from tyro import _errors as events
+    except ImportError:
+        events = None
+
+
+def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callable[[], None]:
+    """The verb with its arguments, not yet run.
+
+    Only the verb that is named is given to tyro, which takes as long as there are verbs to describe.
+
+    Raises ValueError that says what was expected and what was found, SystemExit where help was asked for.
+    """
+    word = argv[0] if argv else "--help"
+    if word in verbs:
+        with _refusals(f"--{name.replace('_', '-')}" for name in inspect.signature(verbs[word]).parameters):
+            return tyro.cli(_later(verbs[word]), prog=f"lidarsynth {word}", args=argv[1:])
+    if not word.startswith("-"):
+        raise ValueError(f"expected a verb of {', '.join(verbs)}, found {word!r}{_meant(word, verbs)}")
+    with _refusals(()):
+        return tyro.extras.subcommand_cli_from_dict(
+            {name: _later(verb) for name, verb in verbs.items()},
+            prog="lidarsynth",
+            description="Generate, complete and judge LiDAR scans.",
+            args=argv or ["--help"],
+        )
+
+
+def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    @wraps(verb)
+    def _with_arguments(*args, **kwargs):
+        return partial(verb, *args, **kwargs)
+
+    return _with_arguments
+
+
+def _refusals(options: Iterable[str]) -> AbstractContextManager[None]:
+    """While it is open, what tyro would complain of in a box is a ValueError of one line."""
+    return nullcontext() if events is None else events.on_parse_error(partial(_refuse, list(options)))
+
+
+def _refuse(options: list[str], event: events.ParseErrorEvent) -> NoReturn:
+    raise ValueError(f"{event.prog}: {_said(options, event)}") from None
+
+
+def _said(options: list[str], event: events.ParseErrorEvent) -> str:
+    """What was expected and what was found."""
+    if isinstance(event, events.MissingArgs):
+        names = ", ".join(missing.arg.display_name() for missing in event.missing_arguments)
+        return f"expected {names}, found {' '.join(event.unrecognized_tokens) or 'none'}"
+    if isinstance(event, events.UnrecognizedArgs):
+        return f"expected one of its options, found {' '.join(event.tokens)}{_meant(event.tokens[0], options)}"
+    if isinstance(event, events.InvalidChoice):
+        choices = ", ".join(choice for choice in event.choices if choice != "None")
+        name = event.argument.display_name()
+        return f"expected {name} of {choices}, found {event.value!r}{_meant(event.value, event.choices)}"
+    if isinstance(event, events.BadValue):
+        return f"expected a value of {event.argument.display_name()}, found {event.offending_value or 'none'}"
+    if isinstance(event, events.InstantiationFailure):
+        name = "its arguments" if event.argument is None else event.argument.display_name()
+        return f"expected {name} as --help says, found: {event.message}"
+    return f"expected what --help says, found {type(event).__name__}"
+
+
+def _meant(found: str, words: Iterable[str]) -> str:
+    """The word that was probably meant, as a question."""
+    near = get_close_matches(found, list(words), n=1)
+    return f"; was {near[0]} meant?" if near else ""
