@@ -55,7 +55,7 @@ def complete(
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
-    how = Filling(method, steps, resamples, seed=seed)
+    how = Filling(method, steps, resamples, seed=seed, precision=precision)
     job = Job(
         "complete",
         model,
@@ -66,7 +66,6 @@ def complete(
         picture=picture,
         least=min_confidence,
         labels=labels,
-        precision=precision,
     )
     results = [result for result in work_through(job, scans, out, many, intensity) if result.errors]
     if len(results) <= PICTURES:

@@ -82,7 +82,7 @@ def _model(job: Job) -> ScanModel | None:
         model.check_realises()
         return model
     model.resolved(job.how)
-    model.at_precision(job.precision)
+    model.at_precision(job.how.precision or "fp32")
     check_confident(model, job.how, job.least)
     return model.with_labels() if job.labels else model
 

@@ -56,7 +56,7 @@ def upsample(
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
-    how = Filling(method, steps, resamples, seed=seed)
+    how = Filling(method, steps, resamples, seed=seed, precision=precision)
     job = Job(
         "upsample",
         model,
@@ -68,6 +68,5 @@ def upsample(
         picture=picture,
         least=min_confidence,
         labels=labels,
-        precision=precision,
     )
     work_through(job, scans, out, many, intensity)

@@ -14,6 +14,7 @@ class Filling:
     resamples  passes over each step of repaint
     sampler    a word of the system
     seed       of all randomness
+    precision  auto, fp32 or bf16, as `ScanModel.at_precision` says; None = what the model is at
 
     A system's `resolved` says what becomes of it, and raises ValueError for what the system would have to ignore.
     """
@@ -23,6 +24,7 @@ class Filling:
     resamples: int | None = None
     sampler: str | None = None
     seed: int = 0
+    precision: str | None = None
 
     def at_least_one(self) -> Filling:
         """The same. Raises ValueError for counts below 1."""

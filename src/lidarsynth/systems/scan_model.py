@@ -123,18 +123,20 @@ class ScanModel(ABC):
         sampler: str | None = None,
         seed: int = 0,
         on_step: OnStep = None,
+        precision: str | None = None,
     ) -> RangeImage:
         """Fill what was not measured; what was comes back exactly.
 
         scan       points, as a scan or an array (N, 3) x y z or (N, 4) x y z reflectance; or an image of this sensor
         known      (H, W) bool: pixels to keep bit by bit, where an empty pixel means that nothing returned. None =
                    those measured, and of points also rays that only have some beyond the range limits
-        method, steps, resamples, sampler  as `Filling` says; which words and defaults, the class of the model says
+        method, steps, resamples, sampler, precision  as `Filling` says; which words and defaults, the class of the
+                   model says
 
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
         """
-        return self.filled(scan, Filling(method, steps, resamples, sampler, seed), known, on_step)
+        return self.filled(scan, Filling(method, steps, resamples, sampler, seed, precision), known, on_step)
 
     def complete_all(
         self,
@@ -156,6 +158,7 @@ class ScanModel(ABC):
         on_step: OnStep = None,
         resamples: int | None = None,
         sampler: str | None = None,
+        precision: str | None = None,
     ) -> RangeImage:
         """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor; else as `complete`.
 
@@ -164,7 +167,7 @@ class ScanModel(ABC):
 
         Raises ValueError when the sensor is not recognised or sees nothing that the model does.
         """
-        return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed), sensor_in, on_step)
+        return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed, precision), sensor_in, on_step)
 
     def realise(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
         """A simulator's scan, in which every ray returns, as the real sensor would have reported it.
@@ -203,8 +206,10 @@ class ScanModel(ABC):
     ) -> RangeImage:
         """`complete` of a record."""
         scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
-        if isinstance(scan, Scan) and (model := self.suited_to(scan)) is not self:
-            return model.filled(scan, how, known, on_step)
+        model = self if how.precision is None else self.at_precision(how.precision)
+        model = model.suited_to(scan) if isinstance(scan, Scan) else model
+        if model is not self:
+            return model.filled(scan, replace(how, precision=None), known, on_step)
         how, image = self.resolved(how), self.image_of(scan)
         if known is not None or isinstance(scan, RangeImage):
             return self.fill(image, known_pixels(image, known), how, on_step)
@@ -226,6 +231,8 @@ class ScanModel(ABC):
         if times is not None:
             raise ValueError(f"{self.experiment.name}: expected a model such as default for {times} times as many "
                              f"beams, found one with images of {self.sensor.name}")  # fmt: skip
+        if how.precision is not None:
+            return self.at_precision(how.precision).upsampled(scan, replace(how, precision=None), sensor_in, on_step)
         scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
         how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
         sparse, known = sparse_image(scan, sensor_in, self.sensor)

@@ -48,7 +48,6 @@ class Job:
     strict     refuse scans that are not in their sensor's frame
     picture    a .png beside each file
     labels     classes of the points too, of complete and upsample
-    precision  auto, fp32 or bf16, of complete and upsample
     """
 
     verb: str
@@ -66,7 +65,6 @@ class Job:
     strict: bool = False
     picture: bool = True
     labels: bool = False
-    precision: str = "fp32"
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> C
             from lidarsynth.weights.load import load
 
             model = load(job.model, device=job.device)
-        model = (model.into(job.into) if job.into else model).at_precision(job.precision)
+        model = model.into(job.into) if job.into else model
         model = model.with_labels() if job.labels else model
     return partial(_one, job, model, on_step)
 

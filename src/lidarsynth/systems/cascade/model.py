@@ -186,6 +186,7 @@ class CascadeModel(ScanModel):
         on_step: OnStep = None,
         resamples: int | None = None,
         sampler: str | None = None,
+        precision: str | None = None,
         times: int | None = None,
     ) -> RangeImage:
         """A scan with `times` - 1 (default 3) new beams between each two of its own sensor's, whose rays stay.
@@ -194,7 +195,8 @@ class CascadeModel(ScanModel):
 
         sensor_in  the sensor that made the scan; None = recognised from the points
         """
-        return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed), sensor_in, on_step, times)
+        how = Filling(method, steps, resamples, sampler, seed, precision)
+        return self.upsampled(scan, how, sensor_in, on_step, times)
 
     def upsampled(
         self,
@@ -209,6 +211,9 @@ class CascadeModel(ScanModel):
             if times is not None:
                 raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
             return super().upsampled(scan, how, sensor_in, on_step)
+        if how.precision is not None:
+            model = self.at_precision(how.precision)
+            return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
         scan, times = scan_of(scan) if isinstance(scan, np.ndarray) else scan, TIMES if times is None else times
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
