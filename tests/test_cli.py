@@ -16,8 +16,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from broken import BROKEN
+from forked import Forked
 from networks import trained
 
+from lidarsynth.cli import parsing
 from lidarsynth.cli.main import VERBS, main
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
@@ -91,14 +93,6 @@ def refused(answer: Answer, *words: str) -> None:
         assert word in answer.err
 
 
-def started(*words: object, **options) -> subprocess.Popen[str]:
-    """The command line in a process of its own."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "lidarsynth", *map(str, words)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
-    return subprocess.Popen(command, env=environment, **pipes)
-
-
 # generate
 
 
@@ -136,7 +130,7 @@ def test_generate_makes_only_what_lacks(run: Run, tiny: Path, tmp_path: Path):
 
 def test_killed_in_the_middle_the_same_command_goes_on(run: Run, tiny: Path, tmp_path: Path):
     words = ("generate", "-n", 6, "--model", tiny, "--steps", 3, "--out")
-    process = started(*words, tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = Forked(*words, tmp_path / "killed")
     while process.poll() is None and not (tmp_path / "killed" / "000001.ply").exists():
         time.sleep(0.002)
     process.send_signal(signal.SIGKILL)
@@ -156,7 +150,7 @@ def test_killed_in_the_middle_the_same_command_goes_on(run: Run, tiny: Path, tmp
 
 def test_ctrl_c_is_one_line(tiny: Path, tmp_path: Path):
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit "ignored"
-    process = started("generate", "-n", 100000, "--model", tiny, "--steps", 2, "--out", tmp_path, "--no-picture")
+    process = Forked("generate", "-n", 100000, "--model", tiny, "--steps", 2, "--out", tmp_path, "--no-picture")
     while process.poll() is None and not (tmp_path / "000002.ply").exists():
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
@@ -404,6 +398,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("generate --format docx", "'docx'"),
         ("generate --model nothing", "nothing: expected"),
         ("generate --nope 3", "--nope"),
+        ("generate --sead 3", "found --sead 3; was --seed meant?"),
         ("generate --model TINY --device quantum", "'quantum'"),
         ("generate --model TINY --out SCAN", "expected a folder to write to, found a file"),
         ("complete", "--out"),
@@ -462,6 +457,12 @@ def test_a_fault_of_our_own_is_not_hidden(monkeypatch: pytest.MonkeyPatch):
         main(["info", "--what", "memory"])
 
 
+def test_without_its_hooks_tyro_speaks_itself(run: Run, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(parsing, "events", None)
+    answer = run("generate", "--nope", 3)
+    assert answer.code == 2 and answer.out == "" and "--nope" in answer.err
+
+
 # the terminal
 
 
@@ -494,16 +495,16 @@ def test_any_file_name_can_be_said_on_any_terminal(scan: Path, tmp_path: Path, m
 def test_a_closed_pipe_ends_quietly():
     read_end, write_end = os.pipe()
     os.close(read_end)
-    process = started("info", "vlp-16", stdout=write_end)
+    process = Forked("info", "vlp-16", stdout=write_end)
     os.close(write_end)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (141, "")
 
 
 def test_refusals_of_a_process(tmp_path: Path):
-    process = started("info", tmp_path / "none.bin")
-    out, err = process.communicate(timeout=60)
-    refused(Answer(process.returncode, out, err), "none.bin: expected", "no file or folder of that name")
+    command = [sys.executable, "-m", "lidarsynth", "info", str(tmp_path / "none.bin")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    refused(Answer(done.returncode, done.stdout, done.stderr), "none.bin: expected", "no file or folder of that name")
 
 
 def test_the_version_and_without_a_verb_the_help(run: Run):

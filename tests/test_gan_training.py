@@ -2,15 +2,12 @@
 
 import csv
 import math
-import os
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked import pair
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -249,12 +246,6 @@ def test_a_broken_run_continues_bit_by_bit(cache: Path, tmp_path: Path, word: st
         assert_close(ours, theirs, rtol=0, atol=0)
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @pytest.mark.timeout(300)
 def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
     words = ["train", "tiny-gan", "--data", str(cache), "--sample-every", "0", "--threads", "1", "--workers", "0"]
@@ -263,15 +254,8 @@ def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
               "adversarial.augmentation_every": 2, "adversarial.augmentation_target": -1.5}  # fmt: skip
     list(run(tiny(**fields), cache, tmp_path / "one", options=Options(sample_every=0, workers=0)))
     changes = ["--set", *(f"{name}={value}" for name, value in fields.items())]
-    shared = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
-    command = [sys.executable, "-m", "lidarsynth", *words, "--out", str(tmp_path / "two"), *changes]
-    processes = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                         env={**shared, "RANK": rank, "LOCAL_RANK": rank})
-        for rank in "01"
-    ]  # fmt: skip
-    ends = [process.communicate(timeout=200) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], ends
+    ends = pair(*words, "--out", tmp_path / "two", *changes)
+    assert [code for code, _, _ in ends] == [0, 0], ends
     for column in ("generator", "discriminator", "r1", "grad_norm"):
         one, two = ([float(row[column] or 0) for row in table(tmp_path / name)] for name in ("one", "two"))
         np.testing.assert_allclose(two, one, rtol=5e-3, err_msg=column)

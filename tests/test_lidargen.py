@@ -3,16 +3,13 @@
 import csv
 import json
 import math
-import os
-import socket
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked import pair
 from networks import trained
 from torch import Tensor, nn
 
@@ -358,19 +355,10 @@ def test_accumulated_passes_give_the_curve_of_one():
 @pytest.mark.timeout(300)
 def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
     list(run(with_fields(TINY, {"training.steps": 4}), cache, tmp_path / "one", options=QUIET))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = str(probe.getsockname()[1])
     words = ["train", "lidargen-tiny", "--data", str(cache), "--out", str(tmp_path / "two"), "--sample-every", "0"]
     words += ["--threads", "1", "--workers", "0", "--set", "training.steps=4"]
-    pair = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
-    processes = [
-        subprocess.Popen([sys.executable, "-m", "lidarsynth", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                         text=True, env={**pair, "RANK": rank, "LOCAL_RANK": rank})
-        for rank in "01"
-    ]  # fmt: skip
-    ends = [process.communicate(timeout=200) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], ends
+    ends = pair(*words)
+    assert [code for code, _, _ in ends] == [0, 0], ends
     np.testing.assert_allclose(curve(tmp_path / "two"), curve(tmp_path / "one"), rtol=1e-4)
 
 

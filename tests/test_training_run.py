@@ -1,18 +1,15 @@
 """Runs in a folder: exact continuation after kill -9 and SIGTERM, several processes, checkpoints, fine-tuning."""
 
 import csv
-import os
 import random
 import signal
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked import Forked, pair
 from safetensors.torch import load_file
 
 from lidarsynth.data.dataset import write_cache
@@ -57,12 +54,12 @@ def table(out: Path) -> list[dict[str, str]]:
 
 def command(cache: Path, out: Path, *more: str) -> list[str]:
     words = ["train", "tiny", "--data", str(cache), "--out", str(out), "--sample-every", "0", "--threads", "1"]
-    return [sys.executable, "-m", "lidarsynth", *words, *more]
+    return [*words, *more]
 
 
-def started(cache: Path, out: Path, rows: int, *more: str) -> subprocess.Popen:
+def started(cache: Path, out: Path, rows: int, *more: str) -> Forked:
     """A training process that has done at least `rows` steps."""
-    process = subprocess.Popen(command(cache, out, *more), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = Forked(*command(cache, out, *more))
     until = time.monotonic() + 120
     while not ((out / "losses.csv").exists() and len(table(out)) >= rows):
         assert process.poll() is None, process.communicate()
@@ -77,7 +74,7 @@ def test_killed_and_stopped_a_run_continues_bit_by_bit(cache: Path, tmp_path: Pa
     list(run(tiny(STEPS), cache, whole, options=QUIET))
     more = ("--set", f"training.steps={STEPS}", "--save-every", "4")
     killed = started(cache, broken, random.randint(5, 9), *more)
-    killed.kill()
+    killed.send_signal(signal.SIGKILL)
     killed.communicate()
     (kept, *_), done = reversed(checkpoints(broken)), len(table(broken))
     assert killed.returncode == -signal.SIGKILL and 4 <= int(kept.name[5:]) <= done < STEPS
@@ -92,26 +89,14 @@ def test_killed_and_stopped_a_run_continues_bit_by_bit(cache: Path, tmp_path: Pa
     assert not list(broken.rglob(".saving-*"))
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @pytest.mark.timeout(300)
 def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
     experiment = tiny(8, **{"diffusion.mean_weight": True})
     list(run(experiment, cache, tmp_path / "one", options=QUIET))
     more = ("--set", "training.steps=8", "diffusion.mean_weight=true", "--workers", "0")
-    shared = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
-    processes = [
-        subprocess.Popen(command(cache, tmp_path / "two", *more), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                         text=True, env={**shared, "RANK": rank, "LOCAL_RANK": rank})
-        for rank in "01"
-    ]  # fmt: skip
-    ends = [process.communicate(timeout=200) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], ends
-    assert "wrote" in ends[0][0] and not ends[1][0], "only the first process speaks"
+    ends = pair(*command(cache, tmp_path / "two", *more))
+    assert [code for code, _, _ in ends] == [0, 0], ends
+    assert "wrote" in ends[0][1] and not ends[1][1], "only the first process speaks"
     for column in ("loss", "grad_norm"):
         one, two = ([float(row[column]) for row in table(tmp_path / name)] for name in ("one", "two"))
         np.testing.assert_allclose(two, one, rtol=1e-4)
