@@ -252,6 +252,12 @@ def test_loss_is_the_mean_over_generation_and_completion():
     torch.testing.assert_close(losses, {"generation": generation, "completion": completion})
 
 
+def test_a_network_that_cannot_be_told_the_known_pixels_is_not_taught_completion():
+    experiment = with_fields(TINY, {"model.network": "efficient-unet"})
+    with pytest.raises(ValueError, match=r"generation_share: expected 1 for efficient-unet, .* found 0.5"):
+        Objective(experiment, network(experiment))
+
+
 def test_r2dm_s_mean_weight_is_that_of_the_global_batch():
     experiment = with_fields(preset("r2dm-h"), {"model.base_channels": 8, "model.attn_num_heads": 2, "data.width": 64,
                                                 "data.height": 16, "training.batch_size": 4})  # fmt: skip

@@ -18,6 +18,7 @@ from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.conditional import ConditionalUNet
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.diffusion.description import DESCRIPTION
 from lidarsynth.systems.filling import Filling
@@ -44,7 +45,7 @@ class LidarModel(ScanModel):
     @property
     def conditional(self) -> bool:
         """Whether the network can be told the known pixels."""
-        return self.experiment.model.network == "conditional-unet"
+        return isinstance(self.network, ConditionalUNet)
 
     def stream(
         self,

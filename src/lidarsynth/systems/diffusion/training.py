@@ -21,6 +21,7 @@ from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.corruption import every_beam, without_columns, without_rectangle
 from lidarsynth.lidar.depth import CODECS, decode, encode, valid
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.conditional import ConditionalUNet
 from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.diffusion.validation import EVERY, judge_diffusion, picture_samples
 from lidarsynth.training.randomness import augment, sample_rng, sample_seed
@@ -59,6 +60,10 @@ class Objective(nn.Module):
 
     def __init__(self, experiment: Experiment, network: nn.Module):
         super().__init__()
+        share, word = experiment.training.generation_share, experiment.model.network
+        if share < 1 and not isinstance(network, ConditionalUNet):
+            raise ValueError(f"training.generation_share: expected 1 for {word}, which cannot be told the known "
+                             f"pixels, found {share:g}")  # fmt: skip
         self.experiment = experiment
         self.network = network
         self.denoiser = build_denoiser(experiment, network)

@@ -14,6 +14,7 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.depth import to_x_0
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.networks.conditional import ConditionalUNet
 from lidarsynth.pictures.figure import panel
 from lidarsynth.pictures.render import range_strip, reflectance_strip
 from lidarsynth.systems.diffusion.build import build_denoiser
@@ -54,7 +55,7 @@ def _losses(experiment: Experiment, denoiser: Denoiser, x_0: Tensor, eps: Tensor
     for time in TIMES:
         t = x_0.new_full((len(x_0),), time)
         losses[f"t_{time}"] = denoiser.loss(x_0, t, eps, loss=experiment.diffusion.loss, gamma=gamma)
-    if experiment.model.network == "conditional-unet":
+    if isinstance(denoiser.network, ConditionalUNet):
         known = torch.zeros_like(x_0)
         known[:, :, ::EVERY] = 1
         given, t = denoiser.given(x_0, known), x_0.new_ones(len(x_0))
