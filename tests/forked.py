@@ -8,16 +8,26 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from lidarsynth.cli.main import main
 
 
 class Forked:
-    """A running command, in the manner of subprocess.Popen. `stdout` is a descriptor, or None to keep what is said."""
+    """A running command, or `run` of the words, in the manner of subprocess.Popen.
 
-    def __init__(self, *words: object, stdout: int | None = None, environment: Mapping[str, str] | None = None):
+    `stdout` is a descriptor, or None to keep what is said.
+    """
+
+    def __init__(
+        self,
+        *words: object,
+        stdout: int | None = None,
+        environment: Mapping[str, str] | None = None,
+        run: Callable[[list[str]], None] = main,
+    ):
+        self.run = run
         self.words, self.environment = [str(word) for word in words], dict(environment or {})
         self.returncode: int | None = None
         self._said = _kept(), _kept()
@@ -37,7 +47,7 @@ class Forked:
         _forget_processes()
         code = 0
         try:
-            main(self.words)
+            self.run(self.words)
             sys.stdout.flush()
         except SystemExit as end:
             code = int(end.code or 0)

@@ -1,5 +1,7 @@
 """The cascade's training: proper scores, patterns, standards, and a run of the command line's own loop."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 import torch
@@ -7,11 +9,13 @@ from torch.testing import assert_close
 
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import with_fields
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.coarse_unet import BINS, CoarseUNet, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import Filled, Known
 from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.systems.cascade import training as cascade_training
 from lidarsynth.systems.cascade.examples import crop, pattern
 from lidarsynth.systems.cascade.training import absolute_errors, energy_score, fit_standard, misnamed
 from lidarsynth.training.options import Options
@@ -58,9 +62,14 @@ def test_absolute_errors_count_hidden_returns_of_the_sensor_alone():
     assert absolute_errors(Filled(code, *filled[1:]), known, rays, metres, metres / 50).item() > 0
 
 
+@lru_cache
+def street(place: int) -> RangeImage:
+    return VirtualStreets(6, 32).image(4 * place)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_crops_tell_the_truth_and_nothing_else(seed: int):
-    image = VirtualStreets(6, 32).image(4 * (seed % 8))
+    image = street(seed % 4)
     known, rays, (metres, reflectance, label) = crop(image, np.random.default_rng(seed), seed % 2 == 0)
     assert metres.shape == reflectance.shape == label.shape == rays.ground.shape == (1, 1, 64, 256)
     assert torch.equal(known.metres[known.told], (metres * known.returned)[known.told])
@@ -72,7 +81,7 @@ def test_crops_tell_the_truth_and_nothing_else(seed: int):
 
 
 def test_some_crops_are_of_perfect_scans_and_some_are_wholly_known():
-    image = VirtualStreets(6, 32).image(0)
+    image = street(0)
     crops = [crop(image, np.random.default_rng(seed), seed % 2 == 0) for seed in range(80)]
     perfect = [(known, metres) for known, _, (metres, _, _) in crops if bool((known.returned & ~known.told).any())]
     assert 4 <= len(perfect) <= 22  # of 80: a fifth of those to be drawn, a tenth of the others
@@ -107,7 +116,7 @@ def test_patterns_leave_something_known_and_something_to_learn():
 def test_standards_make_the_ground_as_wide_as_the_horizon():
     network = CoarseUNet(16, (1, 1, 1, 1), 1)
     streets = VirtualStreets(6, 64)
-    images = [streets.image(i) for i in range(0, 64, 2)]
+    images = [streets.image(i) for i in range(0, 64, 6)]
     fit_standard(network, images)
     assert network.standard.shape == (2, 2, BINS)
     values = []
@@ -124,7 +133,8 @@ def test_standards_make_the_ground_as_wide_as_the_horizon():
 
 
 @pytest.mark.slow
-def test_a_run_trains_both_stages_and_goes_on(tmp_path):
+def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cascade_training, "FITTED", 12)
     before = None
     for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
         before = before or progress

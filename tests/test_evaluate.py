@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forked import Forked
 
 import lidarsynth as ls
 from lidarsynth.cli.main import main
@@ -210,16 +209,13 @@ def test_parts_of_a_reference_become_one_file_to_share(tmp_path: Path, real: Pat
         evaluation.gather_part(real, "1/1", shared_file, LIDARGEN, side="reference")
 
 
-KILLED = """
-import os, signal, sys
-from lidarsynth.evaluation import accumulation
-from lidarsynth.evaluation import evaluate as evaluation
-accumulation.SAVE_EVERY = 0.0
-def kill(what, done, total):
-    if done == 4:
-        os.kill(os.getpid(), signal.SIGKILL)
-evaluation.evaluate(sys.argv[1], sys.argv[2], sys.argv[3], batch_size=1, on_images=kill)
-"""
+def evaluate_until_killed(words: list[str]) -> None:
+    def kill(what: str, done: int, total: int) -> None:
+        if done == 4:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    accumulation.SAVE_EVERY = 0.0
+    evaluation.evaluate(*words, batch_size=1, on_images=kill)
 
 
 @pytest.mark.parametrize("protocol", ["bev-1", "r2dm-upsampling-2024"])
@@ -227,9 +223,8 @@ def test_a_killed_evaluation_goes_on(protocol: str, tmp_path: Path, real: Path, 
     """kill -9 in the middle: the second call begins at the fourth image, and finds what one call would have found."""
     samples = saved(tmp_path / "samples", [*STREETS, *STREETS[:2]])
     expected = ls.evaluate([*STREETS, *STREETS[:2]], REAL, protocol=protocol)
-    command = [sys.executable, "-c", KILLED, str(samples), str(real), protocol]
-    done = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, timeout=100)
-    assert done.returncode == -signal.SIGKILL, done.stderr.decode()[-2000:]
+    killed = Forked(samples, real, protocol, run=evaluate_until_killed)
+    assert killed.wait() == -signal.SIGKILL, killed.communicate()
     assert len(list((cache / "statistics").glob("unfinished-*"))) == 1
     seen: list[int] = []
     report = evaluation.evaluate(

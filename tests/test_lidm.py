@@ -352,20 +352,20 @@ def test_quantisation_keeps_the_first_point_of_a_voxel_and_refuses_nothing_at_al
 
 
 @pytest.mark.slow
-def test_a_full_scan_takes_seconds_and_little_memory(shared: Path):
+def test_a_quarter_of_a_scan_takes_less_than_a_second(shared: Path):
     points = np.fromfile(shared / "fixtures/projection/scan64.bin", np.float32).reshape(-1, 4)[:, :3]
-    features, voxels = collate([quantise(points)])
-    assert len(voxels) == 81292
+    assert len(collate([quantise(points)])[1]) == 81292
+    features, voxels = collate([quantise(points[::4])])
     matrix = torch.rand(2048, 2048)
     start = time.process_time()
-    for _ in range(8):
+    for _ in range(2):
         matrix @ matrix
-    unit = time.process_time() - start  # 0.14 TFLOP: what this machine and its other users leave us
+    unit = time.process_time() - start  # 0.034 TFLOP: what this machine and its other users leave us
     for kind in (MinkowskiUNet, SPVCNN):
         network = kind(widths_of(0.5)).eval()
         start = time.process_time()
         network(features, voxels)
-        assert time.process_time() - start < max(4 * unit, 2.0) * 1.5
+        assert time.process_time() - start < max(4 * unit, 0.5) * 1.5
 
 
 def test_the_buffer_of_a_checkpoint_is_read_from_its_start(tmp_path: Path):

@@ -10,7 +10,7 @@ from networks import trained
 
 import lidarsynth as ls
 from lidarsynth.experiment.presets import PRESETS, preset
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -58,7 +58,8 @@ def scan_of(sensor: Sensor) -> Scan:
 
 @pytest.mark.parametrize("name", SMALL)
 def test_the_usage_on_a_card_runs(name: str, monkeypatch: pytest.MonkeyPatch):
-    model = assemble(preset(name), trained(preset(name)))
+    experiment = preset(name) if preset(name).score is None else with_fields(preset(name), {"score.levels": 2})
+    model = assemble(experiment, trained(experiment))
     monkeypatch.setattr(gan_model, "STEPS", 2)
     (usage,) = re.findall(r"```python\n(.*?)```", card_of(model.experiment, "someone/something"), re.S)
     assert 'ls.load("someone/something")' in usage or name == "bilinear"
