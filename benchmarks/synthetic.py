@@ -1,8 +1,8 @@
 """Synthetic streets: how fast, and how close to real KITTI scans.
 
 python benchmarks/synthetic.py                                        scans per second and core, worlds included
-python benchmarks/synthetic.py --compare ../shared/scans              tables of numbers beside real scans
-python benchmarks/synthetic.py --compare ../shared/scans --pictures docs/images      the pictures as well
+python benchmarks/synthetic.py --compare SCANS                        tables of numbers beside real scans
+python benchmarks/synthetic.py --compare SCANS --pictures docs/images                the pictures as well
 python benchmarks/synthetic.py --sample src/lidarsynth/shipped/street.npz            the scan of the demo
 """
 
@@ -36,7 +36,7 @@ SHOWN = (14, 60, 84)  # real scans of the pictures: numbers in train/
 
 
 def read_kitti(path: Path) -> Scan:
-    """A `.bin`, or a `.scan.xz` as ../shared/scans/README.md has it."""
+    """A `.bin`, or a `.scan.xz`: the count, then steps of x, y and z in millimetres, as int32, and reflectances."""
     if path.suffix == ".bin":
         points = np.fromfile(path, np.float32).reshape(-1, 4)
         return Scan(points[:, :3], points[:, 3])

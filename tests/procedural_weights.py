@@ -1,11 +1,12 @@
-"""Weights that are computed instead of stored: SplitMix64 of the key and the index (fixtures/README_baselines.md)."""
+"""Weights of full-width reference networks that are computed, not stored: SplitMix64 of the key and the index."""
 
 import hashlib
+import math
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 
 def procedural_uniform(key: str, seed: int, count: int) -> np.ndarray:
@@ -57,3 +58,25 @@ def gan_weights(structure: dict[str, Tensor], seed: int, freq_tables: dict[str, 
             low, high = next(limits for fits, limits in GAN_RANGES if fits(key))
             weights[key] = procedural_tensor(key, seed, value.shape, low, high)
     return weights
+
+
+def upsampling_weights(network: nn.Module, seed: int) -> dict[str, Tensor]:
+    """Every tensor of a LiDAR-SR, ILN or LIIF network by the rules of the fixtures."""
+    return {key: upsampling_weight(key, value, seed) for key, value in network.state_dict().items()}
+
+
+def upsampling_weight(key: str, like: Tensor, seed: int) -> Tensor:
+    if key.endswith("num_batches_tracked"):
+        return torch.zeros_like(like)
+    if key.endswith("running_mean"):
+        low, high = -0.2, 0.2
+    elif key.endswith("running_var"):
+        low, high = 0.5, 1.5
+    elif like.ndim == 1:
+        low, high = (0.7, 1.3) if key.endswith("weight") else (-0.2, 0.2)
+    else:
+        gain = 24 if key.startswith("attention.") else 4
+        high = float(np.float32(round(math.sqrt(gain / like[0].numel()), 5)))
+        low = -high
+    value = np.float32(low) + np.float32(high - low) * procedural_uniform(key, seed, like.numel())
+    return torch.from_numpy(value).view(like.shape)

@@ -44,6 +44,26 @@ def test_every_table_is_a_dict_where_the_map_says(table: str, file: str):
     assert re.search(rf"^{table}(: [^=]*)? = {{", (SRC / file).read_text(), re.M)
 
 
+def test_texts_name_documents_that_are_there():
+    made = {"report.md", "table.md", "README.md"}  # by the program
+    for path in [*ROOT.glob("src/**/*.py"), *ROOT.glob("benchmarks/*.py"), *ROOT.glob("docs/**/*.md")]:
+        for name in re.findall(r"[\w/.-]+\.md\b", path.read_text()):
+            there = any((base / name).exists() for base in (ROOT, ROOT / "docs", path.parent))
+            assert there or Path(name).name in made, f"{path}: {name}"
+
+
+def test_each_concept_of_the_readme_is_in_its_file():
+    text = (ROOT / "README.md").read_text()
+    rows = re.findall(r"^\| (.+?) \| (\[.+\)) \|$", text[: text.index("## Use it")], re.M)
+    assert len(rows) >= 15
+    for concept, links in rows:
+        paths = [ROOT / target for target in re.findall(r"\]\(([^)]+)\)", links)]
+        assert all(path.exists() for path in paths), concept
+        if paths[0].is_file():
+            words = re.findall(r"`(\w+)`", concept)
+            assert [word for word in words if word not in paths[0].read_text()] == [], concept
+
+
 def test_what_moved_is_where_the_list_says():
     lines = (ROOT / "docs" / "changes.md").read_text().splitlines()
     cells = [line.split("|")[2] for line in lines if line.count("|") == 3]

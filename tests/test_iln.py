@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from procedural import upsampling_weights
+from procedural_weights import upsampling_weights
 from torch import Tensor
 
 from lidarsynth.networks.iln import ILN, LIIF, angle_queries, from_official, neighbours, pixel_centres

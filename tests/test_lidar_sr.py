@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from procedural import uniforms, upsampling_weights
+from procedural_weights import procedural_uniform, upsampling_weights
 from torch import Tensor
 
 from lidarsynth.networks.lidar_sr import LidarSR, from_keras, from_official, mc_dropout, remove_uncertain
@@ -52,7 +52,7 @@ def test_the_published_width_equals_the_reference(fixture_tensors, reference):
 
 
 def test_procedural_weights_are_those_of_the_readme():
-    found = uniforms("outc.conv.1.weight", 2110, 3)
+    found = procedural_uniform("outc.conv.1.weight", 2110, 3)
     assert found.tolist() == pytest.approx([0.3138620853, 0.8930457830, 0.0852542520], abs=1e-9)
 
 

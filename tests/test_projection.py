@@ -128,7 +128,7 @@ def test_elevations_and_rings_of_real_scans_agree(shared, name):
 
 
 def published_rows(xyz: np.ndarray, height: int) -> np.ndarray:
-    """Row of each point by the reference program's rule, point by point (facts/r2dm.md, section 4)."""
+    """Row of each point by the reference program's rule, point by point."""
     quadrant = [(0 if y >= 0 else 3) if x >= 0 else (1 if y >= 0 else 2) for x, y in xyz[:, :2]]
     starts = [i for i in range(len(xyz)) if quadrant[i - 1] == 3 and quadrant[i] == 0]
     rows, end, row = np.zeros(len(xyz), np.int64), len(xyz), height - 1

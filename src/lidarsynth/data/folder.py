@@ -1,4 +1,4 @@
-"""A folder of scan files of any kind that `files.read` knows, at any depth."""
+"""A folder of scan files of any kind that `files.formats.read` knows, at any depth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarsynth.files.formats import NAMED_ONLY, READERS
 def folder(root: str | Path, intensity: str = "auto") -> Frames:
     """Every scan under `root`, sorted by path; sequence = the folder below `root`, frame = the file's name.
 
-    intensity  scale of the files, as in `files.read`
+    intensity  scale of the files, as in `files.formats.read`
     A `.label` file beside a scan, of the same name, gives its SemanticKITTI labels. Raises ValueError without any scan.
     """
     frames = [_frame(path, Path(root)) for path in scan_files(root)]

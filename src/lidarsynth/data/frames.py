@@ -52,7 +52,7 @@ class Frames:
     source     word of the data set
     frames     one per scan
     missing    sequences of the chosen split that are not on this disk
-    intensity  scale of the files, as in `files.read`
+    intensity  scale of the files, as in `files.formats.read`
     """
 
     source: str

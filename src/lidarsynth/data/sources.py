@@ -109,7 +109,7 @@ def cache_source(
 
     name     a word of SOURCES; `root` is where the data set lies, `folder` the cache; `split` a word of its reader
     workers, check  as in `write_cache`; None = as many as there are processors
-    intensity       scale of the source `files`, as in `files.read`
+    intensity       scale of the source `files`, as in `files.formats.read`
     Raises ValueError for unknown words, a root without scans, or a cache of something else; OSError for a full disk.
     """
     if name not in SOURCES:

@@ -42,7 +42,7 @@ def evaluate(
     device: str = "cpu",
     on_images: OnImages = None,
 ) -> Report:
-    """Judge samples against a reference under a named protocol (`metrics.protocols.PROTOCOLS`).
+    """Judge samples against a reference under a named protocol (`evaluation.protocols.PROTOCOLS`).
 
     samples    a folder of scans, of our `.npz` images, of official R2DM or LiDARGen `.pth` samples; a cache; a list of
                range images; or files of statistics that `gather_part` wrote, which are merged

@@ -5,7 +5,7 @@
                                                checksums.json, the SHA-256 of each: a flipped byte is found
     out/checkpoints/latest                     link to the newest
 
-Nothing of the random generators or of the data order has to be kept: both are functions of the step (`training.steps`).
+Nothing of the random generators or of the data order has to be kept: both follow from the step (`training.randomness`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Adaptive discriminator augmentation of one-channel images on a ring (StyleGAN2-ADA; facts/gans.md section 7).
+"""Adaptive discriminator augmentation of one-channel images on a ring (StyleGAN2-ADA, Karras et al. 2020).
 
 Every transform is a 3x3 matrix on pixel coordinates, x right and y down from the image centre, and a 4x4 matrix on
 colours; all of them are differentiable in the image.

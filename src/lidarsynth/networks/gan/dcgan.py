@@ -1,7 +1,7 @@
 """Vanilla GAN and DUSty v1: DCGAN-like networks on a ring, without and with ray-drop.
 
 Both as re-trained by the DUSty v2 authors at 64x512 (WACV 2023), which is what R2DM compares with; parameter names are
-those of the official checkpoints (facts/gans.md section 3). Range only: images are inverse depth.
+those of the official checkpoints. Range only: images are inverse depth.
 """
 
 from collections.abc import Sequence

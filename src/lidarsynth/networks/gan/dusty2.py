@@ -1,6 +1,6 @@
 """DUSty v2: a generator that renders any ray angles, with modulated 1x1 layers, and a residual discriminator.
 
-Parameter names are those of the official checkpoints (facts/gans.md section 5). Range only: images are inverse depth.
+Parameter names are those of the official checkpoints. Range only: images are inverse depth.
 """
 
 import math

@@ -1,6 +1,6 @@
 """Inverse depth as the GANs see it: min_depth / depth, 0 = no return, and the points it stands for.
 
-The published runs have limits 1.45 and 80 metres, both inclusive (facts/gans.md section 6). Networks work on twice
+The published runs have limits 1.45 and 80 metres, both inclusive. Networks work on twice
 this minus 1.
 """
 

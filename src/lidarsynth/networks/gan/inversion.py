@@ -1,6 +1,6 @@
 """GAN inversion: the latent whose image agrees with the measured pixels, and with it completion (auto-decoding).
 
-Losses, latent steps and learning rates of the DUSty v2 demonstration (facts/gans.md, "Inversion").
+Losses, latent steps and learning rates of the DUSty v2 demonstration (Nakashima et al., WACV 2023).
 """
 
 import math

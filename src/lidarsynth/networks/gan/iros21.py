@@ -1,6 +1,6 @@
 """The first release of the vanilla GAN and DUSty-I (IROS 2021): its parameter names and noise, in terms of ours.
 
-Build `gan.Generator(..., bounded=True)` and `gan.Discriminator(..., vertical="reflect")` (facts/gans.md section 9).
+Build `gan.Generator(..., bounded=True)` and `gan.Discriminator(..., vertical="reflect")`.
 """
 
 import re

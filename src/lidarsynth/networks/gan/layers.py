@@ -1,6 +1,6 @@
 """Layers that the three GANs share: equalised learning rate, FIR resampling on a ring, batch statistics.
 
-Images are (B,C,H,W); the width is a ring, beyond the height rows are mirrored or repeated (facts/gans.md section 1).
+Images are (B,C,H,W); the width is a ring, beyond the height rows are mirrored or repeated.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Losses of the GANs: non-saturating, R1 and path length (facts/gans.md section 7)."""
+"""Losses of the GANs: non-saturating, R1 and path length (StyleGAN2, Karras et al. 2020)."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Modulated layers on Fourier features of the ray angles: the blocks of DUSty v2 (facts/gans.md section 5)."""
+"""Modulated layers on Fourier features of the ray angles: the blocks of DUSty v2 (WACV 2023)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

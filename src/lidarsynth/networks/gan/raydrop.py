@@ -1,4 +1,4 @@
-"""The measurement model of DUSty: each ray returns with a learnt probability (facts/gans.md section 4)."""
+"""The measurement model of DUSty: each ray returns with a learnt probability (Nakashima & Kurazume, IROS 2021)."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,6 @@
 """Denoising score matching over fixed noise levels, as LiDARGen is trained (Song & Ermon 2020; Zyrianov et al. 2022).
 
-A sample's level and noise are a function of (seed, step, its position in the global batch), as in `training.steps`.
+A sample's level and noise are a function of (seed, step, its position in the global batch) (`training.randomness`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """RangeNet learns the class of every pixel of labelled range images (Milioto et al. 2019).
 
-All randomness of a sample is a function of (seed, step, its position in the global batch), as in `training.steps`.
+All randomness of a sample is a function of (seed, step, its position in the global batch) (`training.randomness`).
 Batch normalisation takes its statistics per process, so two processes do not give quite the curve of one.
 """
 
