@@ -10,8 +10,6 @@ from lidarsynth.networks.interpolation import (
     interpolate,
     nearest_along_axes,
     nearest_around,
-    resize_rows,
-    sample_queries,
 )
 
 
@@ -145,33 +143,13 @@ def test_bicubic_is_torch_bicubic_at_true_alignment():
     """Rows 0, 4, ... sampled where torch's half-pixel grid puts them."""
     x = torch.randn(1, 2, 8, 6, generator=torch.Generator().manual_seed(0))
     place = torch.arange(32) / 4
-    queries = torch.cartesian_prod((2 * place + 1) / 8 - 1, (2 * torch.arange(6) + 1) / 6 - 1)
-    expected = sample_queries(x, queries, "bicubic").view(1, 2, 32, 6)
-    torch.testing.assert_close(resize_rows(x, 32, "bicubic", "rows"), expected, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_resize_rows_equals_opencv_and_torch(fixture_tensors, method):
-    expected = fixture_tensors("iln_interpolation")
-    truth = expected["lidargen.range_m"]
-    resized = resize_rows(truth[:, :, ::4], 64, method)
-    torch.testing.assert_close(resized, expected[f"lidargen.{method}"], atol=1e-4, rtol=0)
-    torch.testing.assert_close(resized, expected[f"torch_interpolate.{method}"], atol=1e-4, rtol=0)
-    torch.testing.assert_close((resized - truth).abs().mean(), expected.get(f"lidargen.{method}.mae"))
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("grid", ["grid_64x64", "grid_40x100"])
-def test_sample_queries_equals_iln(fixture_tensors, method, grid):
-    expected = fixture_tensors("iln_interpolation")
-    result = sample_queries(expected["input"], expected[f"{grid}.queries"], method)
-    torch.testing.assert_close(result, expected[f"{grid}.{method}"].transpose(1, 2), atol=1e-5, rtol=0)
-
-
-def test_resize_rows_with_true_rows_keeps_them():
-    x = torch.randn(1, 2, 8, 6)
-    for method in METHODS:
-        assert torch.equal(resize_rows(x, 32, method, "rows")[:, :, ::4], x)
+    grid = torch.cartesian_prod((2 * torch.arange(6) + 1) / 6 - 1, (2 * place + 1) / 8 - 1).view(1, 6, 32, 2)
+    options = {"mode": "bicubic", "padding_mode": "border", "align_corners": False}
+    expected = torch.nn.functional.grid_sample(x, grid.transpose(1, 2), **options)
+    mask = rows_mask((1, 2, 32, 6), *range(0, 32, 4))
+    known = torch.zeros(1, 2, 32, 6)
+    known[:, :, ::4] = x
+    torch.testing.assert_close(interpolate(known, mask, "bicubic"), expected, atol=1e-5, rtol=1e-5)
 
 
 def test_errors_say_both_sides():
@@ -180,10 +158,6 @@ def test_errors_say_both_sides():
         fill_in(x, x[:, :1])
     with pytest.raises(ValueError, match=r"method must be one of .* got 'cubic'"):
         interpolate(x, x, "cubic")
-    with pytest.raises(ValueError, match='"rows" needs a multiple of 8 rows, got 20'):
-        resize_rows(x, 20, alignment="rows")
-    with pytest.raises(ValueError, match="got 'corners'"):
-        resize_rows(x, 16, alignment="corners")
 
 
 def test_the_nearest_known_pixels_along_both_axes():

@@ -5,7 +5,6 @@ Images are equirectangular: the width is circular, the height has ends. None of 
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from lidarsynth.networks.running import running_max
 
@@ -56,40 +55,6 @@ class Interpolation(nn.Module):
 
     def forward(self, known: Tensor, mask: Tensor) -> Tensor:
         return interpolate(known, mask, self.method)
-
-
-def resize_rows(x: Tensor, height: int, method: str = "bilinear", alignment: str = "half_pixel") -> Tensor:
-    """Enlarges (B,C,h,W) to (B,C,height,W), as the protocols in print do it.
-
-    `alignment` "half_pixel": the convention of OpenCV's and torch's resize, which moves measured rows; "rows": input
-    row i is output row i * height/h exactly (beams taken from a dense scan).
-    Raises ValueError for another method or alignment, or if "rows" does not get a whole factor.
-    """
-    _check_method(method)
-    if alignment == "half_pixel":
-        return F.interpolate(
-            x, size=(height, x.shape[3]), mode=method, align_corners=None if method == "nearest" else False
-        )
-    if alignment != "rows":
-        raise ValueError(f'alignment must be "half_pixel" or "rows", got {alignment!r}')
-    if height % x.shape[2]:
-        raise ValueError(f'alignment "rows" needs a multiple of {x.shape[2]} rows, got {height}')
-    known = x.new_zeros(*x.shape[:2], height, x.shape[3])
-    known[:, :, :: height // x.shape[2]] = x
-    mask = torch.zeros_like(known)
-    mask[:, :, :: height // x.shape[2]] = 1
-    return interpolate(known, mask, method)
-
-
-def sample_queries(x: Tensor, queries: Tensor, method: str = "bilinear") -> Tensor:
-    """Values (B,C,Q) of the image (B,C,H,W) at `queries` (Q,2), (vertical, horizontal) in [-1,1] (ILN's baselines).
-
-    -1 and 1 are the outer edges of the border pixels; borders repeat, the width is not circular.
-    Raises ValueError for another method.
-    """
-    _check_method(method)
-    grid = queries.flip(-1).expand(len(x), 1, -1, -1)
-    return F.grid_sample(x, grid, mode=method, padding_mode="border", align_corners=False)[:, :, 0]
 
 
 @torch.no_grad()
