@@ -1,10 +1,12 @@
 """What all tests share: the folder of facts, reference tensors and real scans, and one thread per process."""
 
+import lzma
 import os
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
+import oracle
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -40,17 +42,23 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def fixture_tensors() -> Callable[[str], dict[str, Tensor]]:
-    """`fixture_tensors("r2dm/ops")` -> the tensors of r2dm/ops.safetensors by key, from tests/oracles or the shared
-    folder's fixtures; skips where neither has them."""
+    """`fixture_tensors("r2dm/ops")` -> the tensors of r2dm/ops.safetensors by key, from the shared folder's
+    fixtures or, of large ones a sample (`oracle.load`), from tests/oracles; skips where neither has them."""
 
     def load(name: str) -> dict[str, Tensor]:
-        paths = [folder / f"{name}.safetensors" for folder in (ORACLES, SHARED / "fixtures")]
+        paths = [folder / f"{name}.safetensors" for folder in (SHARED / "fixtures", ORACLES)]
         found = next((path for path in paths if path.is_file()), None)
         if found is None:
-            pytest.skip(f"reference values are not here: {paths[1]}")
-        return load_file(found)
+            pytest.skip(f"reference values are not here: {paths[0]}")
+        return oracle.load(found)
 
     return load
+
+
+@pytest.fixture(scope="session")
+def scan64() -> bytes:
+    """A synthetic turn of an HDL-64E in the order of its rings, as KITTI's `.bin`: what was projected."""
+    return lzma.decompress((ORACLES / "projection" / "scan64.bin.xz").read_bytes())
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from oracle import assert_close
 from test_gan import check_structure
-from torch.testing import assert_close
 
 from lidarsynth.networks.gan.adaptive_augmentation import (
     SYM2,

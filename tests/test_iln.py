@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 from networks import angle_queries
+from oracle import assert_close, largest
 from procedural_weights import upsampling_weights
 from torch import Tensor
 
@@ -33,7 +34,7 @@ def network_of(reference):
 
 
 def tolerance(name: str, expected: Tensor) -> float:
-    return 1e-5 if name in DEPTHS else 2e-5 * expected.abs().max().item()
+    return 1e-5 if name in DEPTHS else 2e-5 * largest(expected)
 
 
 @pytest.mark.parametrize("name", FIXTURES)
@@ -41,13 +42,13 @@ def tolerance(name: str, expected: Tensor) -> float:
 def test_outputs_equal_the_reference(fixture_tensors, network_of, name):
     expected, network = fixture_tensors(name), network_of(name)
     features = network.encode(expected["input"])
-    scale = max(1.0, expected["inter.encoder_feature"].abs().max().item())
-    torch.testing.assert_close(features[:, :8], expected["inter.encoder_feature"], atol=1e-5 * scale, rtol=0)
+    scale = max(1.0, largest(expected["inter.encoder_feature"]))
+    assert_close(features[:, :8], expected["inter.encoder_feature"], atol=1e-5 * scale, rtol=0)
     grids = [key.removesuffix(".queries") for key in expected if key.endswith(".queries")]
     assert len(grids) >= 2
     for grid in grids:
         found, output = network.decode(expected["input"], features, expected[f"{grid}.queries"]), f"{grid}.output"
-        torch.testing.assert_close(found, expected[output][..., 0], atol=tolerance(name, expected[output]), rtol=0)
+        assert_close(found, expected[output][..., 0], atol=tolerance(name, expected[output]), rtol=0)
 
 
 @pytest.mark.parametrize("name", DEPTHS)
@@ -57,8 +58,8 @@ def test_weights_and_places_equal_the_reference(fixture_tensors, network_of, nam
     assert isinstance(network, ILN)
     low = expected["input"]
     near, places, _ = neighbours(network.encode(low), low, expected["random.queries"])
-    torch.testing.assert_close(places, expected["random.rel_coords"], atol=1e-5, rtol=0)
-    torch.testing.assert_close(network.attention(near, places), expected["random.weights"], atol=1e-5, rtol=0)
+    assert_close(places, expected["random.rel_coords"], atol=1e-5, rtol=0)
+    assert_close(network.attention(near, places), expected["random.weights"], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", DEPTHS)
@@ -71,7 +72,7 @@ def test_gradients_equal_the_reference(fixture_tensors, network_of, name):
     assert len(gradients) == 3
     for key, gradient in gradients.items():
         found = network.get_parameter(key.removeprefix("train.grad.")).grad
-        torch.testing.assert_close(found, gradient, atol=1e-4 * gradient.abs().max().item(), rtol=0)
+        assert_close(found, gradient, atol=1e-4 * largest(gradient), rtol=0)
 
 
 @pytest.mark.parametrize("name", FIXTURES)
@@ -88,7 +89,7 @@ def test_queries_from_angles_are_the_references(fixture_tensors, network_of, ref
         ours, theirs = (neighbours(low, low, queries)[2] for queries in (found[None], expected[f"{grid}.queries"]))
         assert torch.equal(ours, theirs)
         if name in DEPTHS:  # at the border LIIF's areas are a ratio of roundings, so that its answer hangs on them
-            torch.testing.assert_close(network(low, found[None]), expected[f"{grid}.output"][..., 0], atol=1e-5, rtol=0)
+            assert_close(network(low, found[None]), expected[f"{grid}.output"][..., 0], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["iln_0d", "iln_1d", "iln_2d", "liif"])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from torch.testing import assert_close
+from oracle import assert_close
 
 from lidarsynth.networks.gan.dcgan import Generator
 from lidarsynth.networks.gan.inverse_depth import to_depth, to_inverse_depth, to_points

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from oracle import assert_close
 from procedural_weights import procedural_uniform, upsampling_weights
 from torch import Tensor
 
@@ -29,9 +30,9 @@ def assert_output_and_stages(network: LidarSR, expected: dict[str, Tensor]) -> N
         # forward goes through `downup` part by part: the last one has its output
         module = network.get_submodule("downup.2" if name == "downup" else name)
         module.register_forward_hook(lambda _module, _inputs, output, name=name: stages.update({name: output}))
-    torch.testing.assert_close(network(expected["input"]), expected["output"], atol=1e-5, rtol=0)
+    assert_close(network(expected["input"]), expected["output"], atol=1e-5, rtol=0)
     for name in STAGES:
-        torch.testing.assert_close(stages[name][:1, :4], expected[f"inter.{name}"], atol=1e-5, rtol=1e-5)
+        assert_close(stages[name][:1, :4], expected[f"inter.{name}"], atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("fixture", "scale"), SMALL.items())

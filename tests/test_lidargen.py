@@ -11,6 +11,7 @@ import pytest
 import torch
 from forked import pair
 from networks import trained
+from oracle import assert_close
 from torch import Tensor, nn
 
 import lidarsynth
@@ -122,13 +123,13 @@ def test_a_score_needs_the_schedule_of_its_levels():
         build_denoiser(experiment, build_network(experiment))
 
 
-def test_the_range_code_is_lidargens(shared, fixture_tensors):
+def test_the_range_code_is_lidargens(scan64, fixture_tensors):
     """The published item from points to the network's input; empty pixels, 2.4e-5 there, are 0 here."""
-    expected = fixture_tensors("projection/scan64_images")["lidargen.network_input"]
-    points = np.fromfile(shared / "fixtures" / "projection" / "scan64.bin", np.float32).reshape(-1, 4)
+    expected = fixture_tensors("projection/lidargen_input")["lidargen.network_input"]
+    points = np.frombuffer(scan64, np.float32).reshape(-1, 4)
     everything = replace(get_sensor("hdl-64e"), min_range=0.0, max_range=math.inf)  # no gate
     image = project(Scan(points[:, :3], points[:, 3]), everything, "spherical")
-    torch.testing.assert_close((to_x_0(image, "log-63m") + 1) / 2, expected, atol=3e-5, rtol=0)
+    assert_close((to_x_0(image, "log-63m") + 1) / 2, expected, atol=3e-5, rtol=0)
     assert (expected[0] == 1).any(), "what is farther than 63 m"
 
 

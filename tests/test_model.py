@@ -65,11 +65,12 @@ def test_the_public_way_in_loads_official_weights_and_samples_as_the_reference(r
     assert isinstance(model, lidarsynth.LidarModel) and not model.conditional
     images = model.generate(2, steps=3, seed=0, sampler="ddpm")
     for image, x_0 in zip(images, expected, strict=True):
-        reference = from_x_0(x_0, model.sensor)
-        agree = image.mask == reference.mask
-        assert agree.mean() > 0.999
+        reference = from_x_0(x_0.nan_to_num(-1), model.sensor)
+        agree, kept = image.mask == reference.mask, ~x_0.isnan().any(0).numpy()
         close = np.isclose(image.range, reference.range, rtol=1e-3, atol=1e-3)
         close &= np.isclose(image.reflectance, reference.reflectance, atol=1e-3)
+        close, agree = close[kept], agree[kept]
+        assert agree.mean() > 0.999
         assert close.mean() > 0.995, "t = 1 amplifies rounding in a few pixels"
 
 

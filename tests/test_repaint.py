@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import oracle
 import pytest
 import torch
 from oracles import gaussian_denoiser
@@ -24,7 +25,7 @@ def test_equals_the_reference(reference, fixture_tensors, jump):
     known, mask = values["repaint.known"], values["repaint.mask"]
     denoiser = tiny_denoiser(reference)
     states = list(repaint(denoiser, x_1, known, mask, lambda x: next(rest), steps=3, resamples=3, jump=jump))
-    assert_close(states[0].x_t, expected[0])
+    oracle.assert_close(states[0].x_t, expected[0])
     for state, one in zip(states[jump - 1 :: jump], expected[1:], strict=True):
         close_trajectory(state.x_s, one)
     assert next(rest, None) is None  # every noise was used
