@@ -316,6 +316,8 @@ def test_bf16_errs_little_and_auto_asks_the_processor(model: CascadeModel, monke
     off = np.abs(exact.range - quick.range)[both] / exact.range[both]
     assert 0 < np.median(off) < 2e-3 and (exact.mask == quick.mask).mean() > 0.99
     np.testing.assert_array_equal(quick.range[known], exact.range[known])
+    asked = model.complete(image.keep(known), known, precision="bf16")
+    np.testing.assert_array_equal(asked.range, quick.range)
     for has in (False, True):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {"amx_bf16": has}, raising=False)
         assert model.at_precision("auto").precision == ("bf16" if has else "fp32")

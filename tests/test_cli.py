@@ -509,6 +509,11 @@ def test_refusals_of_a_process(tmp_path: Path):
     refused(Answer(done.returncode, done.stdout, done.stderr), "none.bin: expected", "no file or folder of that name")
 
 
+def test_every_file_of_the_command_line_is_a_verb_or_serves_them():
+    files = {path.stem for path in Path(parsing.__file__).parent.glob("*.py")} - {"__init__"}
+    assert files - VERBS.keys() == {"arguments", "main", "many", "parsing", "scan_files", "terminal"}
+
+
 def test_the_version_and_without_a_verb_the_help(run: Run):
     assert run("--version").out == f"lidarsynth {version('lidarsynth')}\n"
     assert run().code == 0

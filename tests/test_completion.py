@@ -178,6 +178,7 @@ def test_what_would_be_ignored_is_refused(model: LidarModel):
         (Filling("repaint", sampler="langevin"), "for repaint, found 'langevin'"),
         (Filling("posterior", sampler="heun"), "expected no sampler, .* found 'heun'"),
         (Filling("conditional", resamples=3), "expected no resamples, .* found 3"),
+        (Filling("conditional", precision="bf16"), "expected precision fp32, .* found 'bf16'"),
     ):
         with pytest.raises(ValueError, match=said):
             model.filled(scan, how)

@@ -11,6 +11,7 @@ The convention, for whoever writes the README:
 """
 
 import ast
+import json
 import re
 import shlex
 from pathlib import Path
@@ -18,11 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import torch
 
 from lidarsynth.cli.main import VERBS, main
+from lidarsynth.experiment.presets import preset
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.table import build_network
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
 README = REPO_ROOT / "README.md"
@@ -96,6 +100,29 @@ def street(name: str) -> RangeImage:
     mask = (distance < sensor.max_range) & (distance > sensor.min_range) & ~top
     reflectance = np.where(wall < road, 0.4, 0.2).astype(np.float32)
     return RangeImage(np.where(mask, distance, 0).astype(np.float32), reflectance * mask, mask, sensor)
+
+
+def test_the_numbers_are_those_of_the_models_and_their_cards():
+    text = README.read_text()
+    results = {name: " ".join(shipped(name)["card"]["results"]) for name in ("default", "kitti", "kitti-streets")}
+    for name, said in results.items():
+        (metres, reflectance) = re.findall(rf"^\| `{name}` \| ([\d.]+ m) \| ([\d.]+) \|$", text, re.M)[0]
+        assert f"every fourth beam known {metres}, {reflectance}" in said, name
+        assert f"--model {name} " in said or name == "default", "the command names the model"
+        for line in re.findall(r"^\| bilinear \| ([\d.]+ m) \| ([\d.]+) \|$", text, re.M):
+            assert f"bilinear {', '.join(line)}" in said, name
+    assert "their FRD of 2.05" in text and "FRD 2.05" in results["default"]
+    shares = re.search(r"its range errs (\d+) to (\d+) % less", text)
+    assert shares and f"range {shares[1]} to {shares[2]} % below" in results["default"]
+    with torch.device("meta"):
+        count = sum(p.numel() for p in build_network(preset("r2dm-h")).parameters())
+    assert f"R2DM's network, {count:,} parameters" in text
+    assert len(SENSORS) == 8 and "limits of eight sensors" in text
+
+
+def shipped(name: str) -> dict:
+    path = REPO_ROOT / "src" / "lidarsynth" / "shipped" / name / "experiment.json"
+    return json.loads(path.read_text())
 
 
 @pytest.fixture(scope="module")

@@ -81,8 +81,7 @@ def _model(job: Job) -> ScanModel | None:
     if job.verb == "realise":
         model.check_realises()
         return model
-    model.resolved(job.how)
-    model.at_precision(job.how.precision or "fp32")
+    model.check(job.how)
     check_confident(model, job.how, job.least)
     return model.with_labels() if job.labels else model
 

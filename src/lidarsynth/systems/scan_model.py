@@ -241,6 +241,11 @@ class ScanModel(ABC):
         filled = self.fill_beams(scan, sensor_in, sparse, known, how, on_step)
         return replace(filled, completed=with_measured(loose, sparse.mask, filled, "spherical"))
 
+    def check(self, how: Filling) -> None:
+        """Raises ValueError, before any work, for a request that this model cannot do or would ignore."""
+        self.resolved(how)
+        self.at_precision(how.precision or "fp32")
+
     @abstractmethod
     def resolved(self, how: Filling) -> Filling:
         """The request with this model's own choices. Raises ValueError for what it cannot do, or would ignore."""
