@@ -65,6 +65,21 @@ def test_inversion_reaches_an_image_of_the_generator():
     assert_close(fits[-1].latents.square().mean(1), torch.ones(2))
 
 
+def test_an_inversion_follows_the_schedule_of_learning_rates(monkeypatch: pytest.MonkeyPatch):
+    rates = []
+
+    class Recorded(torch.optim.Adam):
+        def step(self, *arguments):
+            rates.append(self.param_groups[0]["lr"])
+            return super().step(*arguments)
+
+    monkeypatch.setattr(torch.optim, "Adam", Recorded)
+    reference, mask = torch.full((2, 1, 8, 16), 0.5), torch.ones(2, 1, 8, 16)
+    list(invert(lambda z: z.expand(2, 1, 8, 16), torch.zeros(2, 1, 1, 1), reference, mask, LIMITS, 10, 0.1))
+    assert rates == pytest.approx([0.1 * learning_rate_factor(step / 10) for step in range(10)])
+    assert rates[0] < max(rates) == pytest.approx(0.1) and rates[-1] < 0.1
+
+
 def test_depth_conversions_equal_the_reference(fixture_tensors):
     expected = fixture_tensors("gan_coords")
     inverse = to_inverse_depth(expected["depth"], *LIMITS)

@@ -165,3 +165,16 @@ def test_errors_say_both_sides():
         next(langevin(denoiser, x, rng, rate=2))
     with pytest.raises(ValueError, match=r"mask must be \(1, 2, 4, 4\) or \(1, 1, 4, 4\), got \(1, 3, 4, 4\)"):
         next(langevin_posterior(denoiser, x, x, torch.zeros(1, 3, 4, 4), rng))
+
+
+@pytest.mark.parametrize("weight", [0.25, 1.0])
+def test_the_weight_is_the_share_of_the_way_to_known_pixels_in_every_step(weight):
+    """Without noise, and told that every image is clean, only the pull of the known pixels moves anything."""
+    still = Denoiser(lambda x_t, log_snr: x_t, ve(), "x_0", clip=False)
+    x_1, known = torch.rand(2, 1, 2, 4, 8, generator=torch.Generator().manual_seed(0))
+    mask = torch.zeros(1, 1, 4, 8)
+    mask[..., ::2] = 1
+    *_, last = langevin_posterior(still, x_1, known, mask, torch.zeros_like, weight, levels=2, steps=2)
+    left = 1 - weight  # of the way, after each of four steps; the last pull but one is that of the fourth step again
+    rest = left * (left**4 - weight * left**3)
+    torch.testing.assert_close(last.x_s, x_1 + mask * (1 - rest) * (known - x_1), atol=1e-5, rtol=0)

@@ -17,7 +17,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.systems.diffusion.model import LidarModel
-from lidarsynth.systems.scan_model import sparse_image
+from lidarsynth.systems.known_pixels import sparse_image
 from lidarsynth.systems.table import assemble
 
 

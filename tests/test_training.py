@@ -252,6 +252,11 @@ def test_loss_is_the_mean_over_generation_and_completion():
     torch.testing.assert_close(losses, {"generation": generation, "completion": completion})
 
 
+def test_nothing_decays_the_weights_unless_it_is_said():
+    run = start(TINY, network(), task_of(TINY))
+    assert [group["weight_decay"] for group in run.optimizers["network"].param_groups] == [0.0]
+
+
 def test_a_network_that_cannot_be_told_the_known_pixels_is_not_taught_completion():
     experiment = with_fields(TINY, {"model.network": "efficient-unet"})
     with pytest.raises(ValueError, match=r"generation_share: expected 1 for efficient-unet, .* found 0.5"):

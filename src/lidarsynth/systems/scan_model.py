@@ -16,12 +16,12 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.measured import rays_with_points, with_measured
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.hub import push
+from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
 
 if TYPE_CHECKING:
@@ -343,60 +343,4 @@ def imaged_by(experiment: Experiment, sensor: Sensor) -> Experiment:
     return with_fields(
         experiment,
         {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width},
-    )
-
-
-def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
-    """(H, W) bool: the given pixels, or the measured ones. Raises ValueError for another shape or type."""
-    known = image.mask if known is None else known
-    if known.shape != image.shape or known.dtype != np.bool_:
-        raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
-    return known
-
-
-def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
-    """The given sensor, or as recognised from the points. Raises ValueError when it is not."""
-    if sensor_in is None:
-        sensor_in, reason = recognise(scan)
-        if sensor_in is None:
-            raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
-    return get_sensor(sensor_in) if isinstance(sensor_in, str) else sensor_in
-
-
-def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeImage, np.ndarray]:
-    """A scan of `sensor_in` in the image of `sensor`, and which pixels it looked at: (H, W) bool.
-
-    A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
-    in that direction. Raises ValueError when no point falls into the image.
-    """
-    image = project(replace(scan, ring=None), sensor, "spherical")
-    if not image.mask.any():
-        raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
-    own = project(scan, sensor_in, "auto", width=sensor.width)
-    gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
-    # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.
-    beams = np.flatnonzero((gap.min(axis=1) < 0.5) & (own.mask.mean(axis=1) > 0.02))
-    known = image.mask.copy()
-    # A beam of fewer returns a turn than columns leaves gaps: empty is what has no return within two columns.
-    answered = np.any([np.roll(own.mask, shift, axis=1) for shift in range(-2, 3)], axis=0)
-    for beam in beams:
-        known[gap[beam].argmin()] |= ~answered[beam]
-    return image, known
-
-
-def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
-    """The filled image with every known pixel replaced by its measurement, bit by bit."""
-    measured = known & image.mask
-    mask = np.where(known, image.mask, filled.mask)
-    reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
-    points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
-    sure = None if filled.confidence is None else np.where(known, np.float32(1), filled.confidence)
-    return RangeImage(
-        range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
-        reflectance=np.where(mask, reflectance, 0).astype(np.float32),
-        mask=mask,
-        sensor=filled.sensor,
-        label=None if filled.label is None else np.where(mask, filled.label, 0),
-        xyz=points,
-        confidence=sure,
     )

@@ -31,8 +31,9 @@ from lidarsynth.systems.cascade.known import best_known, known_of, spread, unans
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.known_pixels import sensor_that_made, with_known
 from lidarsynth.systems.precision import resolved_precision
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, sensor_that_made, with_known
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 
 METHODS = ("auto", "conditional", "sample", "repaint")
 SAMPLERS = tuple(STEPS)

@@ -22,7 +22,8 @@ from lidarsynth.networks.conditional import ConditionalUNet
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.diffusion.description import DESCRIPTION
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.scan_model import OnStep, ScanModel, with_known
+from lidarsynth.systems.known_pixels import with_known
+from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 METHODS = ("auto", "conditional", "repaint", "posterior")
 REPAINT_STEPS, REPAINT_RESAMPLES = 32, 10  # R2DM, section IV-C

@@ -21,7 +21,8 @@ from lidarsynth.networks.gan.scan_generator import ScanGenerator
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.gan.description import DESCRIPTION
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, with_known
+from lidarsynth.systems.known_pixels import with_known
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 
 METHODS = ("auto", "inversion")
 STEPS = 500  # of an inversion, as published

@@ -15,7 +15,8 @@ from lidarsynth.networks.interpolation import Interpolation, interpolate
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.description import DESCRIPTION
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by, with_known
+from lidarsynth.systems.known_pixels import with_known
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 
 
 def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImage:

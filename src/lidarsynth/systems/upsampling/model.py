@@ -21,12 +21,8 @@ from lidarsynth.networks.iln import ILN, LIIF
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.scan_model import (
-    OnStep,
-    ScanModel,
-    imaged_by,
-    with_known,
-)
+from lidarsynth.systems.known_pixels import with_known
+from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 from lidarsynth.systems.upsampling.description import DESCRIPTION
 
 HARDLY = 0.02  # share of a row's pixels; of a beam with fewer known ones nothing is known
