@@ -269,12 +269,14 @@ def test_an_adapted_network_has_the_statistics_of_the_images():
     """The first normalisation holds the mean and the variance of what reaches it; weights and the original stay."""
     network, images = RangeNet(21, 2).eval(), [scene(i) for i in range(4)]
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    new = adapted(network, images)
     values = torch.from_numpy(np.stack([pixels(image) for image in images]))
+    x = network.network_input(values, values[:, :1] > 0)
+    new = adapted(network, [x[:2], x[2:]])
     with torch.no_grad():
-        reached = new.backbone.conv1(new.network_input(values, values[:, :1] > 0))
-    torch.testing.assert_close(new.backbone.bn1.running_mean, reached.mean((0, 2, 3)))
-    torch.testing.assert_close(new.backbone.bn1.running_var, reached.var((0, 2, 3)))
+        reached = new.backbone.conv1(x).unflatten(0, (2, 2))
+    torch.testing.assert_close(new.backbone.bn1.running_mean, reached.mean((0, 1, 3, 4)))
+    torch.testing.assert_close(new.backbone.bn1.running_var, reached.var((1, 3, 4)).mean(0))
+    assert new.backbone.bn1.momentum == 0.01
     torch.testing.assert_close(network.state_dict(), before)
     torch.testing.assert_close(new.head.state_dict(), network.head.state_dict())
     with pytest.raises(ValueError, match="found none"):
