@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from street import SENSOR, WORD, labelled
+from street_geometry import geometry
 from street_network import Reader, counted
 from torch import Tensor, nn
 
@@ -132,20 +133,46 @@ def cells(counts: np.ndarray) -> str:
 
 
 def taken_for(network: RangeNet, folder: Path) -> Iterator[str]:
-    """Rows: each class, its share, and the four classes that its pixels are read as most often."""
-    counts = confusion(network, labelled(folder))
-    yield "| class | share | read as |"
-    yield "|---|---:|---|"
+    """Rows: what each class of the real scans is read as, and how it looks there and in the streets.
+
+    share; median reflectance; median height above the lowest ground around, cm; median bend of the ring, mm per metre.
+    """
+    real = labelled(folder)
+    counts = confusion(network, real)
+    there, streets = looks(real), looks(held_out())
+    yield "| class | share, % | reflectance | above ground, cm | bend, mm/m | read as |"
+    yield "|---|---|---|---|---|---|"
     for k in np.flatnonzero(counts[:, 1:].sum(1) * (np.arange(len(CLASSES)) > 0)):
         most = np.argsort(-counts[k])[:4]
         read_as = ", ".join(f"{CLASSES[m][0]} {counts[k, m] / counts[k].sum():.0%}" for m in most)
-        yield f"| {CLASSES[k][0]} | {counts[k].sum() / counts[1:].sum():.1%} | {read_as} |"
+        pairs = zip(there[k], streets[k], (".1f", ".2f", ".0f", ".1f"), strict=True)
+        yield f"| {CLASSES[k][0]} | {' | '.join(f'{a:{f}}, {b:{f}}' for a, b, f in pairs)} | {read_as} |"
+
+
+def looks(images: Sequence[RangeImage]) -> np.ndarray:
+    """(20, 4) share in percent, median reflectance, height in cm and bend in mm/m of each class; NaN for none."""
+    rows = np.full((len(CLASSES), 4), np.nan)
+    told = [geometry(pixels(image)) for image in images]
+    label = np.concatenate([np.where(image.mask, image.label, 0).ravel() for image in images])
+    columns = [
+        np.concatenate([image.reflectance.ravel() for image in images]),
+        np.concatenate([100 * (part[6].ravel() + 0.5) for part in told]),
+        np.concatenate([np.expm1(part[1].ravel() + 1.5) for part in told]),
+    ]
+    for k in np.unique(label[label > 0]):
+        rows[k] = [100 * (label == k).sum() / (label > 0).sum(), *(np.median(v[label == k]) for v in columns)]
+    return rows
+
+
+def held_out() -> list[RangeImage]:
+    """Streets as they are without any variation, which street-1's network has not seen."""
+    return [SyntheticStreets(12, 1 << 40, SENSOR, apart=True).image(k) for k in range(1024, 1032)]
 
 
 def why(network: RangeNet, folder: Path) -> Iterator[str]:
     """Rows: the real scans as they are, then with one thing made as the streets have it."""
     real = labelled(folder)
-    streets = [SyntheticStreets(12, 1 << 40, SENSOR, apart=True).image(k) for k in range(1024, 1032)]
+    streets = held_out()
     classes = np.arange(20)
     medians = [np.array([_median(images, k) for k in classes]) for images in (real, streets)]
     yield "| real scans | mIoU | road | sidewalk | building | vegetation | pixels right |"
