@@ -150,10 +150,8 @@ def main() -> None:
     parser.add_argument("--judge", type=Path, nargs="+", default=[])
     args = parser.parse_args()
     torch.set_num_threads(1)
-    kinds = places(args.scans)
-    counts = np.bincount(
-        np.concatenate([classes_of(i).ravel() for i in kinds["as the sensor sees them"]]), minlength=20
-    )
+    kinds = {"generated, labelled": generated(args.generated)} if args.generated else places(args.scans)
+    counts = np.bincount(np.concatenate([classes_of(i).ravel() for i in list(kinds.values())[-1]]), minlength=20)
     counts = np.where(np.arange(20) > 0, counts, 0)
     weights = class_weights(counts / counts.sum()) * (torch.arange(20) > 0)
     judges = {folder.name: labelled(folder) for folder in args.judge}

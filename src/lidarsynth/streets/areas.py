@@ -118,8 +118,8 @@ class Density:
         new["parked"] = (min(low, 1.0), min(high, 1.0))
         green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
         new |= {name: getattr(self, name) for name in ("groups", "motorcycles", "works")}
-        new["kerb"] = area.kerb * self.kerbs
-        return replace(area, **new, **green, on_road=area.on_road * self.pedestrians)
+        green["on_road"], green["kerb"] = area.on_road * self.pedestrians, area.kerb * self.kerbs
+        return replace(area, **new, **green)
 
 
 def _scaled(bounds: Range, factor: float) -> Range:
