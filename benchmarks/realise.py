@@ -4,8 +4,9 @@ python benchmarks/realise.py --streets 64 [--sensor hdl-64e-kitti] [--model defa
 python benchmarks/realise.py --real FOLDER [--model default]           real scans of HDL-64E, their holes filled first
 
 The perfect scan of a street is what its rays meet; that of a real scan is its completion by the same model. Both are
-judged against what the sensor really reported. Beside it: nothing dropped, and as many rays dropped at random; these
-two get the mean reflectance of the truth. Columns:
+judged against what the sensor really reported. Beside it: nothing dropped, as many rays dropped at random, and in each
+beam as many as the truth drops there (cf. the frequency maps of DUSty v2); these get the mean reflectance of the truth.
+Columns:
 
 dropped          share of the perfect scan's rays that do not return
 beam, range, class   mean absolute difference of that share, per beam, per range bin, per class, in percentage points
@@ -76,11 +77,15 @@ def made(pairs: Sequence[Pair], model: ScanModel) -> dict[str, list[RangeImage]]
     mean = float(np.mean([s.reflectance[s.mask].mean() for _, s in pairs]))
     lit = [replace(p, reflectance=(mean * p.mask).astype(np.float32)) for p in perfect]
     thinned = [p.keep(np.random.default_rng(k).random(p.shape) >= lost) for k, p in enumerate(lit)]
+    rays = sum(p.mask.sum(1) for p in perfect)
+    kept = sum((p.mask & s.mask).sum(1) for p, s in pairs) / np.maximum(rays, 1)
+    beams = [p.keep(np.random.default_rng(k).random(p.shape) < kept[:, None]) for k, p in enumerate(lit)]
     real = [model.realised(p.to_scan(), p.sensor, seed=k) for k, p in enumerate(perfect)]
     real = [replace(r, completed=None, xyz=None) for r in real]
     return {
         "nothing dropped": lit,
         "as many at random": thinned,
+        "as many in each beam": beams,
         "realised": real,
         "as the sensor saw it": [s for _, s in pairs],
     }

@@ -1,16 +1,19 @@
-"""Why a network of synthetic streets misreads real scans, and what helps: the sensor's height, tilt and response vary.
+"""Why a network of synthetic streets misreads real scans, and what helps: streets that vary, statistics, geometry.
 
 python benchmarks/street_classes.py --why FOLDER          real scans with one thing made as the streets have it
-python benchmarks/street_classes.py --scans 360 --minutes 15 --judge FOLDER...
+python benchmarks/street_classes.py --confusion FOLDER    what each class is taken for
+python benchmarks/street_classes.py --scans 960 --minutes 35 --geometry --judge FOLDER... --unlabelled FOLDER
 
-The second goes on training the network of street-1 on streets whose sensor stands a few centimetres higher or lower,
-tilts by half a degree, and answers a little brighter or darker, each scan its own; classes differ in brightness from
-scan to scan. No real scan is learned from. Folders are read as `benchmarks/street.py --classes` reads them.
+The third goes on training the network of street-1 on streets as recorded on many days (`streets/recordings.py`), with
+`--geometry` told what a pixel's neighbours say of its surface (`street_geometry.py`). No real label is learned from;
+`--unlabelled` gives the batch normalisations the statistics of real scans without labels (AdaBN). `--scans 0` trains
+nothing. Folders are read as `benchmarks/street.py --classes` reads them.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -19,72 +22,157 @@ from pathlib import Path
 import numpy as np
 import torch
 from street import SENSOR, WORD, labelled
+from street_geometry import geometry
+from street_network import Reader, counted
+from torch import Tensor, nn
 
+from lidarsynth.files.formats import read
+from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.metrics.reconstruction import class_iou
 from lidarsynth.networks.rangenet import RangeNet
-from lidarsynth.streets.reader import SyntheticStreets, Worlds
-from lidarsynth.streets.sensor_model import Optics
-from lidarsynth.systems.segmentation.training import CrossEntropy, SegmentationBatch, confusion
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.streets.recordings import RecordedStreets
+from lidarsynth.streets.world import POSES
+from lidarsynth.systems.segmentation.adaptation import adapted
+from lidarsynth.systems.segmentation.training import class_weights, confusion, pixels
 from lidarsynth.weights.load import load_parts
 
-PER_WORLD, BATCH, COLUMNS = 6, 4, 512
+PER_WORLD, IMAGES, COLUMNS = 4, 3, 256
+RATE, KEPT = 2e-3, 0.97  # learning rate; share of the former average that a step keeps
+Sample = tuple[np.ndarray, np.ndarray]  # (5, H, W) as `pixels`, (H, W) classes
 
 
 def varied(seed: int, count: int) -> Iterator[RangeImage]:
-    """Scans of which each has a sensor and materials of its own."""
-    worlds = Worlds(seed, replace(SENSOR, mount=2.0, elevations=(4.0, *SENSOR.elevations[1:])))
-    rng = np.random.default_rng((seed, 99))
-    for k in range(count):
-        tilt = (float(rng.normal(0, 0.6)), float(rng.normal(0, 0.5)))
-        sensor = replace(SENSOR, mount=float(rng.normal(1.76, 0.07)), tilt=tilt)
-        optics = Optics(gamma=float(rng.uniform(0.65, 1.2)), scale=float(rng.uniform(0.8, 1.25)),
-                        strength=float(rng.uniform(-0.02, 0.05)))  # fmt: skip
-        reader = SyntheticStreets(seed, 1 << 30, sensor, optics=optics, worlds=worlds)
-        image = reader.image(16 * (k // PER_WORLD) + int(rng.integers(16)))
-        assert image.label is not None
-        bright = rng.uniform(0.75, 1.4, 20)[image.label]
-        yield replace(image, reflectance=np.clip(image.reflectance * bright, 0, 0.99).astype(np.float32))
+    """Four places of each world, each recorded on another day."""
+    streets = RecordedStreets(seed, 1 << 40)
+    return (streets.image(POSES * (k // PER_WORLD) + 4 * (k % PER_WORLD)) for k in range(count))
 
 
-def batches(images: list[RangeImage], weights: torch.Tensor, seed: int) -> Iterator[SegmentationBatch]:
-    """Endless batches of cuts, mirrored and thinned at random."""
+def cuts(image: RangeImage, rng: np.random.Generator) -> Sample:
+    """The scan turned, mirrored, thinned and answering otherwise, as (5, H, W) and (H, W)."""
+    assert image.label is not None
+    values, label = pixels(image), np.where(image.mask, image.label, 0)
+    gamma, scale, each = rng.uniform(0.8, 1.25), rng.uniform(0.85, 1.15), np.exp(rng.normal(0, 0.12, len(CLASSES)))
+    values[4] = np.clip(values[4] ** gamma * scale * each[label], 0, 0.99)
+    turn = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else rng.normal(0, 0.15)
+    if rng.random() < 0.5:
+        c, s = np.cos(turn), np.sin(turn)
+        values[1], values[2] = c * values[1] - s * values[2], s * values[1] + c * values[2]
+    gone = (rng.random(label.shape) < 0.1 * rng.random()) | (rng.random((len(label), 1)) < 0.15 * rng.random())
+    values[:, gone], label[gone] = 0, 0
+    if rng.random() < 0.5:
+        values, label = values[:, :, ::-1].copy(), label[:, ::-1].copy()
+        values[2] *= -1
+    return values, label
+
+
+def batches(reader: Reader, images: Sequence[RangeImage], seed: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Endless batches of two cuts, opposite to each other, of each of IMAGES scans."""
     rng = np.random.default_rng(seed)
     while True:
-        pixels, labels = [], []
-        for image in (images[k] for k in rng.integers(len(images), size=BATCH)):
-            assert image.label is not None
-            columns = (rng.integers(image.shape[1]) + np.arange(COLUMNS)) % image.shape[1]
-            xyz = image.points()[:, columns]
-            parts = [np.linalg.norm(xyz, axis=-1), *np.moveaxis(xyz, -1, 0), image.reflectance[:, columns]]
-            stack, label = np.stack(parts).astype(np.float32), image.label[:, columns]
-            gone = (rng.random(label.shape) < 0.1 * rng.random()) | (rng.random((64, 1)) < 0.2 * rng.random())
-            stack, label = np.where(gone, 0, stack), np.where(gone, 0, label)
-            if rng.random() < 0.5:
-                stack, label = stack[:, :, ::-1].copy(), label[:, ::-1].copy()
-                stack[2] *= -1
-            pixels.append(stack)
-            labels.append(label)
-        yield SegmentationBatch(torch.from_numpy(np.stack(pixels)), torch.from_numpy(np.stack(labels)), weights)
+        inputs, labels = [], []
+        for image in (images[k] for k in rng.integers(len(images), size=IMAGES)):
+            values, label = cuts(image, rng)
+            x, first = reader.prepared(values[None]), rng.integers(image.shape[1])
+            for start in (first, first + image.shape[1] // 2):
+                columns = (start + np.arange(COLUMNS)) % image.shape[1]
+                inputs.append(x[..., columns])
+                labels.append(torch.from_numpy(label[:, columns]))
+        yield torch.cat(inputs), torch.stack(labels)
 
 
-def judged(network: RangeNet, folders: list[Path]) -> str:
-    """mIoU of the classes there, IoU of road and vegetation, and pixels right of each folder."""
-    return "; ".join(f"{folder.name}: {scores(network, labelled(folder))}" for folder in folders)
+def trained(reader: Reader, images: Sequence[RangeImage], minutes: float) -> Reader:
+    """The average of the weights over the last steps, after that many minutes."""
+    labels = np.concatenate([i.label[::2, ::4].ravel() for i in images[::7] if i.label is not None])
+    counts = np.bincount(labels, minlength=len(CLASSES)).astype(float)
+    counts[0] = 0
+    weights = class_weights(counts / counts.sum())
+    weights[0] = 0
+    optimizer = torch.optim.AdamW(reader.parameters(), RATE, weight_decay=1e-3)
+    average, start = copy.deepcopy(reader), time.monotonic()
+    reader.train()
+    for step, (x, label) in enumerate(batches(reader, images, 1)):
+        part = (time.monotonic() - start) / (60 * minutes)
+        if part >= 1:
+            print(f"{step} steps", flush=True)
+            break
+        for group in optimizer.param_groups:
+            group["lr"] = RATE * min(1, (step + 1) / 20) * (0.5 + 0.5 * np.cos(np.pi * part))
+        losses = nn.functional.cross_entropy(reader(x), label, weights, ignore_index=0, reduction="none")
+        optimizer.zero_grad()
+        (losses.sum() / (label > 0).sum()).backward()
+        nn.utils.clip_grad_norm_(reader.parameters(), 2.0)
+        optimizer.step()
+        with torch.no_grad():
+            for mine, new in zip(average.state_dict().values(), reader.state_dict().values(), strict=True):
+                mine.lerp_(new, 1 - KEPT) if mine.is_floating_point() else mine.copy_(new)
+    return average.eval()
+
+
+def unlabelled(folder: Path, every: int = 3) -> list[RangeImage]:
+    """Every third scan of a folder of KITTI's .bin files."""
+    return [project(read(path), SENSOR, "unfolding") for path in sorted(folder.glob("*.bin"))[::every]]
+
+
+def judged(reader: Reader, folders: Sequence[Path]) -> str:
+    """mIoU of the classes there, IoU of road, sidewalk, building and vegetation, and pixels right of each folder."""
+    return "; ".join(f"{folder.name}: {cells(counted(reader, labelled(folder)))}" for folder in folders)
 
 
 def scores(network: RangeNet, images: Sequence[RangeImage]) -> str:
     """Cells of a table row."""
-    counts = confusion(network, images)
+    return cells(confusion(network, images))
+
+
+def cells(counts: np.ndarray) -> str:
     iou, there = class_iou(counts, (0,)), counts.sum(1)[1:] > 0
     right = np.trace(counts[1:, 1:]) / counts[1:].sum()
     return f"{iou[1:][there].mean():.3f} | {iou[9]:.3f} | {iou[11]:.3f} | {iou[13]:.3f} | {iou[15]:.3f} | {right:.3f}"
 
 
+def taken_for(network: RangeNet, folder: Path) -> Iterator[str]:
+    """Rows: what each class of the real scans is read as, and how it looks there and in the streets.
+
+    share; median reflectance; median height above the lowest ground around, cm; median bend of the ring, mm per metre.
+    """
+    real = labelled(folder)
+    counts = confusion(network, real)
+    there, streets = looks(real), looks(held_out())
+    yield "| class | share, % | reflectance | above ground, cm | bend, mm/m | read as |"
+    yield "|---|---|---|---|---|---|"
+    for k in np.flatnonzero(counts[:, 1:].sum(1) * (np.arange(len(CLASSES)) > 0)):
+        most = np.argsort(-counts[k])[:4]
+        read_as = ", ".join(f"{CLASSES[m][0]} {counts[k, m] / counts[k].sum():.0%}" for m in most)
+        pairs = zip(there[k], streets[k], (".1f", ".2f", ".0f", ".1f"), strict=True)
+        yield f"| {CLASSES[k][0]} | {' | '.join(f'{a:{f}}, {b:{f}}' for a, b, f in pairs)} | {read_as} |"
+
+
+def looks(images: Sequence[RangeImage]) -> np.ndarray:
+    """(20, 4) share in percent, median reflectance, height in cm and bend in mm/m of each class; NaN for none."""
+    rows = np.full((len(CLASSES), 4), np.nan)
+    told = [geometry(pixels(image)) for image in images]
+    label = np.concatenate([np.where(image.mask, image.label, 0).ravel() for image in images])
+    columns = [
+        np.concatenate([image.reflectance.ravel() for image in images]),
+        np.concatenate([100 * (part[6].ravel() + 0.5) for part in told]),
+        np.concatenate([np.expm1(part[1].ravel() + 1.5) for part in told]),
+    ]
+    for k in np.unique(label[label > 0]):
+        rows[k] = [100 * (label == k).sum() / (label > 0).sum(), *(np.median(v[label == k]) for v in columns)]
+    return rows
+
+
+def held_out() -> list[RangeImage]:
+    """Streets as they are without any variation, which street-1's network has not seen."""
+    return [SyntheticStreets(12, 1 << 40, SENSOR, apart=True).image(k) for k in range(1024, 1032)]
+
+
 def why(network: RangeNet, folder: Path) -> Iterator[str]:
     """Rows: the real scans as they are, then with one thing made as the streets have it."""
     real = labelled(folder)
-    streets = [SyntheticStreets(12, 1 << 40, SENSOR, apart=True).image(k) for k in range(1024, 1032)]
+    streets = held_out()
     classes = np.arange(20)
     medians = [np.array([_median(images, k) for k in classes]) for images in (real, streets)]
     yield "| real scans | mIoU | road | sidewalk | building | vegetation | pixels right |"
@@ -119,42 +207,28 @@ def _answering(image: RangeImage, reflectance: np.ndarray) -> RangeImage:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scans", type=int, default=360)
+    parser.add_argument("--scans", type=int, default=0, help="of streets to learn from")
     parser.add_argument("--minutes", type=float, default=15)
+    parser.add_argument("--geometry", action="store_true")
     parser.add_argument("--why", type=Path, help="folder of labelled scans")
+    parser.add_argument("--confusion", type=Path, help="folder of labelled scans")
     parser.add_argument("--judge", type=Path, nargs="+", default=[])
+    parser.add_argument("--unlabelled", type=Path, help="folder of KITTI's .bin files")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    torch.manual_seed(0)
     network = load_parts(WORD)[1]
     assert isinstance(network, RangeNet)
-    if args.why:
-        for row in why(network, args.why):
-            print(row, flush=True)
-        return
-    print("before:", judged(network, args.judge), flush=True)
-    images = list(varied(31, args.scans))
-    labels = np.stack([image.label for image in images if image.label is not None])
-    shares = np.bincount(labels.ravel(), minlength=20)[1:] / max((labels > 0).sum(), 1)
-    weights = torch.tensor([0.0, *(1 / np.log(1.02 + shares))], dtype=torch.float32)
-    objective, start, step = CrossEntropy(network), time.monotonic(), 0
-    optimizer = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=1e-4)
-    for batch in batches(images, weights, 0):
-        part = (time.monotonic() - start) / (60 * args.minutes)
-        if part >= 1:
-            break
-        for group in optimizer.param_groups:
-            group["lr"] = 1e-3 * min(1, (step + 1) / 20) * (0.5 + 0.5 * np.cos(np.pi * part))
-        network.train()
-        with torch.autocast("cpu", torch.bfloat16):
-            loss = objective(batch)["cross_entropy"].mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        step += 1
-        if step % 100 == 0:
-            print(step, f"{loss.item():.3f}", flush=True)
-    network.eval()
-    print(f"after {step} steps:", judged(network, args.judge), flush=True)
+    for row in [*(why(network, args.why) if args.why else ()),
+                *(taken_for(network, args.confusion) if args.confusion else ())]:  # fmt: skip
+        print(row, flush=True)
+    reader = Reader(args.geometry).eval()
+    if args.scans:
+        reader = trained(reader, list(varied(31, args.scans)), args.minutes)
+    print(judged(reader, args.judge), flush=True)
+    if args.unlabelled:
+        reader = adapted(reader, reader.inputs(unlabelled(args.unlabelled)))
+        print("with the statistics of the unlabelled scans:", judged(reader, args.judge), flush=True)
 
 
 if __name__ == "__main__":

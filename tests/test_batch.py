@@ -1,5 +1,6 @@
 """Many scans: which are read, what is written, skipped, failed and told; in parts and in processes."""
 
+import errno
 import json
 from functools import partial
 from pathlib import Path
@@ -67,6 +68,26 @@ def test_what_is_there_is_skipped(scans: Path, tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "o" / "000.npz").stat().st_mtime_ns == first["000.npz"]
     main(["project", str(scans / "d2"), *out, "--skip-existing"])
     assert told(tmp_path / "o")["skipped"] == 2
+
+
+def test_a_full_disk_stops_at_once_and_what_a_kill_left_is_swept(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    words, place = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS], tmp_path / "o"
+    place.mkdir()
+    (place / ".000.0123456789abcdef.part").write_bytes(b"half")
+    (place / ".mine.part").write_bytes(b"a user's own")
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.lidar.whole_file.os.replace", full)
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+    assert capsys.readouterr().err.count("No space left") == 1 and names(place) == [".mine.part"]
+    main(words)
+    assert "2 scans in" in capsys.readouterr().out
+
+
+def full(*names: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_shards_are_the_whole(scans: Path, tmp_path: Path):

@@ -17,6 +17,7 @@ from lidarsynth.experiment.record import Experiment, from_dict, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.systems.segmentation.adaptation import adapted
 from lidarsynth.systems.segmentation.training import (
     CrossEntropy,
     SegmentationBatch,
@@ -28,6 +29,7 @@ from lidarsynth.systems.segmentation.training import (
     draw,
     judge,
     pictures,
+    pixels,
 )
 from lidarsynth.systems.table import assemble, build_network, task_of, transfer
 from lidarsynth.systems.table import load_folder as load
@@ -261,3 +263,21 @@ def test_the_command_line_trains_and_describes_it(cache: Path, tmp_path: Path, c
     main(["info", str(tmp_path)])
     text = capsys.readouterr().out
     assert "RangeNet-21" in text and "98,220" in text and "schedule" not in text
+
+
+def test_an_adapted_network_has_the_statistics_of_the_images():
+    """The first normalisation holds the mean and the variance of what reaches it; weights and the original stay."""
+    network, images = RangeNet(21, 2).eval(), [scene(i) for i in range(4)]
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    values = torch.from_numpy(np.stack([pixels(image) for image in images]))
+    x = network.network_input(values, values[:, :1] > 0)
+    new = adapted(network, [x[:2], x[2:]])
+    with torch.no_grad():
+        reached = new.backbone.conv1(x).unflatten(0, (2, 2))
+    torch.testing.assert_close(new.backbone.bn1.running_mean, reached.mean((0, 1, 3, 4)))
+    torch.testing.assert_close(new.backbone.bn1.running_var, reached.var((1, 3, 4)).mean(0))
+    assert new.backbone.bn1.momentum == 0.01
+    torch.testing.assert_close(network.state_dict(), before)
+    torch.testing.assert_close(new.head.state_dict(), network.head.state_dict())
+    with pytest.raises(ValueError, match="found none"):
+        adapted(network, [])

@@ -11,6 +11,7 @@ from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.streets.recordings import RecordedStreets
 from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
 from lidarsynth.streets.weather import (
     Weather,
@@ -255,3 +256,24 @@ def test_more_comes_beside_what_is_there():
     kinds = [[str(kind) for kind in actors_of(world).kind] for world in (plain, crowded)]
     for kind in ("person", "motorcycle"):
         assert kinds[1].count(kind) > kinds[0].count(kind) + 3
+
+
+def test_kerbs_are_as_high_as_asked_and_all_else_stays():
+    low, plain = (LabelledStreets(0, 1, SMALL, Options(density=Density(kerbs=k)))._worlds[0][0] for k in (0.5, 1))
+    assert low.ground.kerb == pytest.approx(0.06) and plain.ground.kerb == 0.12
+    np.testing.assert_array_equal(low.corners[..., :2], plain.corners[..., :2])
+    raised = plain.corners[..., 2] - low.corners[..., 2]
+    assert np.isclose(raised, 0, atol=1e-5).any() and np.allclose(raised[np.abs(raised) > 1e-3], 0.06, atol=1e-3)
+
+
+def test_recordings_differ_as_days_do():
+    """Four scans share a sensor; another day it stands and answers otherwise, and so does the same place's scan."""
+    streets = RecordedStreets(5, 32)
+    first, other = streets.recording(3), streets.recording(4)
+    assert streets.recording(0) == first and other.sensor.mount != first.sensor.mount
+    assert other.optics.loss != first.optics.loss
+    image = streets.image(20)
+    again = RecordedStreets(5, 99).image(20)
+    np.testing.assert_array_equal(image.range, again.range)
+    np.testing.assert_array_equal(image.reflectance, again.reflectance)
+    assert image.sensor == streets.recording(20).sensor and image.label is not None

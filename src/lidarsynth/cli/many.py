@@ -102,12 +102,15 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
 
 
 def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many) -> list[Result]:
+    from lidarsynth.lidar.whole_file import TOKEN, sweep
     from lidarsynth.verbs.batch import run
     from lidarsynth.verbs.batch_report import merge_shards, parse_shard, report_of, report_path, write_report
     from lidarsynth.verbs.output_files import works
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending = many.format or ("npz" if job.verb == "project" else "ply")
+    if shard[1] == 1:  # other machines may be writing there else
+        sweep(out, deep=True, token=TOKEN)
     stream = works(inputs, out, ending, shard, many.skip_existing, skipped)
     first = next(stream, None)
     model = _model(job) if first is not None else None

@@ -14,7 +14,9 @@ from lidarsynth.training.options import Options
 
 def train(
     preset: Annotated[Positional[str], arg(help="such as default, r2dm-h, tiny.")],
-    data: Annotated[Path | None, arg(metavar="CACHE|synthetic", help="or several, A,B; or streets.")] = None,
+    data: Annotated[
+        Path | None, arg(metavar="CACHE|synthetic|virtual|recordings", help="or several, A,B; or streets.")
+    ] = None,
     out: Annotated[Path | None, arg(help="folder for weights and checkpoints; default runs/PRESET.")] = None,
     weights: Annotated[str | None, arg(name="from", metavar="MODEL", help="start from these weights.")] = None,
     set: Annotated[tuple[str, ...], arg(help="such as training.steps=9; or --training.steps 9.")] = (),

@@ -96,9 +96,10 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    for of, later in ((options, ("perfect",)), (options["density"], ("groups", "motorcycles", "works"))):
-        for name in later:
-            if not of[name]:
+    later: dict[str, Any] = {"perfect": False, "groups": 0, "motorcycles": 0, "works": 0, "kerbs": 1, "rough": 1}
+    for of in (options, options["density"], options["optics"]):
+        for name in later.keys() & of.keys():
+            if of[name] == later[name]:
                 del of[name]  # a set of before there was this choice goes on
     return {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
 

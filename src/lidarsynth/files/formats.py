@@ -154,7 +154,7 @@ def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:
         with whole_file(path) as scratch, open(scratch, "wb") as file:
             write_to(file)
     except OSError as error:
-        raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from None
+        raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from error
 
 
 def _suffix(path: str | Path, known: dict, verb: str) -> str:

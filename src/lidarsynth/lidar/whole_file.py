@@ -41,8 +41,14 @@ def write_whole(path: str | Path, content: str | bytes | memoryview) -> None:
         scratch.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def sweep(folder: str | Path, deep: bool = False) -> None:
-    """Remove what killed processes left unfinished in a folder, and below it if `deep`; nobody may be writing there."""
-    for stale in Path(folder).glob("**/.*.part" if deep else ".*.part"):
+TOKEN = "[0-9a-f]" * 16  # what `whole_file` puts into a name, as a pattern
+
+
+def sweep(folder: str | Path, deep: bool = False, token: str = "*") -> None:
+    """Remove what killed processes left unfinished in a folder, and below it if `deep`; nobody may be writing there.
+
+    token  pattern of the last part of the names; TOKEN where others' hidden files may lie too
+    """
+    for stale in Path(folder).glob(f"{'**/' if deep else ''}.*{'' if token == '*' else '.' + token}.part"):
         with suppress(OSError):
             stale.unlink()

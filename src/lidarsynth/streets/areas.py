@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from lidarsynth.streets.ground import KERB
+
 Range = tuple[float, float]
 
 
@@ -44,6 +46,7 @@ class Area:
     groups: float = 0.0  # of people who stand together, per 100 m and side; these three only where asked for
     motorcycles: float = 0.0
     works: float = 0.0
+    kerb: float = KERB  # m, from carriageway to sidewalk
 
 
 # fmt: off
@@ -90,6 +93,7 @@ class Density:
     """How much of what there is, as factors of what the kind of street has; 1 leaves a world as it is.
 
     groups, motorcycles, works  more, per 100 m and side: groups of people, parked motorcycles, road works
+    kerbs  factor of their height of 12 cm
     """
 
     traffic: float = 1.0  # moving vehicles and cyclists
@@ -99,6 +103,7 @@ class Density:
     groups: float = 0.0
     motorcycles: float = 0.0
     works: float = 0.0
+    kerbs: float = 1.0
 
     def of(self, area: Area) -> Area:
         """The kind of street with these factors. Raises ValueError for a factor below 0."""
@@ -113,7 +118,8 @@ class Density:
         new["parked"] = (min(low, 1.0), min(high, 1.0))
         green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
         new |= {name: getattr(self, name) for name in ("groups", "motorcycles", "works")}
-        return replace(area, **new, **green, on_road=area.on_road * self.pedestrians)
+        green["on_road"], green["kerb"] = area.on_road * self.pedestrians, area.kerb * self.kerbs
+        return replace(area, **new, **green)
 
 
 def _scaled(bounds: Range, factor: float) -> Range:

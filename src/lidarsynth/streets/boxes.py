@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.streets import hdl64e
 from lidarsynth.streets.drive import Moment
 from lidarsynth.streets.moving import Bodies
-from lidarsynth.streets.turn import Turn, attitudes, world_rays
+from lidarsynth.streets.turn import Turn, attitudes, some_rays
 from lidarsynth.streets.world import World
 
 MOVES = 0.2  # m/s from which a thing counts as moving
@@ -89,7 +88,7 @@ def boxes_of(
     found, frames = [], attitudes(sensor, poses)
     for actor in near.tolist():
         met = hits[actors.thing[actor] + 1]
-        alone = _hits_alone(bodies, actor, moment, sensor, turn, frames, late, here[actor]) if met else 0
+        alone = met + _hidden(bodies, actor, moment, sensor, turn, first, frames, late, here[actor]) if met else 0
         front = np.array([np.cos(moment.yaw[actor]), np.sin(moment.yaw[actor]), 0]) @ to_world[:3, :3]
         shown = met / alone if alone else 0.0
         found.append(Box(
@@ -113,25 +112,33 @@ def _about(vectors: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     return np.column_stack([c * x - s * y, s * x + c * y, z])
 
 
-def _hits_alone(
+def _hidden(
     bodies: Bodies,
     actor: int,
     moment: Moment,
     sensor: Sensor,
     turn: Turn,
+    first: np.ndarray,
     frames: tuple[np.ndarray, np.ndarray],
     late: np.ndarray | None,
     here: np.ndarray,
 ) -> int:
-    """How many beams would meet the actor if nothing else were there."""
+    """How many beams would meet the actor if nothing else were there, beside those that meet it first.
+
+    first (H, W): the thing that each beam meets. Only beams that end before the actor or within its reach can be among
+    them; the others passed it by.
+    """
     slack = 0.0 if late is None else 1.0 + 0.06 * float(np.linalg.norm(moment.velocity[actor]))
-    columns = _columns(sensor, here, bodies.reach[actor] + slack)
-    rows = _rows(sensor, here, bodies.reach[actor] + slack)
-    seen = ~hdl64e.hidden(sensor)[:, columns] & rows[:, None]
-    turns, places = frames
-    mine = frames if len(turns) == 1 else (turns[columns], places[columns])
-    origins, rays = world_rays(sensor, turn.rays[:, columns], seen, mine)
-    column = np.broadcast_to(columns, seen.shape)[seen]
+    reach = bodies.reach[actor] + slack
+    tall = bodies.actors.size[actor, 2] / 2 + slack
+    columns, rows = _columns(sensor, here, reach), np.flatnonzero(_rows(sensor, here, reach, tall))
+    part = np.ix_(rows, columns)
+    ended = (turn.first[part] >= 0) & (turn.surface[part] < np.linalg.norm(here) + reach)
+    ended &= first[part] != bodies.actors.thing[actor]
+    if not ended.any():
+        return 0
+    row, column = (of[index] for of, index in zip((rows, columns), np.nonzero(ended), strict=True))
+    origins, rays = some_rays(sensor, turn.rays, row, column, frames)
     after = np.zeros(len(rays)) if late is None else late[column]
     place = moment.place[actor] + after[:, None] * moment.velocity[actor]
     yaw = moment.yaw[actor] + after * moment.spin[actor]
@@ -147,8 +154,14 @@ def _columns(sensor: Sensor, here: np.ndarray, radius: float) -> np.ndarray:
     return np.unique(np.arange(int(middle - spread), int(middle + spread) + 2) % sensor.width)
 
 
-def _rows(sensor: Sensor, here: np.ndarray, radius: float) -> np.ndarray:
-    """(H,) bool: beams that may meet something of that radius (m) at `here` (sensor frame)."""
-    away = np.linalg.norm(here)
-    half = np.pi if away <= radius else np.arcsin(radius / away) + 0.03
-    return np.abs(np.radians(sensor.elevations) - np.arcsin(here[2] / max(away, 1e-6))) < half
+def _rows(sensor: Sensor, here: np.ndarray, radius: float, tall: float) -> np.ndarray:
+    """(H,) bool: beams that may meet something of that radius and half height (m) at `here` (sensor frame).
+
+    Both frames may be tilted against each other by six degrees.
+    """
+    away, half = float(np.hypot(here[0], here[1])), tall + 0.05 + 0.1 * radius
+    if away <= radius:
+        return np.ones(sensor.height, bool)
+    slopes = [np.arctan2(here[2] + z, d) for z in (-half, half) for d in (away - radius, away + radius)]
+    beams = np.radians(sensor.elevations)
+    return (beams > min(slopes) - 0.03) & (beams < max(slopes) + 0.03)

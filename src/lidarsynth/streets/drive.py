@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarsynth.streets.actors import Actors, actors_of
 from lidarsynth.streets.areas import TODAY, Area, Density
-from lidarsynth.streets.ground import KERB, Ground, Road
+from lidarsynth.streets.ground import Ground, Road
 from lidarsynth.streets.layout import draw_area, fill
 from lidarsynth.streets.traffic import STEP, follow
 from lidarsynth.streets.world import REACH, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground
@@ -88,7 +88,7 @@ class Drive:
             mine = self.number == number
             x, y, heading = road.at(s[mine], self.aside[mine])
             walks = (self.actors.pace[mine] == WALK) & (self.world.ground.carriageway(x, y) > 0) & (road.walk > 0)
-            place[mine] = np.column_stack([x, y, self.world.ground.height(x, y) + KERB * walks])
+            place[mine] = np.column_stack([x, y, self.world.ground.height(x, y) + self.world.ground.kerb * walks])
             yaw[mine] = heading + np.where(self.ahead[mine] > 0, 0, np.pi)
         return place, yaw
 

@@ -9,7 +9,7 @@ import numpy as np
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.streets.materials import NUMBER
 
-KERB = 0.12  # metres from carriageway to sidewalk
+KERB = 0.12  # metres from carriageway to sidewalk, unless said otherwise
 CROWN = 0.018  # fall of a carriageway from its middle to its edges
 BUMPS = (0.006, 0.014)  # metres, unevenness of paved and of other ground
 
@@ -70,6 +70,7 @@ class Ground:
     verge: str = "grass"
     patches: np.ndarray = field(default_factory=lambda: np.zeros((4, 3), np.float32))  # kx, ky, phase of wear
     phase: float = 0.0  # where the dashes of markings start
+    kerb: float = KERB  # metres from carriageway to sidewalk
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Metres above the origin of the bare ground, carriageway level."""
@@ -166,8 +167,8 @@ def slab_mesh(ground: Ground, step: float = 2.5) -> tuple[np.ndarray, np.ndarray
             continue
         s = np.arange(road.start, road.stop, step)
         for side in (-1, 1):
-            edge = [_rail(ground, road, t, side * d, up) for t in (s, s + step)
-                    for d, up in ((road.half, 0.0), (road.half, KERB), (road.half + road.walk, KERB))]  # fmt: skip
+            profile = ((road.half, 0.0), (road.half, ground.kerb), (road.half + road.walk, ground.kerb))
+            edge = [_rail(ground, road, t, side * d, up) for t in (s, s + step) for d, up in profile]
             low_a, a, b, low_b, c, e = edge
             x, y, _ = road.at(s + step / 2, np.full(s.shape, side * (road.half + 0.2)))
             open_ = ground.carriageway(x, y, skip=i) > 0.1

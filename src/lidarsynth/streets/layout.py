@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.streets.areas import AREAS, TODAY, Area, Density
-from lidarsynth.streets.ground import KERB, Road
+from lidarsynth.streets.ground import Road
 from lidarsynth.streets.more import more
 from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground, draw_poses
 
@@ -227,7 +227,7 @@ def car_park(builder: WorldBuilder, road: Road, side: int) -> None:
 def kerbside(builder: WorldBuilder, road: Road, side: int, main: bool) -> None:
     """Trees, lamps, signs, bollards, bins, bicycles and people on or beside the sidewalk."""
     rng, area = builder.rng, builder.area
-    up = KERB if road.walk > 0 else 0.0
+    up = builder.ground.kerb if road.walk > 0 else 0.0
     strip = max(road.walk, 1.5)
     spacing = rng.uniform(*area.trees)
     if spacing > 0.5:
@@ -263,7 +263,7 @@ def parked(builder: WorldBuilder, road: Road, side: int, places: Array) -> None:
     if width == 0:
         if road.walk < 1.5 or rng.random() > 0.25:
             return
-        share, up = share * 0.3, KERB
+        share, up = share * 0.3, builder.ground.kerb
     s = np.arange(road.start, road.stop, 5.4)
     s = s[rng.random(len(s)) < share] + rng.normal(0, 0.25)
     d = side * (road.half - 1.05 + (1.6 if up else 0)) + rng.normal(0, 0.08, len(s))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.streets.ground import KERB, Road
+from lidarsynth.streets.ground import Road
 from lidarsynth.streets.world import WorldBuilder
 
 
@@ -33,7 +33,7 @@ def _group(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
     x, y, _ = road.at(s + far * np.cos(around), side * middle + far * np.sin(around))
     cx, cy, _ = road.at(np.array([s]), np.array([side * middle]))
     yaw = np.arctan2(cy - y, cx - x) + rng.normal(0, 0.3, count)
-    builder.put("person", x, y, yaw, up=KERB if road.walk > 0 else 0.0, clear=0.0)
+    builder.put("person", x, y, yaw, up=builder.ground.kerb if road.walk > 0 else 0.0, clear=0.0)
 
 
 def _motorcycles(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
@@ -43,7 +43,7 @@ def _motorcycles(builder: WorldBuilder, road: Road, side: int, s: float) -> None
     place = s + 0.95 * np.arange(count)
     x, y, along = road.at(place, np.full(count, side * (road.half + 1.1)))
     yaw = along + rng.choice([0.5, np.pi / 2]) + rng.normal(0, 0.08, count)
-    builder.put("motorcycle", x, y, yaw, up=KERB if road.walk > 0 else 0.0, clear=0.0)
+    builder.put("motorcycle", x, y, yaw, up=builder.ground.kerb if road.walk > 0 else 0.0, clear=0.0)
 
 
 def _works(builder: WorldBuilder, road: Road, side: int, s: float) -> None:

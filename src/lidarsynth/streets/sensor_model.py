@@ -73,6 +73,7 @@ class Optics:
     strength          signal above that sensor's: more of it, fewer drop-outs
     gamma, scale      reported reflectance = scale * reflectance ** gamma, at most 1
     fade              factor of the signal lost with distance
+    rough             factor of the roughness of leaves, grass, gravel, stone and bark
     surfaces          per material (signal, spread, grain) as this laser's colour sees it, or () for `materials.TABLE`
     """
 
@@ -84,6 +85,7 @@ class Optics:
     gamma: float = 1.0
     scale: float = 1.0
     fade: float = 1.0
+    rough: float = 1.0
     surfaces: tuple[tuple[float, float, float], ...] = ()
 
     @property
@@ -161,7 +163,7 @@ def sense(
     distance = (
         distance
         + depth / np.maximum(cosine, 0.12)
-        + noise[0] * np.float32(eye.noise) * _spread(material, distance)
+        + noise[0] * np.float32(eye.noise) * _spread(material, distance, eye.rough)
         + lasers.shift
     )
     gone |= ~(distance < max_range)
@@ -192,11 +194,11 @@ def _steady(face: np.ndarray, number: np.ndarray) -> np.ndarray:
     return (mixed >> np.uint32(16)).astype(np.float32) * np.float32(2**-16)
 
 
-def _spread(material: np.ndarray, distance: np.ndarray) -> np.ndarray:
+def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.ndarray:
     """(N,) metres, standard deviation of the range: the sensor's noise and the surface's roughness."""
     table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
-        table[NUMBER[name]] = rough
+        table[NUMBER[name]] = rough * factor
     return np.hypot(table[material], np.clip(distance * np.float32(NOISE[0]), *NOISE[1:]))
 
 

@@ -97,6 +97,18 @@ def world_rays(
     return origins[seen], np.einsum("hwj,wij->hwi", rays, turns)[seen]
 
 
+def some_rays(
+    sensor: Sensor, rays: np.ndarray, row: np.ndarray, column: np.ndarray, frames: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `world_rays`, of the N rays at (row, column)."""
+    turns, places = (part[column] if len(part) > 1 else part for part in frames)
+    start = np.zeros((len(row), 1), np.float32) + np.float32(sensor.mount)
+    if sensor.offsets:
+        start += np.asarray(sensor.offsets, np.float32)[row, None]
+    turned = np.einsum("nj,nij->ni", rays[row, column], np.broadcast_to(turns, (len(row), 3, 3)))
+    return start * turns[:, :, 2] + places, turned
+
+
 def local_points(rays: np.ndarray, distance: np.ndarray, sensor: Sensor) -> np.ndarray:
     """(H, W, 3) float32 points in the sensor frame, zero where nothing returned."""
     points = rays * distance[..., None]

@@ -119,7 +119,7 @@ def draw_ground(rng: np.random.Generator, area: Area, length: float = 2 * REACH[
     banks = rng.normal(0, area.bank, 2) if area.bank else np.zeros(2)
     patches = np.column_stack([rng.normal(0, 0.6, (4, 2)), rng.uniform(0, 6.28, 4)]).astype(np.float32)
     return Ground(tuple(roads), (slope[0], slope[1]), hills, (banks[0], banks[1]), str(rng.choice(area.verge)), patches,
-                  float(rng.uniform(0, 9)))  # fmt: skip
+                  float(rng.uniform(0, 9)), area.kerb)  # fmt: skip
 
 
 def draw_poses(rng: np.random.Generator, ground: Ground) -> tuple[np.ndarray, np.ndarray]:

@@ -24,21 +24,23 @@ from lidarsynth.training.task import Draw
 
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
 VIRTUAL = "virtual"  # the same, by virtual sensors that are drawn too
+RECORDINGS = "recordings"  # the same, by KITTI's sensor as it is on other days
+ENDLESS = (SYNTHETIC, VIRTUAL, RECORDINGS)
 
 
 class Streets:
     """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
 
-    virtual  each seen by a sensor that is drawn from the seed (`VirtualStreets`), and not by `sensor`
+    word  of ENDLESS: seen by `sensor`, by sensors drawn from the seed (`VirtualStreets`), or by KITTI's on many days
+          (`RecordedStreets`)
 
     Raises ImportError naming the extra when the ray caster is missing.
     """
 
-    def __init__(self, seed: int, sensor: Sensor, virtual: bool = False):
+    def __init__(self, seed: int, sensor: Sensor, word: str = SYNTHETIC):
         self.seed = seed
         self.sensor = sensor
-        self.virtual = virtual
-        self.source = {"name": VIRTUAL if virtual else SYNTHETIC, "seed": seed}
+        self.source = {"name": word, "seed": seed}
         self._readers: dict[int, Any] = {}
 
     def indices(self, step: int, batch_size: int) -> list[int]:
@@ -53,16 +55,21 @@ class Streets:
 
     def take(self, indices: list[int]) -> list[RangeImage]:
         """Scans as images, with labels."""
-        from lidarsynth.streets.reader import SyntheticStreets
-        from lidarsynth.streets.virtual import VirtualStreets
-
         images = []
         for slot, index in enumerate(indices):  # a reader per slot, because a reader remembers only two worlds
             if slot not in self._readers:
-                streets = SyntheticStreets(self.seed, 1 << 62, self.sensor)
-                self._readers[slot] = VirtualStreets(self.seed, 1 << 62) if self.virtual else streets
+                self._readers[slot] = self._reader()
             images.append(self._readers[slot].image(index))
         return images
+
+    def _reader(self) -> Any:
+        from lidarsynth.streets.reader import SyntheticStreets
+        from lidarsynth.streets.recordings import RecordedStreets
+        from lidarsynth.streets.virtual import VirtualStreets
+
+        if self.source["name"] == SYNTHETIC:
+            return SyntheticStreets(self.seed, 1 << 62, self.sensor)
+        return (VirtualStreets if self.source["name"] == VIRTUAL else RecordedStreets)(self.seed, 1 << 62)
 
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]."""
@@ -73,13 +80,13 @@ TrainingImages = CachedImages | SeveralCaches | Streets  # what a network can le
 
 
 def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> TrainingImages:
-    """The images of a cache folder, or streets of `seed` (default the experiment's) for `synthetic` and `virtual`.
+    """The images of a cache folder, or streets of `seed` (default the experiment's) for a word of ENDLESS.
 
     Several folders, with commas between them, are seen equally often. Raises ValueError when one is no cache.
     """
-    if str(data) in (SYNTHETIC, VIRTUAL):
+    if str(data) in ENDLESS:
         seed = experiment.training.seed if seed is None else seed
-        return Streets(seed, build_sensor(experiment), str(data) == VIRTUAL)
+        return Streets(seed, build_sensor(experiment), str(data))
     if "," in str(data) and not Path(data).exists():
         return SeveralCaches(str(data).split(","))
     return CachedImages(data)

@@ -8,7 +8,7 @@ from torch import nn
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.training.examples import SYNTHETIC, VIRTUAL, Streets, open_images
+from lidarsynth.training.examples import ENDLESS, Streets, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.task import Task
 
@@ -27,7 +27,7 @@ class Monitor:
         self._experiment = experiment
         self._task = task
         self._source = validation or data
-        held_out = validation is not None or str(data) in (SYNTHETIC, VIRTUAL)
+        held_out = validation is not None or str(data) in ENDLESS
         self._name = "validation" if held_out else "training_images"
         self._images: list[RangeImage] = []
         if validation is not None:  # now, and not in 5,000 steps

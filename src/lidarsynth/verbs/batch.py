@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -104,7 +105,7 @@ class Result:
 
 def run(job: Job, works: Iterable[Work], workers: int = 1, model: ScanModel | None = None,
         on_step: OnStep = None) -> Iterator[Result]:  # fmt: skip
-    """The results in order; a scan that fails comes as its error.
+    """The results in order; a scan that fails comes as its error. Raises ValueError when the disk is full.
 
     workers  processes, each with a model of its own; below 2 the work is done here, with `model` if it is given
     """
@@ -141,6 +142,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         else:
             _store(work.target, done, loaded, job)
     except (ValueError, FloatingPointError) as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise  # that is no fault of the scan, and the next ones would not fit either
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, str(error))
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
