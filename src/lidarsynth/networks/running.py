@@ -17,6 +17,11 @@ def running_max(x: Tensor, dim: int, size: int, least: int) -> Tensor:
     """
     if not torch.compiler.is_exporting():
         return x.cummax(dim).values
+    return doubled_max(x, dim, size, least)
+
+
+def doubled_max(x: Tensor, dim: int, size: int, least: int) -> Tensor:
+    """`running_max` by doubling: maxima with what lies 1, 2, 4, ... before."""
     before = 2 * (x.ndim - 1 - dim % x.ndim)  # places of `pad` that belong to later axes
     step = 1
     while step < size:
