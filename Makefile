@@ -44,19 +44,20 @@ fuzz: $(STAMP)
 bench: $(STAMP)
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
-# The package as others get it, tried on every Python from 3.10 to 3.13 that is at hand.
+# The package as others get it, tried on every Python from 3.10 to 3.13 that is at hand: by its name, of pyenv or of uv.
+# TORCH= leaves torch out and tries what does without it: the help of every verb, the reading of a scan.
+TORCH ?= torch
 wheel: $(STAMP)
 	rm -rf dist
 	$(BIN)/pip install --quiet --disable-pip-version-check build
 	$(BIN)/python -m build --outdir dist .
 	for v in 3.10 3.11 3.12 3.13; do \
-	  command -v python$$v > /dev/null || { echo "python$$v is not at hand: not tried"; continue; }; \
-	  python$$v -m venv dist/venv$$v && \
-	  dist/venv$$v/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch && \
-	  dist/venv$$v/bin/pip install --quiet --disable-pip-version-check "$$(ls dist/*.whl)[synthetic]" && \
-	  (cd dist && venv$$v/bin/python -c "import lidarsynth" && venv$$v/bin/lidarsynth --help > /dev/null && \
-	   venv$$v/bin/lidarsynth generate -n 1 --steps 2 --no-picture --out tried$$v) || exit 1; \
-	  rm -rf dist/venv$$v; \
+	  python=; for found in python$$v $$(pyenv prefix $$v 2> /dev/null)/bin/python $$(uv python find $$v 2> /dev/null); do \
+	    $$found -c "import sys; assert '%d.%d' % sys.version_info[:2] == '$$v'" 2> /dev/null && python=$$found && break; \
+	  done; \
+	  test -n "$$python" || { echo "Python $$v is not at hand: not tried"; continue; }; \
+	  bash tests/wheel.sh $$python dist/$$v "$(TORCH)" || exit 1; \
+	  echo "Python $$v: tried"; \
 	done
 
 # The documentation as a site, in site/; warnings are errors.

@@ -10,8 +10,8 @@ from networks import trained
 
 from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.corruption import corrupt
-from lidarsynth.lidar.measured import rays_with_points, with_measured
-from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.measured import with_measured
+from lidarsynth.lidar.projection import occupied, pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.reconstruction import reconstruction_errors
@@ -95,11 +95,11 @@ def test_with_measured_by_hand():
     scan = Scan(np.stack([2 * near, near, np.float32([1, 0, 9])]), np.float32([0.1, 0.2, 0.3]))
     measured = np.zeros((4, 8), bool)
     measured[1, 2] = True
-    points = with_measured(scan, measured, filled, "spherical")
+    points = with_measured(scan, measured, filled, pixel_of_points(scan, filled.sensor, "spherical"))
     np.testing.assert_array_equal(points.xyz, np.stack([2 * near, near, FLAT.points(distance)[3, 5], [1, 0, 9]]))
     np.testing.assert_array_equal(points.reflectance, np.float32([0.1, 0.2, 0.5, 0.3]))
     assert points.ring is None
-    seen = with_measured(scan[:2], measured, filled, "spherical")
+    seen = with_measured(scan[:2], measured, filled, pixel_of_points(scan[:2], filled.sensor, "spherical"))
     np.testing.assert_array_equal(seen.ring, [1, 1, 3])
 
 
@@ -108,7 +108,7 @@ def test_a_scan_without_reflectance_takes_that_of_its_pixels():
     distance[1, 2] = distance[2, 6] = 10
     filled = image(distance, reflectance=0.75)
     scan = Scan(FLAT.points(filled.range)[filled.mask], np.zeros(2, np.float32))
-    points = with_measured(scan, filled.mask, filled, "spherical")
+    points = with_measured(scan, filled.mask, filled, pixel_of_points(scan, filled.sensor, "spherical"))
     np.testing.assert_array_equal(points.reflectance, np.float32([0.75, 0.75]))
 
 
@@ -145,7 +145,8 @@ def test_the_library_completes_as_the_command_line_does(word: str):
     np.testing.assert_array_equal(rows_of(asked.to_scan()), rows_of(told.points))
     if word != "tiny-gan":  # which knows no reflectance, and what was measured has one
         assert np.isin(rows_of(sparse), rows_of(asked.to_scan())).all(), "bit by bit"
-    there = rays_with_points(sparse, sensor, model.experiment.data.projection) & ~model.image_of(sparse).mask
+    pixels = pixel_of_points(sparse, sensor, model.experiment.data.projection)
+    there = occupied(sparse, sensor, pixels) & ~model.image_of(sparse).mask
     assert there.any()
     assert not asked.mask[there].any(), "nothing stands before a point beyond the limits"
 

@@ -18,7 +18,7 @@ from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.fill_unet import FillUNet
-from lidarsynth.networks.running import running_max
+from lidarsynth.networks.running import doubled_max
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.filling import Filling
@@ -51,10 +51,10 @@ def run(path: Path, **inputs: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("dim", [0, 1, 2, -1])
-def test_doubling_is_the_running_maximum(dim: int):
+def test_doubling_is_the_doubled_maximum(dim: int):
     x = torch.randint(-1, 50, (3, 17, 33), generator=torch.Generator().manual_seed(1), dtype=torch.int32)
     for size in (x.shape[dim], 64):
-        assert torch.equal(running_max(x, dim, size, -1), x.cummax(dim).values)
+        assert torch.equal(doubled_max(x, dim, size, -1), x.cummax(dim).values)
 
 
 @pytest.mark.slow

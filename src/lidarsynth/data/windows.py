@@ -9,7 +9,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from lidarsynth.data.workers import watch_parent
+from lidarsynth.data.workers import keep_memory, watch_parent
 
 _work: list[Callable[[Any], Any]] = []  # of this worker process
 
@@ -45,6 +45,7 @@ def in_window(
 
 def _start(make: Callable[[], Callable[[Any], Any]]) -> None:
     watch_parent()
+    keep_memory()
     _work.append(make())
 
 

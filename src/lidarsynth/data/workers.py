@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from typing import Any
+
+TRIM, MMAP = -1, -3  # of mallopt(3): memory above the one goes back to the system, above the other it comes apart
+LARGEST = 1 << 25  # bytes, of MMAP; what glibc allows at most
 
 _make: list[Callable[[int], Any]] = []  # of this worker process; sent once, not with every item
 
@@ -38,6 +43,7 @@ def in_order(make: Callable[[int], Any], items: Sequence[int], workers: int) -> 
 
 def _start(make: Callable[[int], Any]) -> None:
     watch_parent()
+    keep_memory()
     _make.append(make)
 
 
@@ -45,6 +51,16 @@ def watch_parent() -> None:
     """In a worker: Ctrl-C is the parent's to handle; a parent that was killed takes its workers along."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def keep_memory() -> None:
+    """In a worker: images' memory is kept for the next image, which asking the system for it anew slows by a tenth."""
+    if sys.platform != "linux":
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # not of every C library
+    if mallopt is not None:
+        mallopt(MMAP, LARGEST)
+        mallopt(TRIM, 32 * LARGEST)
 
 
 def _end_with_parent() -> None:

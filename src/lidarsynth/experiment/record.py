@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+from functools import lru_cache
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -222,7 +223,7 @@ def from_dict(values: Any, source: str = "experiment", record: type = Experiment
     """
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected a table of {[f.name for f in fields(record)]}, found {values!r:.60}")
-    hints = get_type_hints(record)
+    hints = _hints(record)
     if unknown := values.keys() - hints.keys():
         raise ValueError(f"{source}: expected the fields {sorted(hints)}, found {sorted(unknown)}")
     needed = {f.name for f in fields(record) if f.default is MISSING and f.default_factory is MISSING}
@@ -233,6 +234,9 @@ def from_dict(values: Any, source: str = "experiment", record: type = Experiment
         return record(**found)
     except ValueError as error:  # of a range
         raise ValueError(f"{source}.{error}") from None
+
+
+_hints = lru_cache(get_type_hints)  # of a record, which takes a millisecond
 
 
 def _value(value: Any, hint: Any, source: str) -> Any:
@@ -265,7 +269,7 @@ def with_fields(experiment: Experiment, changes: dict[str, Any]) -> Experiment:
         part = getattr(experiment, group, None) if group in {f.name for f in fields(experiment)} else None
         if not is_dataclass(part) or name not in {f.name for f in fields(part)}:
             raise ValueError(f"expected an experiment field such as training.steps, found {path!r}")
-        value = _value(value, get_type_hints(type(part))[name], path)
+        value = _value(value, _hints(type(part))[name], path)
         try:
             experiment = replace(experiment, **{group: replace(part, **{name: value})})  # type: ignore[type-var]
         except ValueError as error:  # of a range

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarsynth.lidar.cones import fit_cones
+from lidarsynth.lidar.crowding import height_of_beams
 from lidarsynth.lidar.ground import levels, road_axis
 from lidarsynth.lidar.recognition import recognise, rings_by_elevation, rings_in_order
 from lidarsynth.lidar.scan import Scan
@@ -58,10 +59,14 @@ class Frame:
 
 
 def check_frame(scan: Scan) -> Frame:
-    """In which frame a scan's points are. A scan without rings is only tested for its axes, by the ground."""
+    """In which frame a scan's points are.
+
+    Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height by where
+    elevations crowd; a tilt only where they crowd on rings all the same.
+    """
     up, has_rings = _upright(scan)
     rotation, words = np.array(AXES[up][0], np.float64), AXES[up][1]
-    tip, height = _tilt_and_height(scan, rotation) if has_rings else (np.eye(3), 0.0)
+    tip, height = _stand(scan, rotation, has_rings)
     faults, hints = [words] if words else [], []
     tilt = float(np.degrees(np.arccos(np.clip(tip[2, 2], -1, 1))))
     if tilt > TILTED:
@@ -76,6 +81,18 @@ def check_frame(scan: Scan) -> Frame:
     matrix[:3, :3] = rotation
     matrix[2, 3] = -height if abs(height) > RAISED else 0.0
     return Frame(tuple(faults), tuple(hints), matrix)
+
+
+def _stand(scan: Scan, rotation: np.ndarray, has_rings: bool) -> tuple[np.ndarray, float]:
+    """`_tilt_and_height`, also of a scan whose rings are not said."""
+    xyz = (scan.xyz @ rotation.T).astype(np.float32)
+    if scan.ring is not None or rings_in_order(xyz) is not None:
+        return _tilt_and_height(scan, rotation) if has_rings else (np.eye(3), 0.0)
+    height = height_of_beams(xyz)
+    if height is not None or not has_rings:
+        return np.eye(3), height or 0.0
+    tip, height = _tilt_and_height(scan, rotation)
+    return (tip, height) if np.degrees(np.arccos(np.clip(tip[2, 2], -1, 1))) > TILTED else (np.eye(3), 0.0)
 
 
 def _tilt_and_height(scan: Scan, rotation: np.ndarray) -> tuple[np.ndarray, float]:

@@ -1,4 +1,4 @@
-"""What a scan measured, beside an image of it: rays with any point at all, and all of its points beside new ones."""
+"""What a scan measured, beside an image of it: all of its points, and the new ones."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarsynth.lidar.projection import occupied, pixel_of_points
+from lidarsynth.lidar.projection import Pixels
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import Sensor
 
 
-def rays_with_points(scan: Scan, sensor: Sensor, projection: str) -> np.ndarray:
-    """(H, W) bool: pixels that any point falls into, at whatever range: nothing is to be put before it."""
-    return occupied(scan, sensor, projection)
-
-
-def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projection: str) -> Scan:
+def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: Pixels) -> Scan:
     """Every point of the scan bit by bit, and the pixels of `filled` outside `measured` (H, W) bool as new points.
+
+    pixels  of the scan's points in the image
+
 
     Points come row by row, each row from behind over the left; those above or below the view come last, and only
     without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
@@ -26,7 +23,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, projecti
     `extra["new"]` is 1 for new points; where the image has `confidence`, measured points have 1.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
-    row, column = pixel_of_points(scan, filled.sensor, projection)
+    row, column = pixels
     reflectance, label = scan.reflectance, scan.label
     if not reflectance.any():
         reflectance = np.where(row >= 0, filled.reflectance[row, column], reflectance)

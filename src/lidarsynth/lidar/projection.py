@@ -10,13 +10,19 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor
 PROJECTIONS = ("auto", "spherical", "unfolding")
 
 
-def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int | None = None) -> RangeImage:
+Pixels = tuple[np.ndarray, np.ndarray]  # row and column of each point, as `pixel_of_points` gives them
+
+
+def project(
+    scan: Scan, sensor: Sensor | str, method: str = "auto", width: int | None = None, pixels: Pixels | None = None
+) -> RangeImage:
     """Draw a scan into the sensor's image; the nearest point of a pixel wins (R2DM, section III-A).
 
     method  `spherical`: row by elevation; `unfolding`: row by ring (Triess et al. 2020), from `scan.ring` or from the
             point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, else spherical;
             also on an even grid, whose rows are no beam's
     width   columns of the image, if other than the sensor's
+    pixels  of the points, where they are known already
 
     Points outside the range limits leave their pixel empty, also where they hide a farther point, as in the published
     program. Raises ValueError for an unknown method, and for unfolding when the points do not come ring by ring.
@@ -27,18 +33,19 @@ def project(scan: Scan, sensor: Sensor | str, method: str = "auto", width: int |
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {method!r}")
     depth = _length(*scan.xyz.T)
     if not (depth > 0).all():
-        scan, depth = scan[depth > 0], depth[depth > 0]
-    row = row_of_points(scan, sensor, method)
-    pixel = row * sensor.width + _columns(scan.xyz, sensor.width)
+        scan, depth, pixels = scan[depth > 0], depth[depth > 0], None
+    row, column = pixel_of_points(scan, sensor, method) if pixels is None else pixels
+    pixel = row * sensor.width + column
     return _draw(scan, sensor, depth, pixel, row >= 0)
 
 
-def occupied(scan: Scan, sensor: Sensor, method: str) -> np.ndarray:
-    """(H, W) bool: pixels that any point falls into, at whatever range; methods as in `project`."""
-    row = row_of_points(scan, sensor, method)
-    inside = (row >= 0) & (_length(*scan.xyz.T) > 0)
+def occupied(scan: Scan, sensor: Sensor, pixels: Pixels) -> np.ndarray:
+    """(H, W) bool: pixels that any point falls into, at whatever range; `pixels` are those of the points."""
+    row, column = pixels
+    x, y, z = scan.xyz.T
+    inside = (row >= 0) & ((x != 0) | (y != 0) | (z != 0))
     hit = np.zeros((sensor.height, sensor.width), bool)
-    hit[row[inside], _columns(scan.xyz[inside], sensor.width)] = True
+    hit[row[inside], column[inside]] = True
     return hit
 
 
@@ -92,7 +99,7 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     return np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
 
 
-def pixel_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> tuple[np.ndarray, np.ndarray]:
+def pixel_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> Pixels:
     """Row, as `row_of_points`, and column of each point in the sensor's image, (N,) int64 each."""
     return row_of_points(scan, sensor, method), _columns(scan.xyz, sensor.width)
 

@@ -28,7 +28,7 @@ def recognise(scan: Scan, path: str | Path | None = None) -> tuple[str | None, s
     if len(scan) < 100:
         return None, f"{where}expected at least 100 points to tell the sensor, found {len(scan)}: name it with --sensor"
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
-    if ring is not None and len(np.unique(ring)) > 1:
+    if ring is not None and ring.min() < ring.max():
         name, reason = _by_rings(scan.xyz, ring)
     else:
         name, reason = _by_points(scan.xyz)
@@ -60,10 +60,9 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
 
 
 def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
-    rings = [_far(points) for points in _split(xyz, ring) if len(points) >= 5]
-    if len(rings) < 2:
-        return None, f"{len(rings)} rings of at least 5 points"
-    beams = np.stack([points[np.linspace(0, len(points) - 1, ENOUGH).astype(int)] for points in rings])
+    beams = _beams(xyz, ring)
+    if len(beams) < 2:
+        return None, f"{len(beams)} rings of at least 5 points"
     middle = _elevation(beams, 0.0)
     order = np.argsort(-middle, kind="stable")
     beams, middle = beams[order], middle[order]
@@ -79,10 +78,21 @@ def _by_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[str | None, str]:
     return None, found
 
 
-def _split(xyz: np.ndarray, ring: np.ndarray) -> list[np.ndarray]:
-    """The points of each ring, in the order of the rings' numbers."""
-    order = np.argsort(ring, kind="stable")
-    return np.split(xyz[order], np.flatnonzero(np.diff(ring[order])) + 1)
+def _beams(xyz: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """(rings, ENOUGH, 3) points of each ring of at least 5, evenly from those beyond FAR, where those are 5 too."""
+    if (ring[1:] < ring[:-1]).any():
+        order = np.argsort(ring, kind="stable")
+        xyz, ring = xyz[order], ring[order]
+    far = np.hypot(xyz[:, 0], xyz[:, 1]) > FAR
+    ends = np.append(np.flatnonzero(ring[1:] != ring[:-1]) + 1, len(ring))
+    starts = np.append(0, ends[:-1])
+    farther = np.append(0, np.cumsum(far))
+    enough = (farther[ends] - farther[starts] >= 5)[:, None]  # else all: the lowest beams of a small robot's sensor
+    first = np.where(enough, farther[starts][:, None], starts[:, None])
+    last = np.where(enough, farther[ends][:, None], ends[:, None]) - 1
+    rank = first + np.linspace(0, (last - first)[:, 0], ENOUGH, axis=1).astype(int)
+    place = np.where(enough, np.flatnonzero(far)[np.minimum(rank, far.sum() - 1)] if far.any() else rank, rank)
+    return xyz[place[ends - starts >= 5]]
 
 
 def _far(points: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +156,7 @@ class Sensor:
 
     def to_dict(self) -> dict:
         """Plain lists and numbers, the inverse of `from_dict`."""
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self).items()}
 
 
 def from_dict(values: dict, source: str = "sensor") -> Sensor:

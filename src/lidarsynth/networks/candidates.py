@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.networks.running import running_max, size_of
@@ -16,6 +15,8 @@ from lidarsynth.networks.running import running_max, size_of
 RANGE_CANDIDATES = 10
 REFLECTANCE_CANDIDATES = 6  # mean of the sides, above, below, left, right, nearest
 LOW, AT_LEAST = 0.01, 0.004  # radians below the horizon from which on a plane may be the ground, and least sine
+SHIFTS = (0, -1, 1, -2, 2)  # rows in which the nearest value at all is sought, the nearer ones first
+NOWHERE = 1 << 30  # eighths of squared pixels
 
 
 class Candidates(NamedTuple):
@@ -34,49 +35,77 @@ def candidates(metres: Tensor, reflectance: Tensor, returned: Tensor, lit: Tenso
     """Hypotheses from the known returns.
 
     metres, reflectance (B, 1, H, W), looked at where `returned` and `lit` (B, 1, H, W) bool: a known return, and one
-    of known reflectance. A pixel without any hypothesis gets the ground's range, or a reflectance of 0.25.
+    of known reflectance. A pixel without any hypothesis gets the ground's range, or a reflectance of 0.25. All of a
+    known pixel's are what is known: the work is done for the others.
     """
-    found, distance, source = _sides(returned)  # (B, 4, H, W): above, below, left, right
-    r = _take(metres, source)
-    elevation = rays.elevation.expand_as(metres)
-    e = _take(elevation, source)
-    wall = r * (e.cos() / elevation.cos())
-    wall[:, 2:] = r[:, 2:]
-    low = elevation.sin().clamp(max=-AT_LEAST)
-    ground = r[:, :2] * e[:, :2].sin().clamp(max=-AT_LEAST) / low
-    usable = found[:, :2] & (e[:, :2] < -LOW) & (elevation < -0.8 * LOW)
-    weight = found / distance.clamp_min(1)
+    around = _nearest(returned)
+    codes = _laid(_codes(metres, around, rays), encode_range(metres), returned, around.place)
+    near = _laid(around.found / (1 + around.distance), torch.ones_like(metres), returned, around.place)
+    around = around if _same(lit, returned) else _nearest(lit)
+    return Candidates(codes, _laid(_reflectances(reflectance, around), reflectance, lit, around.place), near)
+
+
+class _Around(NamedTuple):
+    """The N pixels that are to be filled, and the known ones around each.
+
+    place (N,) in the flattened batch; found, distance, source (4, N): whether there is a known pixel above, below, left
+    and right, how many pixels away, and its flat index; nearest (N,): the flat index of the nearest known one within
+    two rows, by those to the left and right in each, where `some` (N,) says that there is one.
+    """
+
+    place: Tensor
+    found: Tensor
+    distance: Tensor
+    source: Tensor
+    nearest: Tensor
+    some: Tensor
+
+
+def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
+    """(10, N) range codes."""
+    found, distance, source = around.found, around.distance, around.source
+    r, tilt = metres.flatten()[source], rays.elevation.expand_as(metres).flatten()
+    e, elevation = tilt[source], tilt[around.place]
+    wall = torch.cat([r[:2] * (e[:2].cos() / elevation.cos()), r[2:]])
+    ground = r[:2] * e[:2].sin().clamp(max=-AT_LEAST) / elevation.sin().clamp(max=-AT_LEAST)
+    usable = found[:2] & (e[:2] < -LOW) & (elevation < -0.8 * LOW)
     code = encode_range(r)
-    total = weight.sum(1, keepdim=True)
-    cross = (weight * code).sum(1, keepdim=True) / total.clamp_min(1e-9)
-    cross = torch.where(total > 0, cross, encode_range(rays.ground))
+    cross = _mean(code, found, distance, encode_range(rays.ground.expand_as(metres).flatten()[around.place]))
     # by angle between the beams above and below: linear in code, and in 1/r, which is exact on any plane
-    span = (e[:, :1] - e[:, 1:2]).clamp_min(1e-6)
-    share = ((e[:, :1] - elevation) / span).clamp(0, 1)
-    both = found[:, :1] & found[:, 1:2]
-    one = torch.where(found[:, :1], code[:, :1], torch.where(found[:, 1:2], code[:, 1:2], cross))
-    column = torch.where(both, code[:, :1] * (1 - share) + code[:, 1:2] * share, one)
-    inverse = (1 - share) / r[:, :1].clamp_min(0.1) + share / r[:, 1:2].clamp_min(0.1)
+    share = ((e[0] - elevation) / (e[0] - e[1]).clamp_min(1e-6)).clamp(0, 1)
+    both = found[0] & found[1]
+    one = torch.where(found[0], code[0], torch.where(found[1], code[1], cross))
+    column = torch.where(both, code[0] * (1 - share) + code[1] * share, one)
+    inverse = (1 - share) / r[0].clamp_min(0.1) + share / r[1].clamp_min(0.1)
     plane = torch.where(both, encode_range(1 / inverse), column)
     sides = torch.where(found, encode_range(wall), cross)
     grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
-    around = _around(code[:, 2:], distance[:, 2:], found[:, 2:], sides[:, 2:3], elevation)
-    known = encode_range(metres)
-    codes = torch.cat([cross, column, plane, sides, grounds, around], 1)
-    codes = torch.where(returned, known, codes)
-    near = found / (1 + distance)
-    return Candidates(codes, _reflectances(reflectance, lit, returned, (found, distance, source)), near)
+    nearest = torch.where(around.some, encode_range(metres.flatten()[around.nearest]), sides[2])
+    return torch.cat([torch.stack([cross, column, plane]), sides, grounds, nearest[None]])
 
 
-def _reflectances(reflectance: Tensor, lit: Tensor, returned: Tensor, sides: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    found, distance, source = sides if _same(lit, returned) else _sides(lit)
-    f = _take(reflectance, source)
+def _reflectances(reflectance: Tensor, around: _Around) -> Tensor:
+    """(6, N) reflectances."""
+    f = reflectance.flatten()[around.source]
+    cross = _mean(f, around.found, around.distance, f.new_full((), 0.25))
+    nearest = torch.where(around.some, reflectance.flatten()[around.nearest], cross)
+    return torch.cat([cross[None], torch.where(around.found, f, cross), nearest[None]])
+
+
+def _mean(values: Tensor, found: Tensor, distance: Tensor, other: Tensor) -> Tensor:
+    """(N,) the mean of the four sides by nearness, `other` where there is none."""
     weight = found / distance.clamp_min(1)
-    total = weight.sum(1, keepdim=True)
-    cross = torch.where(total > 0, (weight * f).sum(1, keepdim=True) / total.clamp_min(1e-9), 0.25)
-    around = _around(f[:, 2:], distance[:, 2:], found[:, 2:], cross, None)
-    values = torch.cat([cross, torch.where(found, f, cross), around], 1)
-    return torch.where(lit, reflectance, values)
+    total = weight.sum(0)
+    return torch.where(total > 0, (weight * values).sum(0) / total.clamp_min(1e-9), other)
+
+
+def _laid(values: Tensor, known: Tensor, where: Tensor, place: Tensor) -> Tensor:
+    """(B, C, H, W): values (C, N) at their places, and `known` (B, 1, H, W) in all channels `where` it is known."""
+    shape = (len(values), len(known), *known.shape[2:])
+    if torch.compiler.is_exporting():  # there all pixels are places
+        return torch.where(where, known, values.view(shape).transpose(0, 1))
+    whole = known.transpose(0, 1).expand(shape).flatten(1)
+    return whole.index_copy(1, place, values).view(shape).transpose(0, 1)
 
 
 def _same(lit: Tensor, returned: Tensor) -> bool:
@@ -84,46 +113,74 @@ def _same(lit: Tensor, returned: Tensor) -> bool:
     return lit is returned or (not torch.compiler.is_exporting() and torch.equal(lit, returned))
 
 
-def _sides(known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the nearest known pixel above, below, left and right: whether there is one, its distance, its flat index."""
+def _nearest(known: Tensor) -> _Around:
+    """The known pixels (B, 1, H, W) around all others; in an exported network, of fixed shapes, around all pixels."""
     height, width = known.shape[2:]
-    rows = torch.arange(height, dtype=torch.int32)[:, None].expand(height, width)
-    columns = torch.arange(width, dtype=torch.int32)[None].expand(height, width)
-    k = known[:, 0]
-    above = _last(torch.where(k, rows, -1), 1)
-    below = height - 1 - _last(torch.where(k, rows, height).flip(1).sub(height - 1).neg(), 1).flip(1)
-    before = _last(torch.where(k, columns, -1), 2)
-    after = width - 1 - _last(torch.where(k, columns, width).flip(2).sub(width - 1).neg(), 2).flip(2)
+    sides = _sides(known[:, 0])
+    every = torch.arange(known.numel(), device=known.device)
+    place = every if torch.compiler.is_exporting() else every[~known.flatten()]
+    row, column, up, down, left, right = (part.flatten()[place] for part in sides)
+    found = torch.stack([up >= 0, down < height, left >= -width, right < 2 * width])
+    distance = torch.stack([row - up, down - row, column - left, right - column])
+    rows = torch.stack([up - row, down - row]) * width
+    columns = torch.stack([_turned(left, width), _turned(right, width)]) - column
+    source = place + torch.where(found, torch.cat([rows, columns]), 0)
+    some, nearest = _nearest_at_all(place, row, sides)
+    return _Around(place, found, distance.float(), source, nearest, some)
+
+
+def _nearest_at_all(place: Tensor, row: Tensor, sides: _Sides) -> tuple[Tensor, Tensor]:
+    """`nearest` and `some` of `_Around`, the latter first; of equally near ones the earlier shift's, left before right.
+
+    In a row the nearest one is that to the left or that to the right, the same for whoever looks from another row.
+    """
+    height, width = sides.row.shape[1:]
+    left, right = sides.column - sides.before, sides.after - sides.column
+    step = torch.where(left <= right, _turned(sides.before, width), _turned(sides.after, width)) - sides.column
+    away = torch.where(sides.before >= -width, 8 * torch.minimum(left, right).square(), NOWHERE).flatten()
+    shift = torch.tensor(SHIFTS, dtype=torch.int32, device=place.device)[:, None]  # (5, 1) against (N,)
+    inside = (row + shift >= 0) & (row + shift < height)
+    beside = torch.where(inside, place + shift * width, place)
+    turn = torch.arange(len(SHIFTS), dtype=torch.int32, device=place.device)[:, None]
+    best = torch.where(inside, away[beside] + (8 * shift.square() + turn), NOWHERE).amin(0)
+    some = best < NOWHERE
+    there = torch.where(some, place + shift[best.remainder(8).clamp(max=len(SHIFTS) - 1).long(), 0] * width, place)
+    return some, torch.where(some, there + step.flatten()[there], place)
+
+
+class _Sides(NamedTuple):
+    """Of each pixel, (B, H, W) int32: its row and column; the row of the nearest known one above and below; the column
+    of that to the left and right.
+
+    -1 and H where the column has none; columns count on around the turn, and lie a turn beyond it where a row has none.
+    """
+
+    row: Tensor
+    column: Tensor
+    above: Tensor
+    below: Tensor
+    before: Tensor
+    after: Tensor
+
+
+def _sides(known: Tensor) -> _Sides:
+    height, width = known.shape[1:]
+    rows = torch.arange(height, dtype=torch.int32, device=known.device)[:, None].expand(known.shape)
+    columns = torch.arange(width, dtype=torch.int32, device=known.device).expand(known.shape)
+    above = _last(torch.where(known, rows, -1), 1)
+    below = height - 1 - _last(torch.where(known, height - 1 - rows, -1).flip(1), 1).flip(1)
+    before = _last(torch.where(known, columns, -1), 2)
+    after = width - 1 - _last(torch.where(known, width - 1 - columns, -1).flip(2), 2).flip(2)
     before = torch.where(before < 0, before[..., -1:] - width, before)
     after = torch.where(after >= width, after[..., :1] + width, after)
-    found = torch.stack([above >= 0, below < height, before >= -width, after < 2 * width], 1)
-    distance = torch.stack([rows - above, below - rows, columns - before, after - columns], 1).float()
-    row = torch.stack([above.clamp(0), below.clamp(max=height - 1), rows.expand_as(k), rows.expand_as(k)], 1)
-    column = torch.stack([columns.expand_as(k)] * 2 + [before % width, after % width], 1)
-    return found, distance, (row * width + column).long()
+    return _Sides(rows, columns, above, below, before, after)
+
+
+def _turned(column: Tensor, width: int) -> Tensor:
+    """Columns of -width to 2 width - 1 as those of the turn."""
+    return column + width * ((column < 0).int() - (column >= width).int())
 
 
 def _last(place: Tensor, dim: int) -> Tensor:
     """The last known place up to each, -1 for none."""
     return running_max(place, dim, size_of(place, dim), -1)
-
-
-def _take(values: Tensor, source: Tensor) -> Tensor:
-    """(B, 1, H, W) at flat indices (B, 4, H, W)."""
-    return values.flatten(2).expand(-1, 4, -1).gather(2, source.flatten(2)).view(source.shape)
-
-
-def _around(values: Tensor, distance: Tensor, found: Tensor, other: Tensor, elevation: Tensor | None) -> Tensor:
-    """(B, 1, H, W): the nearest known value within two rows, by those to the left and right in each; else `other`."""
-    far = torch.where(found, distance.square(), torch.inf)
-    best, best_value = torch.full_like(other, torch.inf), other
-    tall, taller = F.pad(values, (0, 0, 2, 2)), F.pad(far, (0, 0, 2, 2), value=torch.inf)
-    height = values.shape[2]
-    for shift in (0, -1, 1, -2, 2):
-        here = slice(2 + shift, 2 + shift + height)
-        for side in (0, 1):
-            away = taller[:, side : side + 1, here] + shift**2
-            closer = away < best
-            best_value = torch.where(closer, tall[:, side : side + 1, here], best_value)
-            best = torch.minimum(best, away)
-    return best_value

@@ -61,8 +61,13 @@ class Block(nn.Module):
         nn.init.normal_(self.second.weight, std=0.1 / math.sqrt(9 * out))
 
     def forward(self, x: Tensor) -> Tensor:
-        h = ring(F.silu(self.norm(x)), 2)
-        return self.skip(x) + self.second(F.silu(self.first(h)))
+        h = ring(_silu(self.norm(x)), 2)
+        return self.skip(x) + self.second(_silu(self.first(h)))
+
+
+def _silu(fresh: Tensor) -> Tensor:
+    """`F.silu` of a tensor that nobody else has, in its own memory where no gradient asks for it."""
+    return F.silu(fresh, inplace=not torch.is_grad_enabled())
 
 
 class Pointwise(nn.Linear):
@@ -139,9 +144,9 @@ class FillUNet(nn.Module):
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
         out = _to_pixels(self.out(h))
-        filled = _assemble(out, guesses, noise)
+        filled, shares = _assemble(out, guesses, noise)
         if doubt:
-            filled = filled._replace(spread=_spread(out, filled.code, guesses), near=guesses.near)
+            filled = filled._replace(spread=_spread(shares, filled.code, guesses), near=guesses.near)
         if not classify:
             return filled
         if self.classes is None:
@@ -156,15 +161,17 @@ def _through(blocks: nn.Module, h: Tensor) -> Tensor:
     return h
 
 
-def _assemble(out: Tensor, guesses: Candidates, noise: Tensor) -> Filled:
+def _assemble(out: Tensor, guesses: Candidates, noise: Tensor) -> tuple[Filled, Tensor]:
+    """The image, and the shares of the candidates in its ranges, (B, 10, H, W)."""
     scores, shift, grain, f_scores, f_shift, f_gain, logit, gain = out.split(
         [RANGE_CANDIDATES, 1, 1, REFLECTANCE_CANDIDATES, 1, NOISES, 1, NOISES], 1
     )
-    code = (_shares(scores) * guesses.code).sum(1, keepdim=True) + 0.1 * shift
+    shares = _shares(scores)
+    code = (shares * guesses.code).sum(1, keepdim=True) + 0.1 * shift
     code = code + 0.02 * grain * noise[:, :1]
     reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
     reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True)
-    return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0)
+    return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0), shares
 
 
 def _shares(scores: Tensor) -> Tensor:
@@ -173,9 +180,9 @@ def _shares(scores: Tensor) -> Tensor:
     return (scores + prior).softmax(1)
 
 
-def _spread(out: Tensor, code: Tensor, guesses: Candidates) -> Tensor:
+def _spread(shares: Tensor, code: Tensor, guesses: Candidates) -> Tensor:
     away = (decode_range(guesses.code) - decode_range(code)).abs()
-    return (_shares(out[:, :RANGE_CANDIDATES]) * away).sum(1, keepdim=True)
+    return (shares * away).sum(1, keepdim=True)
 
 
 def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tensor:
@@ -220,12 +227,16 @@ def draw_noise(shape: tuple[int, int, int], rng: torch.Generator | None = None) 
 
 
 def _to_patches(x: Tensor) -> Tensor:
+    """(B, C, H, W) -> (B, 8 C, H / 4, W / 2), channels last in memory: one transposed matrix, then whole runs."""
     b, c, h, w = x.shape
-    x = x.reshape(b, c, h // STEM[0], STEM[0], w // STEM[1], STEM[1]).permute(0, 2, 4, 3, 5, 1)
-    return x.reshape(b, h // STEM[0], w // STEM[1], -1).permute(0, 3, 1, 2)  # channels last in memory, in one copy
+    rows = x.transpose(0, 1).reshape(c, -1).t().contiguous()
+    runs = rows.view(b, h // STEM[0], STEM[0], w // STEM[1], STEM[1] * c).transpose(2, 3)
+    return runs.reshape(b, h // STEM[0], w // STEM[1], -1).permute(0, 3, 1, 2)
 
 
 def _to_pixels(x: Tensor) -> Tensor:
+    """The inverse of `_to_patches`."""
     b, c, h, w = x.shape
-    x = x.reshape(b, STEM[0], STEM[1], c // (STEM[0] * STEM[1]), h, w).permute(0, 3, 4, 1, 5, 2)
-    return x.reshape(b, -1, h * STEM[0], w * STEM[1])
+    runs = x.permute(0, 2, 3, 1).reshape(b, h, w, STEM[0], c // STEM[0]).transpose(2, 3)
+    rows = runs.reshape(b * h * STEM[0] * w * STEM[1], c // (STEM[0] * STEM[1]))
+    return rows.t().contiguous().view(-1, b, h * STEM[0], w * STEM[1]).transpose(0, 1)

@@ -1,4 +1,4 @@
-"""The largest value so far along an axis, in slices and maxima alone: an exported network has no operator for it."""
+"""The largest value so far along an axis; an exported network has no operator for it, and takes slices and maxima."""
 
 from __future__ import annotations
 
@@ -10,11 +10,18 @@ LONGEST = 4096  # columns of an exported network whose number of columns is open
 
 
 def running_max(x: Tensor, dim: int, size: int, least: int) -> Tensor:
-    """`x.cummax(dim).values` of an integer tensor, by doubling.
+    """`x.cummax(dim).values` of an integer tensor; in an export by doubling.
 
     size   the axis' length, or LONGEST where it is not known yet
     least  a value below all others
     """
+    if not torch.compiler.is_exporting():
+        return x.cummax(dim).values
+    return doubled_max(x, dim, size, least)
+
+
+def doubled_max(x: Tensor, dim: int, size: int, least: int) -> Tensor:
+    """`running_max` by doubling: maxima with what lies 1, 2, 4, ... before."""
     before = 2 * (x.ndim - 1 - dim % x.ndim)  # places of `pad` that belong to later axes
     step = 1
     while step < size:

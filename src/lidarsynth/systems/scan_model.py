@@ -14,8 +14,8 @@ from torch import nn
 
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment, with_fields
-from lidarsynth.lidar.measured import rays_with_points, with_measured
-from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.measured import with_measured
+from lidarsynth.lidar.projection import occupied, pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.description import Description
@@ -210,14 +210,17 @@ class ScanModel(ABC):
         model = model.suited_to(scan) if isinstance(scan, Scan) else model
         if model is not self:
             return model.filled(scan, replace(how, precision=None), known, on_step)
-        how, image = self.resolved(how), self.image_of(scan)
+        how = self.resolved(how)
         if known is not None or isinstance(scan, RangeImage):
+            image = self.image_of(scan)
             return self.fill(image, known_pixels(image, known), how, on_step)
+        pixels = pixel_of_points(scan, self.sensor, self.experiment.data.projection)
+        image = project(scan, self.sensor, self.experiment.data.projection, pixels=pixels)
         if not image.mask.any():
             raise ValueError(f"expected points within {self.sensor.name}'s view, found none of {len(scan)} points")
-        projection = self.experiment.data.projection
-        filled = self.fill(image, image.mask | rays_with_points(scan, self.sensor, projection), how, on_step)
-        return replace(filled, completed=with_measured(scan, image.mask, filled, projection))
+        # Nothing is to be put before a point, at whatever range.
+        filled = self.fill(image, image.mask | occupied(scan, self.sensor, pixels), how, on_step)
+        return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))
 
     def upsampled(
         self,
@@ -237,9 +240,10 @@ class ScanModel(ABC):
         how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
         sparse, known = sparse_image(scan, sensor_in, self.sensor)
         loose = replace(scan, ring=None)  # its rings are not the model's
-        known |= rays_with_points(loose, self.sensor, "spherical")
+        pixels = pixel_of_points(loose, self.sensor, "spherical")
+        known |= occupied(loose, self.sensor, pixels)
         filled = self.fill_beams(scan, sensor_in, sparse, known, how, on_step)
-        return replace(filled, completed=with_measured(loose, sparse.mask, filled, "spherical"))
+        return replace(filled, completed=with_measured(loose, sparse.mask, filled, pixels))
 
     def check(self, how: Filling) -> None:
         """Raises ValueError, before any work, for a request that this model cannot do or would ignore."""

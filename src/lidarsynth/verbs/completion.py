@@ -101,7 +101,8 @@ def _measured(model: ScanModel, scan: Scan, filled: RangeImage) -> RangeImage:
     """The scan's own image: the pixels of a filled one that hold measured points, where it says which."""
     if filled.xyz is None:
         return model.image_of(scan)
-    return filled.keep(np.any(filled.xyz != 0, axis=-1))
+    x, y, z = np.moveaxis(filled.xyz, -1, 0)
+    return filled.keep((x != 0) | (y != 0) | (z != 0))
 
 
 def judged(filled: RangeImage, before: RangeImage, known: np.ndarray, truth: RangeImage) -> dict[str, Errors]:

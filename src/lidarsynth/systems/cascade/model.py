@@ -16,7 +16,7 @@ from lidarsynth.diffusion.samplers import STEPS, even_log_snr, generators, noise
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
-from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
@@ -221,7 +221,9 @@ class CascadeModel(ScanModel):
         model = self.into(own.denser(times))
         image, known = spread(sparse, model.sensor, times)
         filled = model.fill(image, known, how, on_step)
-        return replace(filled, completed=with_measured(replace(scan, ring=None), image.mask, filled, "spherical"))
+        loose = replace(scan, ring=None)
+        pixels = pixel_of_points(loose, filled.sensor, "spherical")
+        return replace(filled, completed=with_measured(loose, image.mask, filled, pixels))
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
