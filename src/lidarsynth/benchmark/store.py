@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from lidarsynth.files.formats import read_image, write
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import sweep, write_whole
 
 
@@ -88,7 +89,7 @@ def open_store(folder: Path, name: str, settings: dict[str, Any]) -> Store:
 def _read_table(path: Path) -> dict[str, Any]:
     """A JSON table, or {} where there is none."""
     try:
-        found = json.loads(path.read_bytes())
+        found = read_json(path, LARGEST_INDEX)
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

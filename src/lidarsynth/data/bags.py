@@ -15,6 +15,7 @@ from typing import IO, Any, NamedTuple
 
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
+from lidarsynth.lidar.small_file import check_regular
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -117,6 +118,11 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         raise FileError(f"{path}: expected a bag, found nothing")
     _packages()
     inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    for file in inside if path.is_dir() else [path]:
+        try:
+            check_regular(file)
+        except ValueError as error:
+            raise FileError(str(error)) from None
     bare = [path] if path.suffix.lower() == ".mcap" else inside
     opened = _mcap(path, bare) if bare else _rosbags(path)
     with naming(path):

@@ -26,7 +26,7 @@ DOTTED = re.compile(
 )  # begins where a word does, so that it stays linear
 
 
-def check_regular(path: str | Path, most: int) -> None:
+def check_regular(path: str | Path, most: int = 1 << 62) -> None:
     """Raises ValueError unless `path` is a regular file of at most `most` bytes; OSError where there is none."""
     status = Path(path).stat()
     if not stat.S_ISREG(status.st_mode):
