@@ -69,15 +69,16 @@ def test_killed_and_continued_what_is_gathered_is_the_same_bit_by_bit(tmp_path: 
         assert continued == evaluate.gather_part(samples, "1/1", out, protocol, batch_size=1), "the hash of all of it"
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize("side", ["samples", "reference"])
-def test_two_machines_gather_what_one_does(side, protocol: str, tmp_path: Path, cache: Path):
-    folder = scans(tmp_path / "scans", range(3), 0)
+@pytest.mark.parametrize(
+    ("protocol", "side"), [("lidm-2024", "samples"), ("r2flow-2025", "reference"), ("r3dpa-2026", "reference")]
+)
+def test_two_machines_gather_what_one_does(protocol: str, side, tmp_path: Path, cache: Path):
+    folder = scans(tmp_path / "scans", range(2), 0)
     files = [tmp_path / f"{part[0]}.safetensors" for part in ("1/2", "2/2", "all")]
     for part, file in zip(("1/2", "2/2", "1/1"), files, strict=True):
         evaluate.gather_part(folder, part, file, protocol, side=side)
     (merged, notes), (whole, _) = (evaluate.merged(parts, get_protocol(protocol)) for parts in (files[:2], files[2:]))
-    assert not notes and merged.count == whole.count == 3 and merged.digest == whole.digest
+    assert not notes and merged.count == whole.count == 2 and merged.digest == whole.digest
     found, expected = merged.tensors(), whole.tensors()
     assert found.keys() == expected.keys() and {"minkowskinet.features", "spvcnn.features"} <= found.keys()
     for name, tensor in expected.items():  # counts and cells are integers; sums of floats are in another order
@@ -95,18 +96,18 @@ def test_a_folder_that_grows_is_judged_whole_and_a_file_half_written_is_named(tm
     out = tmp_path / "out.safetensors"
     with pytest.raises(KeyboardInterrupt):
         evaluate.gather_part(samples, "1/1", out, "lidm-2024", batch_size=1, on_images=stop)
-    scans(samples, range(3, 5), 0)
-    whole = (samples / "000004.bin").read_bytes()
-    (samples / "000004.bin").write_bytes(whole[:1001])
-    with pytest.raises(ValueError, match=r"000004\.bin: expected .*, found"):
+    scans(samples, range(3, 4), 0)
+    whole = (samples / "000003.bin").read_bytes()
+    (samples / "000003.bin").write_bytes(whole[:1001])
+    with pytest.raises(ValueError, match=r"000003\.bin: expected .*, found"):
         evaluate.gather_part(samples, "1/1", out, "lidm-2024", batch_size=1)
     assert not out.exists()
-    (samples / "000004.bin").write_bytes(whole)
+    (samples / "000003.bin").write_bytes(whole)
     (samples / ".000005.bin.part").write_bytes(whole[:100])
     grown, again = tmp_path / "grown.safetensors", tmp_path / "again.safetensors"
-    for folder, out in ((samples, grown), (scans(tmp_path / "again", range(5), 0), again)):
+    for folder, out in ((samples, grown), (scans(tmp_path / "again", range(4), 0), again)):
         evaluate.gather_part(folder, "1/1", out, "lidm-2024", batch_size=1)
     both = [load_statistics(out)[0] for out in (grown, again)]
-    assert both[0].count == 5 and both[0].digest == both[1].digest
+    assert both[0].count == 4 and both[0].digest == both[1].digest
     for name, tensor in both[0].tensors().items():
         assert torch.equal(tensor, both[1].tensors()[name]), name

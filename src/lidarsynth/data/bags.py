@@ -242,12 +242,13 @@ def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, T
 
 def library_errors() -> tuple[type[Exception], ...]:
     """What the libraries raise of their own."""
+    import zstandard
     from mcap.exceptions import McapError
     from rosbags.rosbag1 import ReaderError as Error1
     from rosbags.rosbag2 import ReaderError as Error2
     from rosbags.serde import SerdeError
 
-    return McapError, Error1, Error2, SerdeError
+    return McapError, Error1, Error2, SerdeError, zstandard.ZstdError
 
 
 def _packages() -> None:

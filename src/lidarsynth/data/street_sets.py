@@ -23,6 +23,7 @@ from lidarsynth.data.layouts.nuscenes import NUSCENES
 from lidarsynth.data.layouts.pcd import PCD
 from lidarsynth.data.layouts.semantickitti import SEMANTICKITTI
 from lidarsynth.data.workers import in_order
+from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
@@ -44,8 +45,14 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
 
     layout   a word of LAYOUTS
     workers  processes; with fewer than two this one works itself
-    Raises ValueError where the folder holds another set or something else, OSError of one line when the disk is full.
+    Raises ValueError where the folder holds another set or something else, or another process writes to it, OSError of
+    one line when the disk is full.
     """
+    with only_writer(folder, "making of streets"):
+        yield from _write(folder, streets, layout, workers)
+
+
+def _write(folder: Path, streets: LabelledStreets, layout: str, workers: int) -> Iterator[int]:
     _claim(folder, _settings(streets, layout))
     sweep(folder, deep=True)
     task = _Task(folder, streets, layout)
