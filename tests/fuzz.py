@@ -20,6 +20,7 @@ import tarfile
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -343,7 +344,9 @@ def case(found: dict[str, Target], seed: int, number: int, scratch: Path) -> str
     (scratch / target.file).write_bytes(damaged(whole, rng))
     there = sorted(path.name for path in scratch.iterdir())
     try:
-        target.read(scratch / target.file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # on a terminal each would be a line or two more
+            target.read(scratch / target.file)
     except HANDLED as error:
         if isinstance(error, ValueError) and "\n" in str(error):
             raise AssertionError(f"more than one line: {str(error)!r:.200}") from error

@@ -19,7 +19,9 @@ from lidarsynth.lidar.small_file import check_regular
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 SUFFIXES = (".bag", ".mcap", ".db3")
-BROKEN = (OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, AssertionError, TypeError, struct.error)
+BROKEN = (
+    OSError, ValueError, LookupError, EOFError, RuntimeError, AssertionError, TypeError, OverflowError, struct.error
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
