@@ -17,6 +17,7 @@ from lidarsynth.__main__ import command
 from lidarsynth.cli import terminal
 from lidarsynth.cli.main import main
 from lidarsynth.data.cache import write_cache
+from lidarsynth.data.frames import read_velodyne
 from lidarsynth.data.street_sets import write_streets
 from lidarsynth.evaluation.evaluate import evaluate
 from lidarsynth.files.lock import only_writer
@@ -24,6 +25,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.lidar.small_file import read_toml
 from lidarsynth.metrics.bev import BevCounts
+from lidarsynth.networks.archive import read_yaml
 from lidarsynth.streets.frame import LabelledStreets
 from lidarsynth.training.journal import _continue_table
 from lidarsynth.weights.download import SUMS, download
@@ -74,6 +76,27 @@ def test_a_toml_of_one_long_word_is_read_in_linear_time(tmp_path: Path):
     start = time.process_time()
     assert len(read_toml(tmp_path / "a.toml")) == 1
     assert time.process_time() - start < 2, "100,000 letters took minutes"
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_in_a_data_set_and_a_yaml_of_aliases_of_aliases_are_refused_at_once(tmp_path: Path):
+    os.mkfifo(tmp_path / "000000.bin")
+    with pytest.raises(ValueError, match="found a device or pipe"):
+        read_velodyne(tmp_path / "000000.bin")
+    bomb = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10))
+    for text, found in ((bomb, "values, found more"), ("a: 1\n" * 20_000, "bytes, found 100000")):
+        with pytest.raises(ValueError, match=f"here: expected YAML of at most .* {found}"):
+            read_yaml(text.encode(), "here")
+
+
+def test_a_refusal_nobody_hears_is_a_refusal(monkeypatch, tmp_path: Path):
+    monkeypatch.setattr(sys, "stderr", None)
+    monkeypatch.setattr(os, "devnull", str(tmp_path / "nobody"))
+    with pytest.raises(SystemExit) as end:
+        main(["info", str(tmp_path / "nothing.bin")])
+    sys.stderr.close()
+    assert end.value.code == 2 and "nothing.bin: expected" in (tmp_path / "nobody").read_text()
 
 
 class Clock:

@@ -144,6 +144,8 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
 
     Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 141 where nobody reads stdout any more.
     """
+    if sys.stderr is None:  # closed by who started us, as 2>&- does
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for as long as the process lasts
     if isinstance(sys.stdout, io.TextIOWrapper):
         codecs.register_error("lidarsynth", _sayable)
         sys.stdout.reconfigure(errors="lidarsynth")
