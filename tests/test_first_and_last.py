@@ -22,7 +22,7 @@ from lidarsynth.data.street_sets import write_streets
 from lidarsynth.evaluation.evaluate import evaluate
 from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, from_dict
 from lidarsynth.lidar.small_file import read_toml
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.networks.archive import read_yaml
@@ -180,6 +180,12 @@ def test_merged_histograms_stay_small():
     again.load_state(whole.state())
     again.merge(whole)
     assert whole.scans.dtype == again.scans.dtype == torch.int16
+
+
+@pytest.mark.parametrize("blocked", [7, None, [7], [[1, "a"]], {"a": 1}])
+def test_blocked_columns_of_another_kind_are_named(blocked):
+    with pytest.raises(ValueError, match="mine: expected blocked as a list of"):
+        from_dict({**SENSOR.to_dict(), "blocked": blocked}, "mine")
 
 
 def test_damaged_rows_of_a_curve_are_left_out(tmp_path: Path):

@@ -73,9 +73,10 @@ class Store:
     def _record(self, i: int) -> dict[str, Any]:
         record = _read_table(self.folder / f"{i:06d}.json")
         seconds = record.get("seconds")
-        told = isinstance(seconds, dict) and seconds.keys() == set(Seconds._fields)
-        whole = told and all(isinstance(value, int | float) for value in seconds.values())
-        return record if whole and (self.folder / f"{i:06d}.npz").is_file() else {}
+        if not isinstance(seconds, dict) or seconds.keys() != set(Seconds._fields):
+            return {}
+        told = all(isinstance(value, int | float) for value in seconds.values())
+        return record if told and (self.folder / f"{i:06d}.npz").is_file() else {}
 
 
 def open_store(folder: Path, name: str, settings: dict[str, Any]) -> Store:
