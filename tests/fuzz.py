@@ -3,8 +3,8 @@
     python tests/fuzz.py --minutes 10 --seed 3        or: make fuzz MINUTES=10 SEED=3
     python tests/fuzz.py --case 3:1234                that case alone, with its traceback
 
-Whatever a file holds, a reader answers within ten seconds: with content, or with one line. A case `seed:number` is the
-same on every machine.
+Whatever a file holds, a reader answers within ten seconds of the processor: with content, or with one line. A case
+`seed:number` is the same on every machine that has the same extras.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import tarfile
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,9 +29,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from test_captures import pcap, pcapng, udp, velodyne_packet
 
 from lidarsynth.benchmark.config import read_config
+from lidarsynth.benchmark.store import Seconds, Store
+from lidarsynth.data.bag_writer import write_bag
+from lidarsynth.data.bags import Cloud, naming, open_bag
 from lidarsynth.data.dataset import CachedImages, write_cache
+from lidarsynth.data.ouster import read_metadata, sensor_of
+from lidarsynth.data.street_sets import _claim, _settings
 from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.protocols import BEV_1
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
@@ -43,11 +50,14 @@ from lidarsynth.lidar.sensor import SENSORS, read_sensor
 from lidarsynth.networks.minkowski_unet import MinkowskiUNet, widths_of
 from lidarsynth.networks.rangenet_archive import read_rangenet
 from lidarsynth.networks.sparse_weights import read_sparse
+from lidarsynth.streets.frame import LabelledStreets
 from lidarsynth.systems.table import build_network, load_folder
 from lidarsynth.verbs.generation import claim
+from lidarsynth.verbs.inputs import capture_turns
 from lidarsynth.weights.official import read_official
 
-SECONDS = 10  # that one file may take
+SECONDS = 10  # of the processor that one file may take
+WAITING = 60  # seconds by the clock, for what waits without computing; a crowded machine needs them
 HANDLED = (ValueError, OSError, ImportError, MemoryError, RecursionError)  # what the command line says in one line
 SENSOR = SENSORS["hdl-64e"].resized(8, 32)
 
@@ -61,7 +71,7 @@ class Target(NamedTuple):
 
 
 class Hang(BaseException):
-    """Ten seconds are over."""
+    """The time of one file is over."""
 
 
 def targets(home: Path) -> dict[str, Target]:
@@ -71,12 +81,24 @@ def targets(home: Path) -> dict[str, Target]:
     def add(name: str, file: str, make: Callable[[Path], object], read: Callable[[Path], object]) -> None:
         folder = home / name
         folder.mkdir(parents=True)
-        make(folder / file)
+        try:
+            make(folder / file)
+        except ImportError:  # without an extra its files cannot be written, and not be read either
+            return
         found[name] = Target(folder, file, read)
 
     scan = _scan()
     for ending in WRITERS:
         add(ending[1:], f"a{ending}", lambda path: write(path, scan), read)
+    for ending, make in OTHERS.items():
+        add(ending[1:], f"a{ending}", make, read)
+    add("bag", "a.bag", _bag, _messages)
+    add("mcap", "a.mcap", _bag, _messages)
+    add("pcap", "a.pcap", lambda path: path.write_bytes(pcap(_packets())), lambda path: next(capture_turns(path), None))
+    add("pcapng", "a.pcapng", lambda p: p.write_bytes(pcapng(_packets())), lambda path: next(capture_turns(path), None))
+    add("ouster", "a.json", lambda path: path.write_text(json.dumps(OUSTER)), lambda p: sensor_of(read_metadata(p)))
+    add("streets", "streets.json", _streets, _streets)
+    add("store", "000000.json", lambda path: Store(path.parent).put(0, _image(), Seconds(1, 2), "a"), _stored)
     add("image", "a.npz", lambda path: write(path, _image()), lambda path: [*map(image_set(path).item, [0])])
     add(
         "label", "a.label", lambda path: np.arange(50, dtype=np.uint32).tofile(path), lambda path: read_labels(path, 50)
@@ -114,6 +136,72 @@ def targets(home: Path) -> dict[str, Target]:
 def _scan() -> Scan:
     rng = np.random.default_rng(0)
     return Scan(rng.uniform(-20, 20, (50, 3)).astype(np.float32), rng.random(50).astype(np.float32))
+
+
+def _las(path: Path) -> None:
+    import laspy
+
+    file = laspy.create(point_format=3, file_version="1.2")
+    file.x, file.y, file.z = _scan().xyz.T
+    file.intensity = (_scan().reflectance * 65535).astype(np.uint16)
+    file.write(str(path))
+
+
+def _feather(path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import feather
+
+    columns = dict(zip(("x", "y", "z", "intensity"), (*_scan().xyz.T, _scan().reflectance), strict=True))
+    feather.write_feather(pa.table(columns), str(path))
+
+
+def _e57(path: Path) -> None:
+    import pye57
+
+    file = pye57.E57(str(path), mode="w")
+    file.write_scan_raw(
+        {f"cartesian{axis}": column.astype(float) for axis, column in zip("XYZ", _scan().xyz.T, strict=True)}
+    )
+    file.close()
+
+
+def _text(path: Path) -> None:
+    np.savetxt(path, np.column_stack([_scan().xyz, _scan().reflectance]), header="x y z intensity", comments="")
+
+
+OTHERS = {".las": _las, ".laz": _las, ".feather": _feather, ".e57": _e57, ".csv": _text, ".pts": _text}
+OUSTER = {
+    "beam_altitude_angles": [float(20 - i) for i in range(16)],
+    "beam_azimuth_angles": [0.0] * 16,
+    "lidar_mode": "512x10",
+    "prod_line": "OS-1-16",
+}
+
+
+def _bag(path: Path) -> None:
+    scan = _scan()
+    fields = dict(zip(("x", "y", "z", "intensity"), (*scan.xyz.T, scan.reflectance), strict=True))
+    with write_bag(path) as bag:
+        bag.write_cloud("/points", Cloud(10**9, "lidar", 10**9, fields))
+
+
+def _messages(path: Path) -> None:
+    with open_bag(path) as bag, naming(path):
+        [*bag.clouds(bag.point_topic())]
+
+
+def _packets() -> list[bytes]:
+    return [udp(velodyne_packet(0x22, 3000 * i, 20, 5000), 2368) for i in range(14)]
+
+
+def _streets(path: Path) -> None:
+    _claim(path.parent, _settings(LabelledStreets(0, 1, SENSOR), "pcd"))
+
+
+def _stored(path: Path) -> None:
+    store = Store(path.parent)
+    if not store.lacks({0: "a"}):
+        store.seconds(1)
 
 
 def _image() -> RangeImage:
@@ -256,7 +344,9 @@ def case(found: dict[str, Target], seed: int, number: int, scratch: Path) -> str
     (scratch / target.file).write_bytes(damaged(whole, rng))
     there = sorted(path.name for path in scratch.iterdir())
     try:
-        target.read(scratch / target.file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # on a terminal each would be a line or two more
+            target.read(scratch / target.file)
     except HANDLED as error:
         if isinstance(error, ValueError) and "\n" in str(error):
             raise AssertionError(f"more than one line: {str(error)!r:.200}") from error
@@ -269,12 +359,13 @@ def case(found: dict[str, Target], seed: int, number: int, scratch: Path) -> str
 
 
 def _alarm(signum: int, frame: FrameType | None) -> None:
-    raise Hang(f"more than {SECONDS} s")
+    raise Hang(f"more than {SECONDS} s of the processor, or {WAITING} s of waiting")
 
 
 def run(seed: int, until: Callable[[int], bool], first: int = 0) -> Iterator[tuple[int, str, str]]:
     """Cases `first`, ... of a seed while `until` says so: (number, target, traceback or "")."""
     signal.signal(signal.SIGALRM, _alarm)
+    signal.signal(signal.SIGPROF, _alarm)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as home:
         with torch.random.fork_rng():
@@ -288,7 +379,8 @@ def run(seed: int, until: Callable[[int], bool], first: int = 0) -> Iterator[tup
             scratch = Path(home) / f"case-{number}"
             scratch.mkdir()
             name, failure = "", ""
-            signal.setitimer(signal.ITIMER_REAL, SECONDS)
+            signal.setitimer(signal.ITIMER_PROF, SECONDS)
+            signal.setitimer(signal.ITIMER_REAL, WAITING)
             try:
                 name = case(found, seed, number, scratch)
             except KeyboardInterrupt:
@@ -296,6 +388,7 @@ def run(seed: int, until: Callable[[int], bool], first: int = 0) -> Iterator[tup
             except BaseException:
                 failure = traceback.format_exc()
             finally:
+                signal.setitimer(signal.ITIMER_PROF, 0)
                 signal.setitimer(signal.ITIMER_REAL, 0)
             yield number, name, failure
             number += 1

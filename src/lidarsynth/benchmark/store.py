@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from lidarsynth.files.formats import read_image, write
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import sweep, write_whole
 
 
@@ -71,7 +72,11 @@ class Store:
 
     def _record(self, i: int) -> dict[str, Any]:
         record = _read_table(self.folder / f"{i:06d}.json")
-        return record if (self.folder / f"{i:06d}.npz").is_file() else {}
+        seconds = record.get("seconds")
+        if not isinstance(seconds, dict) or seconds.keys() != set(Seconds._fields):
+            return {}
+        told = all(isinstance(value, int | float) for value in seconds.values())
+        return record if told and (self.folder / f"{i:06d}.npz").is_file() else {}
 
 
 def open_store(folder: Path, name: str, settings: dict[str, Any]) -> Store:
@@ -88,7 +93,7 @@ def open_store(folder: Path, name: str, settings: dict[str, Any]) -> Store:
 def _read_table(path: Path) -> dict[str, Any]:
     """A JSON table, or {} where there is none."""
     try:
-        found = json.loads(path.read_bytes())
+        found = read_json(path, LARGEST_INDEX)
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

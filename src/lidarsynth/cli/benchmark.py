@@ -27,6 +27,7 @@ def benchmark(
 ) -> None:
     """Methods side by side: tables, numbers and pictures; killed at any moment, the same command goes on."""
     from lidarsynth.benchmark import run
+    from lidarsynth.files.lock import only_writer
 
     at_least(0, {"seed": seed})
     at_least(1, {"batch-size": batch_size})
@@ -35,7 +36,7 @@ def benchmark(
     words += ["--device", device] if device != "cpu" else []
     command = shlex.join(["lidarsynth", "benchmark", kind, str(config), *words])
     load = partial(load_with_bar, device=device)
-    with image_bar() as on_images:
+    with only_writer(out, "benchmark"), image_bar() as on_images:
         text = run.benchmark(kind, config, out, load, data, classes, seed, device, batch_size, on_images, command)
     say(text)
     made = [name for name in (run.RESULTS, run.TABLE, run.FIGURE, run.SCORES) if (out / name).is_file()]

@@ -58,7 +58,7 @@ def scan_bar(title: str, count: int | None) -> Iterator[Callable[[], object]]:
     """A progress bar with total and time left for work over two seconds; gives what to call after every scan."""
     from tqdm import tqdm
 
-    with tqdm(total=count, unit="scan", delay=2, desc=title, leave=False) as bar:
+    with tqdm(total=count, unit="scan", delay=2, desc=title, leave=False, mininterval=_seconds()) as bar:
         yield bar.update
 
 
@@ -97,9 +97,7 @@ def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
     for progress in run:  # its first is where the run stands
         if progress.note:
             tqdm.write(f"lidarsynth: {progress.note}", file=sys.stderr)
-        bar = bar or tqdm(
-            total=steps, initial=progress.step, unit="step", mininterval=0.5 if sys.stderr.isatty() else 30
-        )
+        bar = bar or tqdm(total=steps, initial=progress.step, unit="step", mininterval=max(0.5, _seconds()))
         losses = " ".join(f"{name} {value:.4f}" for name, value in progress.losses.items())
         bar.set_postfix_str(f"{losses} norm {progress.grad_norm:.2f} rate {progress.learning_rate:.1e}", refresh=False)
         bar.update(progress.step - bar.n)
@@ -116,7 +114,7 @@ def load_with_bar(source: str, device: str) -> ScanModel:
     from lidarsynth.weights.load import load_parts
 
     check_device(device)
-    with tqdm(desc=f"download {source}", unit="B", unit_scale=True, delay=2) as bar:
+    with tqdm(desc=f"download {source}", unit="B", unit_scale=True, delay=2, mininterval=_seconds()) as bar:
 
         def on_bytes(done: int, total: int | None) -> None:
             bar.total = total
@@ -146,6 +144,8 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
 
     Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 141 where nobody reads stdout any more.
     """
+    if sys.stderr is None:  # closed by who started us, as 2>&- does
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for as long as the process lasts
     if isinstance(sys.stdout, io.TextIOWrapper):
         codecs.register_error("lidarsynth", _sayable)
         sys.stdout.reconfigure(errors="lidarsynth")

@@ -15,10 +15,13 @@ from typing import IO, Any, NamedTuple
 
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
+from lidarsynth.lidar.small_file import check_regular
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 SUFFIXES = (".bag", ".mcap", ".db3")
-BROKEN = (OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, AssertionError, TypeError, struct.error)
+BROKEN = (
+    OSError, ValueError, LookupError, EOFError, RuntimeError, AssertionError, TypeError, OverflowError, struct.error
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,11 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         raise FileError(f"{path}: expected a bag, found nothing")
     _packages()
     inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    for file in inside if path.is_dir() else [path]:
+        try:
+            check_regular(file)
+        except ValueError as error:
+            raise FileError(str(error)) from None
     bare = [path] if path.suffix.lower() == ".mcap" else inside
     opened = _mcap(path, bare) if bare else _rosbags(path)
     with naming(path):
@@ -236,12 +244,13 @@ def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, T
 
 def library_errors() -> tuple[type[Exception], ...]:
     """What the libraries raise of their own."""
+    import zstandard
     from mcap.exceptions import McapError
     from rosbags.rosbag1 import ReaderError as Error1
     from rosbags.rosbag2 import ReaderError as Error2
     from rosbags.serde import SerdeError
 
-    return McapError, Error1, Error2, SerdeError
+    return McapError, Error1, Error2, SerdeError, zstandard.ZstdError
 
 
 def _packages() -> None:

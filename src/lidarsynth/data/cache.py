@@ -15,6 +15,7 @@ import numpy as np
 
 from lidarsynth.data.index import RANGE_STEP, close_index, open_index, resumable_file, stored_step, write_index
 from lidarsynth.data.workers import in_order
+from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 
@@ -69,9 +70,24 @@ def write_cache(
     workers  processes; two or more need a picklable `image` and `name`, with fewer this one works itself
     check    compare the checksums of the shards that are there, and make anew those that differ
     Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
-    when the folder holds something else or no scan can be read, OSError of one line when the disk is full.
+    when the folder holds something else, another process writes to it or no scan can be read, OSError of one line when
+    the disk is full.
     """
     folder = Path(folder)
+    with only_writer(folder, "preparation of a cache"):
+        yield from _write(folder, image, count, sensor, source, name, workers, check)
+
+
+def _write(
+    folder: Path,
+    image: Callable[[int], RangeImage],
+    count: int,
+    sensor: Sensor,
+    source: dict[str, Any],
+    name: Namer | None,
+    workers: int,
+    check: bool,
+) -> Iterator[int]:
     index = open_index(folder, sensor, source, count, range_step(sensor))
     task = _Task(folder, image, name, count, stored_step(index))
     firsts = range(0, count, SHARD)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from lidarsynth.files.fields import FileError
+from lidarsynth.lidar.small_file import check_regular
 
 MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
 NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
@@ -52,9 +53,12 @@ def datagrams(path: str | Path) -> Iterator[Datagram]:
 
 def _open(path: Path) -> IO[bytes]:
     try:
+        check_regular(path)
         return open(path, "rb")
     except OSError as error:
         raise FileError(f"{path}: expected a readable file, found: {error.strerror}") from None
+    except ValueError as error:
+        raise FileError(str(error)) from None
 
 
 def _records(file: IO[bytes], order: str, nano: bool) -> Iterator[tuple[int, int, bytes]]:

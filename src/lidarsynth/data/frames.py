@@ -76,6 +76,8 @@ class Frames:
 
 def read_velodyne(path: str | Path) -> Scan:
     """A KITTI `.bin` with reflectance 0-1: as `files.read(path, "unit")`, three times faster where nothing is amiss."""
+    if not Path(path).is_file():  # a pipe would be waited for
+        return read(path, "unit")
     try:
         table = np.fromfile(path, "<f4")
     except OSError:

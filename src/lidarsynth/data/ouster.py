@@ -6,7 +6,6 @@ point by point (tests/test_captures.py). That library is not asked for: it pins 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from lidarsynth.data.capture import Datagram
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.small_file import read_json, read_text
 
 MODES = {"512x10": 512, "512x20": 512, "1024x10": 1024, "1024x20": 1024, "2048x10": 2048, "4096x5": 4096}
 ORIGIN = 12.163  # mm from the lidar's axis to a beam's origin where the metadata does not say: a first-generation OS1
@@ -80,12 +80,11 @@ def read_metadata(path: str | Path) -> Metadata:
     """The metadata `.json` of an Ouster sensor, of any firmware. Raises FileError for a file that is none."""
     path = Path(path)
     try:
-        values = json.loads(path.read_text())
+        flat = flatten(read_json(path))
     except OSError as error:
         raise FileError(f"{path}: expected a readable file, found: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise FileError(f"{path}: expected Ouster metadata in JSON, found {error}") from None
-    flat = flatten(values)
+        raise FileError(f"{error}; it should be metadata of an Ouster sensor") from None
     if not {"beam_altitude_angles", "beam_azimuth_angles"} <= flat.keys():
         raise FileError(f"{path}: expected Ouster metadata with beam_altitude_angles and beam_azimuth_angles, found "
                         f"{', '.join(list(flat)[:6]) or 'nothing'}")  # fmt: skip
@@ -122,8 +121,8 @@ def is_metadata(path: str | Path) -> bool:
     """Whether a `.json` file is Ouster metadata: it has the beams' altitudes."""
     path = Path(path)
     try:
-        return path.suffix.lower() == ".json" and b'"beam_altitude_angles"' in path.read_bytes()
-    except OSError:
+        return path.suffix.lower() == ".json" and '"beam_altitude_angles"' in read_text(path)
+    except (OSError, ValueError):
         return False
 
 

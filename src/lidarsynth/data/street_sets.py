@@ -23,6 +23,8 @@ from lidarsynth.data.layouts.nuscenes import NUSCENES
 from lidarsynth.data.layouts.pcd import PCD
 from lidarsynth.data.layouts.semantickitti import SEMANTICKITTI
 from lidarsynth.data.workers import in_order
+from lidarsynth.files.lock import only_writer
+from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
 from lidarsynth.streets.drawing import bev_with_boxes, strips
@@ -43,8 +45,14 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
 
     layout   a word of LAYOUTS
     workers  processes; with fewer than two this one works itself
-    Raises ValueError where the folder holds another set or something else, OSError of one line when the disk is full.
+    Raises ValueError where the folder holds another set or something else, or another process writes to it, OSError of
+    one line when the disk is full.
     """
+    with only_writer(folder, "making of streets"):
+        yield from _write(folder, streets, layout, workers)
+
+
+def _write(folder: Path, streets: LabelledStreets, layout: str, workers: int) -> Iterator[int]:
     _claim(folder, _settings(streets, layout))
     sweep(folder, deep=True)
     task = _Task(folder, streets, layout)
@@ -110,10 +118,7 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     settings, path = json.loads(json.dumps(settings)), folder / RECORD
     if path.exists():
-        try:
-            found = json.loads(path.read_text())
-        except ValueError as error:
-            raise ValueError(f"{path}: expected the settings of labelled streets in JSON, found {error}") from None
+        found = read_json(path)
         if found != settings:
             differ = [k for k in settings if not isinstance(found, dict) or found.get(k) != settings[k]]
             asked, was = ({k: of.get(k) for k in differ} if isinstance(of, dict) else of for of in (settings, found))

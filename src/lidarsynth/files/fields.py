@@ -165,9 +165,11 @@ def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
     counted from the first instant so that no digit is lost.
     """
     if _numbers(time, "time").dtype.kind == "f" and np.nanmax(time, initial=0) > 1e15:
-        return (time.astype(np.float64) - np.nanmin(time)) * 1e-9
+        with np.errstate(invalid="ignore"):
+            return (time.astype(np.float64) - np.nanmin(time)) * 1e-9
     if time.dtype.kind == "f":
-        return time.astype(np.float64) * (1e-9 if nanoseconds else 1.0)
+        with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
+            return time.astype(np.float64) * (1e-9 if nanoseconds else 1.0)
     first = time.min()
     span = max(int(time.max()) - int(first), 1)
     power = 9 if nanoseconds else min((0, 3, 6, 9), key=lambda p: abs(np.log10(span) - p + 1))

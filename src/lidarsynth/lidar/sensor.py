@@ -202,7 +202,8 @@ def _numbers(values: Any, source: str) -> Sequence[float]:
 
 def _runs(values: dict, source: str) -> tuple[tuple[int, ...], ...]:
     runs = values.get("blocked", ())
-    if not all(isinstance(run, list | tuple) and all(type(number) is int for number in run) for run in runs):
+    listed = isinstance(runs, list | tuple) and all(isinstance(run, list | tuple) for run in runs)
+    if not listed or not all(type(number) is int for run in runs for number in run):
         raise ValueError(
             f"{source}: expected blocked as a list of [row, first column, last column], found {runs!r:.60}"
         )

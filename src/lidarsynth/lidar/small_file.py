@@ -21,10 +21,12 @@ else:
 LARGEST = 1 << 20  # bytes of a file of settings
 LARGEST_INDEX = 1 << 30  # of the index of a cache, which has a line per scan
 LARGEST_WEIGHTS = 1 << 36
-DOTTED = re.compile(r"""(?:[\w"'-]+[ \t]*\.[ \t]*){16}""")
+DOTTED = re.compile(
+    r"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){16}"""
+)  # begins where a word does, so that it stays linear
 
 
-def check_regular(path: str | Path, most: int) -> None:
+def check_regular(path: str | Path, most: int = 1 << 62) -> None:
     """Raises ValueError unless `path` is a regular file of at most `most` bytes; OSError where there is none."""
     status = Path(path).stat()
     if not stat.S_ISREG(status.st_mode):

@@ -114,7 +114,7 @@ class BevCounts:
     def _add(self, count: int, pooled: Tensor, scans: Tensor) -> None:
         free = len(scans) if self.keep is None else self.keep - sum(map(len, self._kept))
         if free > 0 and len(scans):
-            small = scans[:free].amax() < 1 << 15
+            small = int(scans[:free].amax()) < 1 << 15  # as a number: in int16 the limit itself does not fit
             self._kept.append(scans[:free].to(torch.int16 if small else torch.int32, copy=True))
         self.count += count
         self.pooled += pooled

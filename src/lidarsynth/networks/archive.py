@@ -8,6 +8,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+LARGEST_YAML = 1 << 16  # bytes, and values; published files have some thousand
+
 
 def weight_files(path: str | Path, largest: Mapping[str, int], needed: Collection[str], what: str) -> dict[str, bytes]:
     """Contents of the files of these names; of others, and of those that are neither there nor `needed`, nothing.
@@ -60,12 +62,22 @@ def _check_member(path: Path, member: tarfile.TarInfo, twice: bool, largest: int
 
 
 def read_yaml(text: bytes, where: str) -> Any:
-    """A small YAML file. Raises ValueError that begins with `where`; ImportError without pyyaml."""
+    """A small YAML file. Raises ValueError that begins with `where`, also for one that aliases make large; ImportError
+    without pyyaml.
+    """
     try:
         import yaml
     except ImportError as error:
         raise ImportError("published weights need pyyaml: pip install 'lidarsynth[metrics]'") from error
+    if len(text) > LARGEST_YAML:
+        raise ValueError(f"{where}: expected YAML of at most {LARGEST_YAML} bytes, found {len(text)}")
     try:
-        return yaml.safe_load(text)
+        values = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ValueError(f"{where}: expected YAML, found {str(error)!r:.100}") from None
+    parts = [values]
+    for part in parts:  # it grows on the way: aliases of aliases make a billion parts of a few lines
+        parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else []
+        if len(parts) > LARGEST_YAML:
+            raise ValueError(f"{where}: expected YAML of at most {LARGEST_YAML} values, found more")
+    return values

@@ -45,7 +45,8 @@ def read_sparse(path: str | Path, kind: Kind) -> MinkowskiUNet | SPVCNN:
     build = {"minkowskinet": MinkowskiUNet, "spvcnn": SPVCNN}[kind]
     with torch.device("meta"):  # shapes first, so that absurd ones cost nothing
         shapes = build(widths)
-    own = {name: value for name, value in tensors.items() if name in shapes.state_dict()}
+    known = shapes.state_dict().keys()
+    own = {name: value for name, value in tensors.items() if name in known}
     check_shapes(shapes, own, where)
     network = build(widths)
     load_weights(network, own, where, counters=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.networks.minkowski_unet import Stage, Stem, Up, checked_levels
-from lidarsynth.networks.sparse_convolution import Level
+from lidarsynth.networks.sparse_convolution import Level, with_norm
 from lidarsynth.networks.voxel_points import corners, devoxelise, voxel_of_points, voxelise
 
 VOXEL = 0.05  # metres
@@ -54,13 +54,22 @@ class SPVCNN(nn.Module):
         x3 = self.stage3(x2, levels[2], levels[3])
         x4 = self.stage4(x3, levels[3], levels[4])
         coarse = _Meeting(points, levels[4])
-        z1 = coarse.to_points(x4) + self.point_transforms[0](z0)
+        z1 = coarse.to_points(x4) + self._transformed(z0, 0)
         y2 = self.up2(self.up1(coarse.to_voxels(z1), x3, levels[3]), x2, levels[2])
         middle = _Meeting(points, levels[2])
-        z2 = middle.to_points(y2) + self.point_transforms[1](z1)
+        z2 = middle.to_points(y2) + self._transformed(z1, 1)
         # the last skip is the stem's own output, not what came back from the points
         y4 = self.up4(self.up3(middle.to_voxels(z2), x1, levels[1]), stem, levels[0])
-        return finest.to_points(y4) + self.point_transforms[2](z2), points
+        return finest.to_points(y4) + self._transformed(z2, 2), points
+
+    def _transformed(self, z: Tensor, number: int) -> Tensor:
+        """(P, C') of point features (P, C): a linear layer, batch normalisation and ReLU at once."""
+        chain = self.point_transforms[number]
+        assert isinstance(chain, nn.Sequential)
+        linear, norm = chain[0], chain[1]
+        assert isinstance(linear, nn.Linear) and isinstance(norm, nn.BatchNorm1d)
+        kernel, bias = with_norm(linear.weight.T, norm, linear.bias)
+        return torch.addmm(bias, z, kernel).relu_()
 
 
 class _Meeting:
@@ -68,7 +77,7 @@ class _Meeting:
 
     def __init__(self, points: Tensor, level: Level):
         self.count, self.rows = len(level), voxel_of_points(points, level)
-        self.corners = corners(points, level)
+        self.corners = corners(points, level, self.rows)
 
     def to_points(self, features: Tensor) -> Tensor:
         return devoxelise(features, *self.corners)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -94,10 +95,16 @@ def _row(progress: Progress, columns: Sequence[str]) -> str:
 
 def _continue_table(path: Path, step: int, columns: Sequence[str]):
     """The open table with the rows up to `step`."""
-    lines = path.read_text().splitlines()[1:] if path.exists() else []
-    kept = [line for line in lines if line.count(",") == len(columns) - 1 and int(line.split(",")[0]) <= step]
+    lines = path.read_text(errors="replace").splitlines()[1:] if path.exists() else []
+    kept = [line for line in lines if line.count(",") == len(columns) - 1 and _step_of(line) <= step]
     write_whole(path, "\n".join([",".join(columns), *kept]) + "\n")
     return path.open("a")
+
+
+def _step_of(line: str) -> float:
+    """The number a row begins with; infinity for a row that was damaged."""
+    word = line.partition(",")[0]
+    return int(word) if word.isascii() and word.isdecimal() else math.inf
 
 
 def _tensorboard(folder: Path, step: int) -> Any:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.batch import Result
 
@@ -63,7 +64,7 @@ def merge_shards(out: Path, parts: int) -> Path | None:
     paths = [report_path(out, (part, parts)) for part in range(1, parts + 1)]
     if parts == 1 or not all(path.is_file() for path in paths):
         return None
-    reports = [json.loads(path.read_text()) for path in paths]
+    reports = [read_json(path, LARGEST_INDEX) for path in paths]
     total: dict[str, Any] = {key: sum(r[key] for r in reports) for key in ("done", "skipped", "failed")}
     longest = max(r["seconds"] for r in reports)
     merged = {"settings": reports[0]["settings"] | {"shards": parts}, **total, "seconds": longest}

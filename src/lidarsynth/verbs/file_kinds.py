@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.verbs.inputs import capture_turns, has_scans
 
 Lines = dict[str, str]
@@ -144,9 +144,9 @@ def _json(path: Path) -> Lines:
         return {"kind": "metadata of an Ouster sensor", "beams": beams, "columns": str(found.columns),
                 "packets": found.profile}  # fmt: skip
     try:
-        values: Any = json.loads(path.read_text())
-    except (ValueError, OSError) as error:
-        raise FileError(f"{path}: expected JSON, found: {error}") from None
+        values: Any = read_json(path, LARGEST_INDEX)
+    except OSError as error:
+        raise FileError(f"{path}: expected JSON, found: {error.strerror}") from None
     if isinstance(values, Mapping) and {"settings", "done", "scans"} <= values.keys():
         return {"kind": "report of many scans"} | {k: str(values[k]) for k in ("done", "skipped", "failed", "seconds")}
     if isinstance(values, Mapping) and ("elevations" in values or "beams" in values):

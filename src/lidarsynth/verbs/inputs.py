@@ -20,6 +20,7 @@ from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import parse_transform, transformed
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.small_file import LARGEST, check_regular
 
 
 @dataclass(frozen=True)
@@ -269,6 +270,7 @@ def read_transform(text: str | None, mount: float | None = None) -> np.ndarray |
 
 
 def _matrix_file(path: Path) -> np.ndarray:
+    check_regular(path, LARGEST)
     try:
         numbers = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path)
     except (ValueError, OSError) as error:

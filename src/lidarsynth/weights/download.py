@@ -15,6 +15,10 @@ from typing import BinaryIO
 
 from platformdirs import user_cache_path
 
+from lidarsynth.data.cache import sha256
+from lidarsynth.lidar.small_file import read_text
+
+SUMS = "SHA256SUMS"  # beside the files: lines `hash  name`, as sha256sum writes them, that a user or a team trusts
 OnBytes = Callable[[int, "int | None"], object]  # called with (bytes so far, bytes in all or None if not known)
 
 
@@ -34,11 +38,14 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
 
     The bytes gather in `<path>.part`, which moves into place when it is complete; after an interruption, the next call
     continues there, if the server still has the same file: `<path>.part.origin` keeps its address and its tag.
-    Raises ValueError that says where to put the file by hand.
+    A file that the folder's SHA256SUMS names must have that hash, also one that is there already. No publisher of the
+    files that we fetch has told a hash, so we bring none.
+    Raises ValueError that says where to put the file by hand, or which hash was found.
     """
     path = Path(path)
     part = path.with_name(path.name + ".part")
     if path.is_file():
+        _check_sum(path, path)
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,6 +54,7 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
         origin = path.with_name(path.name + ".part.origin")
         with part.open("r+b") as file:
             yield from _receive(url, file, origin)
+        _check_sum(part, path)
         os.replace(part, path)
         origin.unlink(missing_ok=True)
     except (OSError, http.client.HTTPException) as error:
@@ -54,6 +62,18 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
             return
         place = f"without a network, put the file at {path}"
         raise ValueError(f"{url}: expected a download, found {_reason(error)}; {place}") from None
+
+
+def _check_sum(content: Path, path: Path) -> None:
+    """Raises ValueError unless a file that the SHA256SUMS beside `path` names has the hash that stands there."""
+    sums = path.with_name(SUMS)
+    lines = [line.split() for line in read_text(sums).splitlines()] if sums.is_file() else []
+    known = {words[1].lstrip("*"): words[0].lower() for words in lines if len(words) == 2}
+    if (expected := known.get(path.name)) is None:
+        return
+    if (found := sha256(content)) != expected:
+        raise ValueError(f"{content}: expected the SHA-256 {expected} of {sums}, found {found}; delete the file to "
+                         "download it again")  # fmt: skip
 
 
 def _receive(url: str, file: BinaryIO, origin: Path) -> Iterator[tuple[int, int | None]]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.streets.frame import Frame, LabelledStreets
 
 Content = Iterator[tuple[str, bytes | BinaryIO]]  # path below the folder, what is in it
@@ -28,7 +28,7 @@ class Layout(NamedTuple):
 def read_record(path: Path) -> dict[str, Any]:
     """The JSON of one frame. Raises ValueError that names the file."""
     try:
-        return json.loads(path.read_text())
+        return read_json(path, LARGEST_INDEX)
     except (OSError, ValueError) as error:
         raise ValueError(
             f"{path}: expected the JSON of a frame, found {error}; remove it, the same command goes on"
