@@ -71,13 +71,17 @@ def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
     usable = found[:2] & (e[:2] < -LOW) & (elevation < -0.8 * LOW)
     code = encode_range(r)
     cross = _mean(code, found, distance, encode_range(rays.ground.expand_as(metres).flatten()[around.place]))
-    # by angle between the beams above and below: linear in code, and in 1/r, which is exact on any plane
+    # by angle between the beams above and below: linear in code, and in 1/r, which is exact on any plane; without beams
+    # above and below, in 1/r between the columns to the left and right
     share = ((e[0] - elevation) / (e[0] - e[1]).clamp_min(1e-6)).clamp(0, 1)
     both = found[0] & found[1]
     one = torch.where(found[0], code[0], torch.where(found[1], code[1], cross))
     column = torch.where(both, code[0] * (1 - share) + code[1] * share, one)
     inverse = (1 - share) / r[0].clamp_min(0.1) + share / r[1].clamp_min(0.1)
-    plane = torch.where(both, encode_range(1 / inverse), column)
+    turn = distance[2] / (distance[2] + distance[3]).clamp_min(1)
+    beside = (1 - turn) / r[2].clamp_min(0.1) + turn / r[3].clamp_min(0.1)
+    across = torch.where(found[2] & found[3] & ~found[0] & ~found[1], encode_range(1 / beside), column)
+    plane = torch.where(both, encode_range(1 / inverse), across)
     sides = torch.where(found, encode_range(wall), cross)
     grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
     nearest = torch.where(around.some, encode_range(metres.flatten()[around.nearest]), sides[2])

@@ -92,19 +92,22 @@ class CoarseUNet(nn.Module):
         )
         return mean, spread
 
-    def encode(self, metres: Tensor, reflectance: Tensor, standing: Tensor) -> Tensor:
-        """x_0 (B, 3, H, W) of metres (B, H, W), 0 where nothing returned, and reflectance (B, H, W) in [0, 1]."""
+    def encode(self, metres: Tensor, reflectance: Tensor, standing: Tensor, dimness: Tensor | float = 0.0) -> Tensor:
+        """x_0 (B, 3, H, W) of metres (B, H, W), 0 where nothing returned, and reflectance (B, H, W) in [0, 1].
+
+        dimness  (H, 1), how much less than the mean beam a beam reads: its reflectance stands in x_0 as if it did not
+        """
         mean, spread = self.standards(standing)
         returned = metres > 0
-        values = (torch.stack([encode_range(metres), 2 * reflectance - 1], 1) - mean) / spread
+        values = (torch.stack([encode_range(metres), 2 * (reflectance + dimness) - 1], 1) - mean) / spread
         return torch.cat([left_filled(values, returned), 2 * returned[:, None].float() - 1], 1)
 
-    def decode(self, x_0: Tensor, standing: Tensor) -> tuple[Tensor, Tensor]:
+    def decode(self, x_0: Tensor, standing: Tensor, dimness: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
         """Metres, 0 where nothing returned, and reflectance, each (B, H, W), of x_0 (B, 3, H, W)."""
         mean, spread = self.standards(standing)
         code, reflectance = (x_0[:, :2] * spread + mean).unbind(1)
         returned = x_0[:, 2] > 0
-        return decode_range(code) * returned, ((reflectance + 1) / 2).clamp(0, 1) * returned
+        return decode_range(code) * returned, ((reflectance + 1) / 2 - dimness).clamp(0, 1) * returned
 
 
 class Detail(nn.Module):

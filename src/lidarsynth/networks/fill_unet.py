@@ -14,9 +14,10 @@ from lidarsynth.networks.rays import Rays, decode_range, encode_range
 
 STEM = (4, 2)  # rows, columns of the patches that become channels
 NOISES = 3  # per pixel, along a ring, in patches
-INPUTS = 30
+INPUTS = 34
 OUTPUTS = (RANGE_CANDIDATES + 2) + (REFLECTANCE_CANDIDATES + 1 + NOISES) + (1 + NOISES)
 PRIOR = 2.0  # score of the first guess before any training
+SNAP = 0.01  # of the code, 3 % of the range: from so near a hypothesis is taken as it is
 
 
 class Known(NamedTuple):
@@ -101,6 +102,8 @@ class FillUNet(nn.Module):
     noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
     the grain of a recorded scan. For each pixel the network chooses among `candidates` by a softmax, corrects the
     choice, and says whether the ray returns at all; and, if it has learned `classes`, of which class the surface is.
+    In use, not in training, a choice close to a candidate is that candidate. Reflectances are compared as even beams
+    would read them: what a beam loses (`dimness`) is added before, and taken off after.
     """
 
     def __init__(
@@ -129,7 +132,8 @@ class FillUNet(nn.Module):
 
     def forward(self, known: Known, rays: Rays, noise: Tensor, classify: bool = False, doubt: bool = False) -> Filled:
         with torch.no_grad():
-            guesses = candidates(known.metres, known.reflectance, known.returned, known.lit, rays)
+            even = (known.reflectance + rays.dimness) * known.lit
+            guesses = candidates(known.metres, even, known.returned, known.lit, rays)
             x = _to_patches(inputs(known, rays, guesses, noise))
         top = h = self.stem(x)
         kept = []
@@ -144,7 +148,9 @@ class FillUNet(nn.Module):
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
         out = _to_pixels(self.out(h))
-        filled, shares = _assemble(out, guesses, noise)
+        filled, shares = _assemble(out, guesses, noise, rays.dimness)
+        if not self.training:
+            filled = filled._replace(code=_snapped(filled.code, guesses))
         if doubt:
             filled = filled._replace(spread=_spread(shares, filled.code, guesses), near=guesses.near)
         if not classify:
@@ -161,7 +167,7 @@ def _through(blocks: nn.Module, h: Tensor) -> Tensor:
     return h
 
 
-def _assemble(out: Tensor, guesses: Candidates, noise: Tensor) -> tuple[Filled, Tensor]:
+def _assemble(out: Tensor, guesses: Candidates, noise: Tensor, dimness: Tensor) -> tuple[Filled, Tensor]:
     """The image, and the shares of the candidates in its ranges, (B, 10, H, W)."""
     scores, shift, grain, f_scores, f_shift, f_gain, logit, gain = out.split(
         [RANGE_CANDIDATES, 1, 1, REFLECTANCE_CANDIDATES, 1, NOISES, 1, NOISES], 1
@@ -170,8 +176,14 @@ def _assemble(out: Tensor, guesses: Candidates, noise: Tensor) -> tuple[Filled, 
     code = (shares * guesses.code).sum(1, keepdim=True) + 0.1 * shift
     code = code + 0.02 * grain * noise[:, :1]
     reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
-    reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True)
+    reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True) - dimness
     return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0), shares
+
+
+def _snapped(code: Tensor, guesses: Candidates) -> Tensor:
+    """The nearest hypothesis where one is near, so that what is flat comes out flat: mixtures of several are rough."""
+    away, which = (guesses.code - code).abs().min(1, keepdim=True)
+    return torch.where(away < SNAP, guesses.code.gather(1, which), code)
 
 
 def _shares(scores: Tensor) -> Tensor:
@@ -211,6 +223,7 @@ def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tens
             rays.blocked.expand_as(told),
             rays.inside.expand_as(told),
             10 * rays.dimness * full,
+            4 * (guesses.reflectance[:, 1:5] - guesses.reflectance[:, :1]),
         ],
         1,
     )

@@ -6,6 +6,7 @@ of the instrument, not of any scene.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -105,6 +106,22 @@ def lasers(sensor: Sensor, loss: Table = (), dip: Table = (), shift: Table = ())
 def hidden(sensor: Sensor) -> np.ndarray:
     """(H, W) bool: rays that end on the carrier: those blocked by name, and those of KITTI's own car."""
     return own_car(sensor) | sensor.blocked_rays()
+
+
+@lru_cache(maxsize=4)
+def written_out(sensor: Sensor) -> Sensor:
+    """The sensor with what is known by its name in its own fields, so that its parts and denser ones keep it."""
+    if sensor.name != NAME:
+        return sensor
+    edges = np.diff(np.pad(hidden(sensor), ((0, 0), (1, 1))).astype(int), axis=1)
+    first, last = np.argwhere(edges > 0), np.argwhere(edges < 0)
+    blocked = tuple((int(row), int(a), int(b) - 1) for (row, a), (_, b) in zip(first, last, strict=True))
+    return replace(sensor, blocked=blocked, dimness=RING_LOSS)
+
+
+def shifts(sensor: Sensor) -> np.ndarray:
+    """(H, 1) float32 metres that each beam reads too far, 0 where nobody has measured it."""
+    return np.asarray(RING_SHIFT if sensor.name == NAME else [0.0] * sensor.height, np.float32)[:, None]
 
 
 def dimness(sensor: Sensor) -> Table:

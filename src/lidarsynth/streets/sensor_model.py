@@ -194,12 +194,17 @@ def _steady(face: np.ndarray, number: np.ndarray) -> np.ndarray:
     return (mixed >> np.uint32(16)).astype(np.float32) * np.float32(2**-16)
 
 
+def range_noise(distance: np.ndarray) -> np.ndarray:
+    """(N,) metres, standard deviation of the sensor's range at distances (N,) in metres, on a smooth surface."""
+    return np.clip(distance * np.float32(NOISE[0]), *NOISE[1:])
+
+
 def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.ndarray:
     """(N,) metres, standard deviation of the range: the sensor's noise and the surface's roughness."""
     table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
         table[NUMBER[name]] = rough * factor
-    return np.hypot(table[material], np.clip(distance * np.float32(NOISE[0]), *NOISE[1:]))
+    return np.hypot(table[material], range_noise(distance))
 
 
 def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:

@@ -23,6 +23,7 @@ from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
 
 HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
+FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -79,28 +80,28 @@ def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Kn
     carrier is unknown at times, and the tilt and the beams' dimness, since users do not know theirs either. At times
     all surfaces are known but not which of them return, as in a simulator's scan; or everything is, for the classes.
     """
-    sensor, rows = _window(image.sensor, rng)
+    first = sampled and rng.random() < FIRST
+    sensor, rows = _window(image.sensor, rng, first)
     columns = (int(rng.integers(sensor.width)) + np.arange(WIDTH)) % sensor.width
     scale = math.exp(rng.uniform(-SCALE, SCALE)) if rng.random() < 0.7 else 1.0
     blocked = hidden(image.sensor)[rows]
     told_sensor = sensor if rng.random() < 0.7 else replace(sensor, tilt=(0.0, 0.0))
     told_sensor = replace(told_sensor, mount=told_sensor.mount * scale)
     unaware = rng.random() < 0.3
-    dim = tuple(np.asarray(dimness(image.sensor))[rows]) if dimness(image.sensor) and rng.random() < 0.6 else ()
-    rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns, dim)
     metres = image.range[rows][:, columns] * np.float32(scale)
-    reflectance, hole = image.reflectance[rows][:, columns], blocked[:, columns]
+    reflectance, dim = _responding(image.reflectance[rows][:, columns], _even(image.sensor, rows), rng)
+    dim = tuple(dim) if rng.random() < 0.6 else ()
+    rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns, dim)
+    hole = blocked[:, columns]
     metres = np.where(metres < 250, metres, np.float32(0))
-    told = pattern(metres.shape, sensor.width, rng, sampled)
+    told = every_column(metres.shape, sensor.width, rng) if first else pattern(metres.shape, sensor.width, rng, sampled)
     surface, kind = image.surface, rng.random()
-    perfect = surface is not None and kind < (0.2 if sampled else 0.1)
+    perfect = surface is not None and not first and kind < (0.2 if sampled else 0.1)
     told[:] = ~np.bool_(perfect) & (told | (not sampled and kind > 0.94))
     if rng.random() < 0.4 and kind <= 0.94:
         told &= metres > 0
     told = told & ~hole if unaware else told | hole
     lit = told & (metres > 0) & (rng.random() >= 0.1)
-    if rng.random() < 0.3:
-        reflectance = np.minimum(reflectance ** math.exp(rng.normal(0, 0.25)) * rng.uniform(0.6, 1.2), 1)
     near, returned = metres, told & (metres > 0)
     if perfect:
         assert surface is not None
@@ -129,8 +130,26 @@ def _to_height(part: Tensor, below: int) -> Tensor:
     return torch.cat([part, part[:, :, -1:].expand(-1, -1, HEIGHT - part.shape[2], -1)], 2)
 
 
-def _window(sensor: Sensor, rng: np.random.Generator) -> tuple[Sensor, np.ndarray]:
-    """At most 64 beams: all, every second, or a run of 64; and their rows."""
+def _even(sensor: Sensor, rows: np.ndarray) -> np.ndarray:
+    """(R, 1) float32: how much less than the mean beam these beams of the sensor read, 0 where nobody knows."""
+    dim = np.asarray(dimness(sensor) or np.zeros(sensor.height), np.float32)
+    return (dim - dim.mean())[rows, None]
+
+
+def _responding(reflectance: np.ndarray, dim: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance (R, C), at times of a sensor of another response, and how dim its beams then are, (R,)."""
+    if rng.random() >= 0.3:
+        return reflectance, dim[:, 0]
+    even = np.where(reflectance > 0, np.maximum(reflectance + dim, 0), 0)
+    power, scale = math.exp(rng.normal(0, 0.25)), np.float32(rng.uniform(0.6, 1.2))
+    return np.clip(scale * (even**power - dim), 0, 1), scale * dim[:, 0]
+
+
+def _window(sensor: Sensor, rng: np.random.Generator, first: bool = False) -> tuple[Sensor, np.ndarray]:
+    """At most 64 beams: all, every second, or a run of 64; `first`, the 16 that generation fills first; their rows."""
+    if first:
+        rows = grid_rows(sensor.height, rng.random())
+        return sensor.rows(rows.tolist()), rows
     if sensor.height <= HEIGHT:
         return sensor, np.arange(sensor.height)
     if sensor.height >= 2 * HEIGHT and rng.random() < 0.3:
@@ -140,14 +159,25 @@ def _window(sensor: Sensor, rng: np.random.Generator) -> tuple[Sensor, np.ndarra
     return sensor.rows(rows.tolist()), rows
 
 
+def every_column(shape: tuple[int, int], turn: int, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool, True = known: 128 columns of a turn of `turn`, or 256, as the coarse stage gives them."""
+    step = max(1, round(turn / (128 if rng.random() < 0.85 else 256)))
+    known = np.zeros(shape, bool)
+    known[:, rng.integers(step) :: step] = True
+    return known
+
+
 def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled: bool) -> np.ndarray:
     """(H, W) bool, True = known, of a crop of a turn of `turn` columns.
 
-    The coarse stage's grids (most of what is `sampled`), every k-th beam, any beams, points, a lost sector, regions.
+    16 of the beams (what is `sampled`, most of the time), the coarse stage's grids, every k-th beam, any beams, points,
+    a lost sector, regions.
     """
     (height, width), kind = shape, rng.random()
     known = np.zeros(shape, bool)
-    if kind < (0.6 if sampled else 0.12):
+    if sampled and kind < 0.45:
+        known[grid_rows(height, rng.random())] = True
+    elif kind < (0.6 if sampled else 0.12):
         count, step = (16 if rng.random() < 0.75 else 8), max(1, round(turn / (128 if rng.random() < 0.8 else 256)))
         rows = ((np.arange(count) + rng.random()) * height / count).astype(int)
         known[np.ix_(np.unique(rows), np.arange(rng.integers(step), width, step))] = True
@@ -173,12 +203,16 @@ def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled
 
 
 def grid(image: RangeImage, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Metres, reflectance, rays and standing elevations of an image at the coarse stage, any phase, maybe mirrored."""
+    """Metres, reflectance, rays and standing elevations of an image at the coarse stage, any phase, maybe mirrored.
+
+    Reflectance as beams that are all alike would read it.
+    """
     rows, columns = grid_rows(image.shape[0], rng.random()), grid_columns(image.shape[1], rng.random())
     rays, standing = grid_rays(image.sensor, hidden(image.sensor), rows, columns)
     at = np.ix_(rows, columns)
     metres = torch.from_numpy(np.where(image.range[at] < 250, image.range[at], 0).astype(np.float32))
-    reflectance = torch.from_numpy(image.reflectance[at].astype(np.float32))
+    even = (image.reflectance[at] + _even(image.sensor, rows)) * (image.range[at] > 0)
+    reflectance = torch.from_numpy(even.astype(np.float32))
     if rng.random() < 0.5:
         metres, reflectance, rays, standing = (part.flip(-1) for part in (metres, reflectance, rays, standing))
         rays[4] *= -1  # the sine of the azimuth

@@ -24,7 +24,8 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import NOISES, Filled, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
-from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.streets.hdl64e import dimness, hidden, shifts, written_out
+from lidarsynth.streets.sensor_model import range_noise
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
@@ -40,9 +41,9 @@ SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
-# Of the noise that training draws: its energy scores leave samples rougher than streets are. Chosen by street-1 among
-# 0.25, 0.4 and 1 on grids of true streets, and right for realise on streets too (docs/training-default.md).
-GRAIN = 0.4
+# Of each kind of the noise that training draws: speckle as it is, and no stripes and patches, which energy scores leave
+# too strong. Chosen by street-2 on grids of true streets (docs/training-default.md).
+GRAIN = (1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,7 +133,7 @@ class CascadeModel(ScanModel):
                 x_0 = state.x_s
                 if on_step is not None:
                     on_step()
-            metres, reflectance = self.network.coarse.decode(x_0, standing)
+            metres, reflectance = self.network.coarse.decode(x_0, standing, self._dimness(rows))
             yield from self._filled_grids(metres, reflectance, rows, columns, rng)[: n - start]
             if on_step is not None:
                 on_step()
@@ -173,6 +174,8 @@ class CascadeModel(ScanModel):
             metres, reflectance, told = self._holes(metres, reflectance, told, rng, how, on_step)
         noise = None if how.method == "conditional" else rng
         filled = self._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
+        if noise is not None:
+            filled = self._measured(filled, rng[0])
         if on_step is not None:
             on_step()
         return with_known(filled, image, known, keep_reflectance=lit)
@@ -218,7 +221,7 @@ class CascadeModel(ScanModel):
         scan, times = scan_of(scan) if isinstance(scan, np.ndarray) else scan, TIMES if times is None else times
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
-        model = self.into(own.denser(times))
+        model = self.into(written_out(own).denser(times))
         image, known = spread(sparse, model.sensor, times)
         filled = model.fill(image, known, how, on_step)
         loose = replace(scan, ring=None)
@@ -262,20 +265,53 @@ class CascadeModel(ScanModel):
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
         return (part.to(self._device).expand(count, *part.shape) for part in (told, standing))  # type: ignore[return-value]
 
+    def _dimness(self, rows: np.ndarray) -> Tensor:
+        """(R, 1), of these beams, against the mean beam."""
+        dim = np.asarray(dimness(self.sensor) or np.zeros(self.sensor.height), np.float32)
+        return torch.from_numpy((dim - dim.mean())[rows, None]).to(self._device)
+
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
-        """Coarse grids (B, 16, 128) as samples of whole images."""
-        shape, grid = (
-            (len(metres), self.sensor.height, self.sensor.width),
-            np.ix_(np.arange(len(metres)), rows, columns),
-        )
+        """Coarse grids (B, 16, 128) as samples of whole images: first the grid's beams, then all between them.
+
+        At once, most pixels would know nothing above or below them. Those between are told how bright the beams are
+        without their speckle, else it would go on as stripes.
+        """
+        own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
+        if len(rows) == self.sensor.height:
+            images = own._between(*told, rows, columns, rng)
+        else:
+            beams = replace(own, sensor=own.sensor.rows(rows.tolist()), labelled=False)
+            drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
+            shades = [np.where(b.mask, b.reflectance, a.reflectance) for a, b in zip(drawn, calm, strict=True)]
+            whole = np.arange(self.sensor.width)
+            images = own._between(np.stack([a.range for a in drawn]), np.stack(shades), rows, whole, rng)
+            for image, beam in zip(images, drawn, strict=True):
+                image.reflectance[rows] = beam.reflectance
+        return [self._measured(replace(image, sensor=self.sensor), one) for image, one in zip(images, rng, strict=True)]
+
+    def _between(
+        self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: list | None
+    ) -> list[RangeImage]:
+        """Samples of whole images, told metres (B, R, C), 0 for no return, and reflectance of rows and columns."""
+        shape = (len(metres), self.sensor.height, self.sensor.width)
         ranges, shades, told = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
-        ranges[grid], shades[grid], told[grid] = metres.cpu().numpy(), reflectance.cpu().numpy(), True
+        grid = np.ix_(np.arange(len(metres)), rows, columns)
+        ranges[grid], shades[grid], told[grid] = metres, reflectance, True
         ranges[(ranges < self.sensor.min_range) | (ranges > self.sensor.max_range)] = 0
         ranges[:, self._blocked] = 0
         told |= self._blocked
-        return [image.keep(image.mask) for image in self._fill(ranges, shades * (ranges > 0), told, True, rng)]
+        samples = self._fill(ranges, shades, told, True, rng)
+        return [
+            with_known(image, RangeImage(r, f, r > 0, self.sensor), one, keep_reflectance=True)
+            for image, r, f, one in zip(samples, ranges, shades * (ranges > 0), told, strict=True)
+        ]
+
+    def _measured(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
+        """The image with the range noise of a sensor, and each beam's own error, as streets have it."""
+        noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(self.sensor)
+        return replace(image, range=np.clip(image.range + noise, self.sensor.min_range, None) * image.mask)
 
     def _holes(
         self,
@@ -294,7 +330,8 @@ class CascadeModel(ScanModel):
         here = torch.from_numpy(told[grid])[None].to(self._device)
         coarse = self.network.coarse
         values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
-        known = coarse.encode(*values, standing)  # type: ignore[call-arg]
+        dim = self._dimness(rows)
+        known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
         x_1 = noise_like(known, rng)
         assert how.steps is not None and how.resamples is not None
         x_0 = x_1
@@ -311,7 +348,7 @@ class CascadeModel(ScanModel):
             x_0 = state.x_s
             if on_step is not None:
                 on_step()
-        new_metres, new_reflectance = (part[0].cpu().numpy() for part in coarse.decode(x_0, standing))
+        new_metres, new_reflectance = (part[0].cpu().numpy() for part in coarse.decode(x_0, standing, dim))
         hole = ~widened(cell)
         metres, reflectance, told = metres.copy(), reflectance.copy(), told.copy()
         new_metres = np.where(new_metres > self.sensor.max_range, 0, new_metres)
@@ -368,7 +405,8 @@ class CascadeModel(ScanModel):
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
-            noise = GRAIN * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
+            kinds = torch.tensor(GRAIN)[:, None, None]
+            noise = kinds * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
         device = self._device
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))

@@ -24,6 +24,7 @@ from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
 from lidarsynth.training.task import Phase, Task
 
+DARK = -0.15  # what the fill learns where a return reads 0
 SEAM = 16  # columns at the ends of a crop that are not judged: beyond them its turn would go on
 FITTED = 256  # streets that the standards of the coarse stage are measured on
 
@@ -95,9 +96,14 @@ def absolute_errors(filled: Filled, known: Known, rays: Rays, metres: Tensor, re
     sought = hidden & returned & ~known.returned
     code = _mean((filled.code - encode_range(metres)).abs(), sought)
     far = _mean((decode_range(filled.code) - metres).abs(), sought)
-    shade = _mean((filled.reflectance - reflectance).abs(), ~known.lit & inside & returned)
+    shade = _mean((filled.reflectance - _dark(reflectance, returned)).abs(), ~known.lit & inside & returned)
     drop = _mean(F.binary_cross_entropy_with_logits(filled.logit, returned.float(), reduction="none"), hidden)
-    return 2 * code + 0.1 * far + 4 * shade + 0.5 * drop
+    return 2 * code + 0.1 * far + 6 * shade + 0.5 * drop
+
+
+def _dark(reflectance: Tensor, returned: Tensor) -> Tensor:
+    """Reflectance with DARK in the place of 0, so that draws of it, which are cut at 0, are often 0."""
+    return torch.where(returned & (reflectance <= 0), DARK, reflectance)
 
 
 def misnamed(filled: Filled, rays: Rays, classes: Tensor) -> Tensor:
@@ -117,13 +123,14 @@ def joined(filled: Filled, known: Known, rays: Rays) -> Tensor:
     """What energy scores compare, (b, 3, H, W): returns, range and reflectance, with known pixels as they are."""
     share = torch.where(known.told, known.returned.float(), filled.logit.sigmoid())
     code = torch.where(known.returned, encode_range(known.metres), filled.code)
-    shade = torch.where(known.lit, known.reflectance, filled.reflectance)
+    shade = torch.where(known.lit, _dark(known.reflectance, known.lit), filled.reflectance)
     return _comparable(share, code, shade, rays)
 
 
 def truth(metres: Tensor, reflectance: Tensor, rays: Rays) -> Tensor:
     """`joined` of what was measured."""
-    return _comparable((metres > 0).float(), encode_range(metres), reflectance, rays)
+    returned = metres > 0
+    return _comparable(returned.float(), encode_range(metres), _dark(reflectance, returned), rays)
 
 
 def _comparable(share: Tensor, code: Tensor, shade: Tensor, rays: Rays) -> Tensor:
