@@ -127,3 +127,9 @@ def shifts(sensor: Sensor) -> np.ndarray:
 def dimness(sensor: Sensor) -> Table:
     """How much less signal each beam reports, () where nobody has measured it."""
     return RING_LOSS if sensor.name == NAME else sensor.dimness
+
+
+def unevenness(sensor: Sensor) -> np.ndarray:
+    """(H, 1) float32: how much less than the mean beam each one reads, 0 where nobody has measured it."""
+    dim = np.asarray(dimness(sensor) or [0.0] * sensor.height, np.float32)
+    return (dim - dim.mean())[:, None]

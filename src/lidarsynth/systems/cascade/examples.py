@@ -17,7 +17,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
-from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.streets.hdl64e import hidden, unevenness
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
@@ -89,7 +89,7 @@ def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Kn
     told_sensor = replace(told_sensor, mount=told_sensor.mount * scale)
     unaware = rng.random() < 0.3
     metres = image.range[rows][:, columns] * np.float32(scale)
-    reflectance, dim = _responding(image.reflectance[rows][:, columns], _even(image.sensor, rows), rng)
+    reflectance, dim = _responding(image.reflectance[rows][:, columns], unevenness(image.sensor)[rows], rng)
     dim = tuple(dim) if rng.random() < 0.6 else ()
     rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns, dim)
     hole = blocked[:, columns]
@@ -128,12 +128,6 @@ def _to_height(part: Tensor, below: int) -> Tensor:
     if part.shape[2] == 1 or part.shape[2] == HEIGHT:
         return part
     return torch.cat([part, part[:, :, -1:].expand(-1, -1, HEIGHT - part.shape[2], -1)], 2)
-
-
-def _even(sensor: Sensor, rows: np.ndarray) -> np.ndarray:
-    """(R, 1) float32: how much less than the mean beam these beams of the sensor read, 0 where nobody knows."""
-    dim = np.asarray(dimness(sensor) or np.zeros(sensor.height), np.float32)
-    return (dim - dim.mean())[rows, None]
 
 
 def _responding(reflectance: np.ndarray, dim: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +205,7 @@ def grid(image: RangeImage, rng: np.random.Generator) -> tuple[Tensor, Tensor, T
     rays, standing = grid_rays(image.sensor, hidden(image.sensor), rows, columns)
     at = np.ix_(rows, columns)
     metres = torch.from_numpy(np.where(image.range[at] < 250, image.range[at], 0).astype(np.float32))
-    even = (image.reflectance[at] + _even(image.sensor, rows)) * (image.range[at] > 0)
+    even = (image.reflectance[at] + unevenness(image.sensor)[rows]) * (image.range[at] > 0)
     reflectance = torch.from_numpy(even.astype(np.float32))
     if rng.random() < 0.5:
         metres, reflectance, rays, standing = (part.flip(-1) for part in (metres, reflectance, rays, standing))

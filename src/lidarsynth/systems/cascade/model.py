@@ -24,11 +24,10 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import NOISES, Filled, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
-from lidarsynth.streets.hdl64e import dimness, hidden, shifts, written_out
-from lidarsynth.streets.sensor_model import range_noise
+from lidarsynth.streets.hdl64e import dimness, hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
+from lidarsynth.systems.cascade.known import best_known, known_of, noisy, placed, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -133,7 +132,7 @@ class CascadeModel(ScanModel):
                 x_0 = state.x_s
                 if on_step is not None:
                     on_step()
-            metres, reflectance = self.network.coarse.decode(x_0, standing, self._dimness(rows))
+            metres, reflectance = self.network.coarse.decode(x_0, standing, self._dims(rows))
             yield from self._filled_grids(metres, reflectance, rows, columns, rng)[: n - start]
             if on_step is not None:
                 on_step()
@@ -175,7 +174,7 @@ class CascadeModel(ScanModel):
         noise = None if how.method == "conditional" else rng
         filled = self._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         if noise is not None:
-            filled = self._measured(filled, rng[0])
+            filled = noisy(filled, rng[0])
         if on_step is not None:
             on_step()
         return with_known(filled, image, known, keep_reflectance=lit)
@@ -265,18 +264,13 @@ class CascadeModel(ScanModel):
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
         return (part.to(self._device).expand(count, *part.shape) for part in (told, standing))  # type: ignore[return-value]
 
-    def _dimness(self, rows: np.ndarray) -> Tensor:
-        """(R, 1), of these beams, against the mean beam."""
-        dim = np.asarray(dimness(self.sensor) or np.zeros(self.sensor.height), np.float32)
-        return torch.from_numpy((dim - dim.mean())[rows, None]).to(self._device)
-
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
         """Coarse grids (B, 16, 128) as samples of whole images: first the grid's beams, then all between them.
 
-        At once, most pixels would know nothing above or below them. Those between are told how bright the beams are
-        without their speckle, else it would go on as stripes.
+        At once, most pixels would know nothing above or below. Those between are told the beams without their speckle,
+        else it would go on as stripes.
         """
         own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
         if len(rows) == self.sensor.height:
@@ -289,29 +283,18 @@ class CascadeModel(ScanModel):
             images = own._between(np.stack([a.range for a in drawn]), np.stack(shades), rows, whole, rng)
             for image, beam in zip(images, drawn, strict=True):
                 image.reflectance[rows] = beam.reflectance
-        return [self._measured(replace(image, sensor=self.sensor), one) for image, one in zip(images, rng, strict=True)]
+        return [noisy(replace(image, sensor=self.sensor), one) for image, one in zip(images, rng, strict=True)]
 
     def _between(
         self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: list | None
     ) -> list[RangeImage]:
         """Samples of whole images, told metres (B, R, C), 0 for no return, and reflectance of rows and columns."""
-        shape = (len(metres), self.sensor.height, self.sensor.width)
-        ranges, shades, told = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
-        grid = np.ix_(np.arange(len(metres)), rows, columns)
-        ranges[grid], shades[grid], told[grid] = metres, reflectance, True
-        ranges[(ranges < self.sensor.min_range) | (ranges > self.sensor.max_range)] = 0
-        ranges[:, self._blocked] = 0
-        told |= self._blocked
-        samples = self._fill(ranges, shades, told, True, rng)
-        return [
-            with_known(image, RangeImage(r, f, r > 0, self.sensor), one, keep_reflectance=True)
-            for image, r, f, one in zip(samples, ranges, shades * (ranges > 0), told, strict=True)
-        ]
+        ranges, shades, told = placed(metres, reflectance, rows, columns, self.sensor, self._blocked)
+        samples = zip(self._fill(ranges, shades, told, True, rng), ranges, shades, told, strict=True)
+        return [with_known(a, RangeImage(r, f, r > 0, self.sensor), t, keep_reflectance=True) for a, r, f, t in samples]
 
-    def _measured(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
-        """The image with the range noise of a sensor, and each beam's own error, as streets have it."""
-        noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(self.sensor)
-        return replace(image, range=np.clip(image.range + noise, self.sensor.min_range, None) * image.mask)
+    def _dims(self, rows: np.ndarray) -> Tensor:
+        return torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device)
 
     def _holes(
         self,
@@ -330,7 +313,7 @@ class CascadeModel(ScanModel):
         here = torch.from_numpy(told[grid])[None].to(self._device)
         coarse = self.network.coarse
         values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
-        dim = self._dimness(rows)
+        dim = self._dims(rows)
         known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
         x_1 = noise_like(known, rng)
         assert how.steps is not None and how.resamples is not None
@@ -394,11 +377,7 @@ class CascadeModel(ScanModel):
 
     @torch.inference_mode()
     def _network(
-        self,
-        known: Known,
-        rng: list[torch.Generator] | None,
-        doubt: bool = False,
-        classify: bool = False,
+        self, known: Known, rng: list[torch.Generator] | None, doubt: bool = False, classify: bool = False
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
