@@ -102,3 +102,21 @@ def widened(cell: np.ndarray) -> np.ndarray:
     tall = np.pad(cell, ((1, 1), (0, 0)))
     tall = tall[:-2] | tall[1:-1] | tall[2:]
     return tall | np.roll(tall, 1, 1) | np.roll(tall, -1, 1)
+
+
+def answered(
+    sensor: Sensor,
+    blocked: np.ndarray,
+    distance: np.ndarray,
+    reflectance: Tensor,
+    logit: Tensor,
+    classes: Tensor | None,
+    sure: Tensor | None,
+) -> RangeImage:
+    """The image of what the fill says: metres (H, W), outputs (1, H, W) and (C, H, W), and chances (1, H, W)."""
+    mask = (logit[0] > 0).numpy() & (distance <= sensor.max_range) & (distance >= sensor.min_range) & ~blocked
+    shade = reflectance[0].clamp(0, 1).numpy()
+    label = None if classes is None else classes[1:].argmax(0).numpy() + 1  # 0, unlabeled, is no answer
+    chance = None if sure is None else sure.reshape(distance.shape).numpy()
+    # The label is that of all rays: what is known may return.
+    return RangeImage(distance * mask, shade * mask, mask, sensor, label, confidence=chance)

@@ -27,7 +27,7 @@ from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.known import best_known, known_of, noisy, placed, spread, unanswered, widened
+from lidarsynth.systems.cascade.known import answered, best_known, known_of, noisy, placed, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -122,7 +122,7 @@ class CascadeModel(ScanModel):
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         rows, columns = self._grid()
-        size = self.at_once(batch_size)
+        dim, size = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device), self.at_once(batch_size)
         for start in range(first, n, size):
             rng = generators(seed, size, offset=start)
             told, standing = self._grid_rays(rows, columns, len(rng))
@@ -132,7 +132,7 @@ class CascadeModel(ScanModel):
                 x_0 = state.x_s
                 if on_step is not None:
                     on_step()
-            metres, reflectance = self.network.coarse.decode(x_0, standing, self._dims(rows))
+            metres, reflectance = self.network.coarse.decode(x_0, standing, dim)
             yield from self._filled_grids(metres, reflectance, rows, columns, rng)[: n - start]
             if on_step is not None:
                 on_step()
@@ -293,9 +293,6 @@ class CascadeModel(ScanModel):
         samples = zip(self._fill(ranges, shades, told, True, rng), ranges, shades, told, strict=True)
         return [with_known(a, RangeImage(r, f, r > 0, self.sensor), t, keep_reflectance=True) for a, r, f, t in samples]
 
-    def _dims(self, rows: np.ndarray) -> Tensor:
-        return torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device)
-
     def _holes(
         self,
         metres: np.ndarray,
@@ -313,7 +310,7 @@ class CascadeModel(ScanModel):
         here = torch.from_numpy(told[grid])[None].to(self._device)
         coarse = self.network.coarse
         values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
-        dim = self._dims(rows)
+        dim = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device)
         known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
         x_1 = noise_like(known, rng)
         assert how.steps is not None and how.resamples is not None
@@ -373,7 +370,10 @@ class CascadeModel(ScanModel):
         sure = None if weights is None else confidence(filled, rays, weights)
         parts = (filled.reflectance, logit, filled.classes, sure)
         cut = [[None] * len(metres) if part is None else part[..., :height, :width].cpu() for part in parts]
-        return [self._image(*of_one) for of_one in zip(metres[:, :height, :width], *cut, strict=True)]
+        return [
+            answered(self.sensor, self._blocked, *of_one)
+            for of_one in zip(metres[:, :height, :width], *cut, strict=True)
+        ]
 
     @torch.inference_mode()
     def _network(
@@ -391,19 +391,6 @@ class CascadeModel(ScanModel):
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             return self.network.fill(known, rays, noise.to(device), classify=classify, doubt=doubt), rays
-
-    def _image(
-        self, distance: np.ndarray, reflectance: Tensor, logit: Tensor, classes: Tensor | None, sure: Tensor | None
-    ) -> RangeImage:
-        """The image of (H, W) metres, (1, H, W) and (C, H, W) outputs, and chances."""
-        sensor = self.sensor
-        mask = (logit[0] > 0).numpy() & (distance <= sensor.max_range) & ~self._blocked
-        mask &= distance >= sensor.min_range
-        shade = reflectance[0].clamp(0, 1).numpy()
-        label = None if classes is None else classes[1:].argmax(0).numpy() + 1  # 0, unlabeled, is no answer
-        chance = None if sure is None else sure.reshape(distance.shape).numpy()
-        # The label is that of all rays: what is known may return.
-        return RangeImage(distance * mask, shade * mask, mask, sensor, label, confidence=chance)
 
     @property
     def _blocked(self) -> np.ndarray:
