@@ -21,13 +21,14 @@ from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
 from lidarsynth.networks.fill_unet import NOISES, Filled, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.known import answered, best_known, known_of, noisy, placed, spread, unanswered, widened
+from lidarsynth.systems.cascade.images import answered, grid_of, noisy, placed
+from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -40,9 +41,11 @@ SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
-# Of each kind of the noise that training draws: speckle as it is, and no stripes and patches, which energy scores leave
-# too strong. Chosen by street-2 on grids of true streets (docs/training-default.md).
-GRAIN = (1.0, 0.0, 0.0)
+GRAIN = (
+    1.0,
+    0.0,
+    0.0,
+)  # of the noises of training: speckle, but neither stripes nor patches (docs/training-default.md)
 
 
 @dataclass(frozen=True, repr=False)
@@ -121,7 +124,7 @@ class CascadeModel(ScanModel):
         sampler, steps = self._sampler(sampler), STEPS_DEFAULT if steps is None else steps
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
-        rows, columns = self._grid()
+        rows, columns = grid_of(self.sensor)
         dim, size = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device), self.at_once(batch_size)
         for start in range(first, n, size):
             rng = generators(seed, size, offset=start)
@@ -242,7 +245,7 @@ class CascadeModel(ScanModel):
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch: the coarse steps, the fill. Raises ValueError as `stream`."""
         self._sampler(sampler)
-        self._grid()
+        grid_of(self.sensor)
         return 1 + (STEPS_DEFAULT if steps is None else steps)
 
     def _sampler(self, sampler: str | None) -> str:
@@ -252,13 +255,6 @@ class CascadeModel(ScanModel):
 
     def _coarse(self, told: Tensor) -> Denoiser:
         return Denoiser(self.network.coarse, flow(BOUND), "velocity", clip=False, condition=(told,))
-
-    def _grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (16,) and columns (128,) of the coarse grid."""
-        if self.sensor.height < ROWS or self.sensor.width < COLUMNS:
-            raise ValueError(f"expected a sensor of at least {ROWS} beams and {COLUMNS} columns to generate, found "
-                             f"{self.sensor.name} with {self.sensor.height} and {self.sensor.width}")  # fmt: skip
-        return grid_rows(self.sensor.height), grid_columns(self.sensor.width)
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
@@ -303,7 +299,7 @@ class CascadeModel(ScanModel):
         on_step: OnStep,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Metres, reflectance and known pixels with a grid of new ones where nothing is known around."""
-        self._grid()
+        grid_of(self.sensor)
         rows, columns, cell = best_known(told)
         rays, standing = self._grid_rays(rows, columns, 1)
         grid = np.ix_(rows, columns)

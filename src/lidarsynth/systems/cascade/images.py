@@ -1,0 +1,67 @@
+"""Images of a cascade: grids placed in them, what the fill answers, and a sensor's noise on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rows
+from lidarsynth.streets.hdl64e import shifts
+from lidarsynth.streets.sensor_model import range_noise
+
+
+def grid_of(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (16,) and columns (128,) of the coarse grid. Raises ValueError for a sensor that has fewer."""
+    if sensor.height < ROWS or sensor.width < COLUMNS:
+        raise ValueError(f"expected a sensor of at least {ROWS} beams and {COLUMNS} columns to generate, found "
+                         f"{sensor.name} with {sensor.height} and {sensor.width}")  # fmt: skip
+    return grid_rows(sensor.height), grid_columns(sensor.width)
+
+
+def placed(
+    metres: np.ndarray,
+    reflectance: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    sensor: Sensor,
+    blocked: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(B, R, C) metres and reflectance of these rows and columns in whole images (B, H, W), and what is told of them.
+
+    Ranges beyond the sensor's limits are no returns; blocked rays (H, W) are known to be empty.
+    """
+    shape, grid = (len(metres), *blocked.shape), np.ix_(np.arange(len(metres)), rows, columns)
+    ranges, shades, told = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
+    ranges[grid], shades[grid], told[grid] = metres, reflectance, True
+    ranges[(ranges < sensor.min_range) | (ranges > sensor.max_range)] = 0
+    ranges[:, blocked] = 0
+    return ranges, shades * (ranges > 0), told | blocked
+
+
+def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
+    """The image with a sensor's range noise and each beam's own error, as streets have them."""
+    noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(image.sensor)
+    return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask)
+
+
+def answered(
+    sensor: Sensor,
+    blocked: np.ndarray,
+    distance: np.ndarray,
+    reflectance: Tensor,
+    logit: Tensor,
+    classes: Tensor | None,
+    sure: Tensor | None,
+) -> RangeImage:
+    """The image of what the fill says: metres (H, W), outputs (1, H, W) and (C, H, W), and chances (1, H, W)."""
+    mask = (logit[0] > 0).numpy() & (distance <= sensor.max_range) & (distance >= sensor.min_range) & ~blocked
+    shade = reflectance[0].clamp(0, 1).numpy()
+    label = None if classes is None else classes[1:].argmax(0).numpy() + 1  # 0, unlabeled, is no answer
+    chance = None if sure is None else sure.reshape(distance.shape).numpy()
+    # The label is that of all rays: what is known may return.
+    return RangeImage(distance * mask, shade * mask, mask, sensor, label, confidence=chance)
