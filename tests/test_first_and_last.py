@@ -18,11 +18,12 @@ from lidarsynth.cli import terminal
 from lidarsynth.cli.main import main
 from lidarsynth.data.cache import write_cache
 from lidarsynth.data.frames import read_velodyne
+from lidarsynth.data.ouster import read_metadata
 from lidarsynth.data.street_sets import write_streets
 from lidarsynth.evaluation.evaluate import evaluate
 from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS, Sensor, from_dict
+from lidarsynth.lidar.sensor import SENSORS, Sensor, from_dict, read_sensor
 from lidarsynth.lidar.small_file import read_toml
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.networks.archive import read_yaml
@@ -186,6 +187,16 @@ def test_merged_histograms_stay_small():
 def test_blocked_columns_of_another_kind_are_named(blocked):
     with pytest.raises(ValueError, match="mine: expected blocked as a list of"):
         from_dict({**SENSOR.to_dict(), "blocked": blocked}, "mine")
+
+
+def test_numbers_too_large_for_a_float_are_named(tmp_path: Path):
+    (tmp_path / "a.toml").write_text(f"beams = 8\ntop = 1{'0' * 400}\nbottom = -25\n")
+    with pytest.raises(ValueError, match="a: expected numbers in the sensor's fields, found"):
+        read_sensor(tmp_path / "a.toml")
+    beams = '"beam_altitude_angles": [4, 3, 2, 1], "beam_azimuth_angles": [0, 0, 0, 0]'
+    (tmp_path / "a.json").write_text(f'{{{beams}, "columns_per_frame": 1e999}}')
+    with pytest.raises(ValueError, match="expected Ouster metadata, found"):
+        read_metadata(tmp_path / "a.json")
 
 
 def test_damaged_rows_of_a_curve_are_left_out(tmp_path: Path):

@@ -90,7 +90,7 @@ def read_metadata(path: str | Path) -> Metadata:
                         f"{', '.join(list(flat)[:6]) or 'nothing'}")  # fmt: skip
     try:
         return _metadata(flat, path.stem)
-    except (TypeError, ValueError, KeyError) as error:
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise FileError(f"{path}: expected Ouster metadata, found: {error}") from None
 
 

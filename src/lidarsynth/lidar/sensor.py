@@ -196,7 +196,7 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
 def _numbers(values: Any, source: str) -> Sequence[float]:
     try:
         return [float(value) for value in values]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values!r:.60}") from None
 
 

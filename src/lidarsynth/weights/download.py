@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import os
 import re
@@ -15,7 +16,6 @@ from typing import BinaryIO
 
 from platformdirs import user_cache_path
 
-from lidarsynth.data.cache import sha256
 from lidarsynth.lidar.small_file import read_text
 
 SUMS = "SHA256SUMS"  # beside the files: lines `hash  name`, as sha256sum writes them, that a user or a team trusts
@@ -71,7 +71,11 @@ def _check_sum(content: Path, path: Path) -> None:
     known = {words[1].lstrip("*"): words[0].lower() for words in lines if len(words) == 2}
     if (expected := known.get(path.name)) is None:
         return
-    if (found := sha256(content)) != expected:
+    digest = hashlib.sha256()
+    with content.open("rb") as file:
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    if (found := digest.hexdigest()) != expected:
         raise ValueError(f"{content}: expected the SHA-256 {expected} of {sums}, found {found}; delete the file to "
                          "download it again")  # fmt: skip
 
