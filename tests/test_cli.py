@@ -27,6 +27,7 @@ from lidarsynth.files.formats import read, read_image, write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.weights.load import load
 
 
 class Answer(NamedTuple):
@@ -103,6 +104,15 @@ def test_generate_writes_scans_and_pictures(run: Run, tiny: Path, tmp_path: Path
     assert list(files(tmp_path / "g")) == names
     assert "2 scans, 2 of them new" in answer.out
     assert 0 < len(read(tmp_path / "g" / "000001.ply")) <= 16 * 64
+
+
+def test_the_command_line_takes_as_many_steps_as_the_library(run: Run, tmp_path: Path):
+    """The steps of a cascade's progress are one more than its coarse stage takes."""
+    words = ("--model", "default", "--sensor", "vlp-16", "--steps", 1, "--format", "npz", "--no-picture")
+    assert run("generate", "-n", 1, "--out", tmp_path / "g", *words).code == 0
+    (image,) = load("default").into("vlp-16").generate(1, steps=1, seed=0)
+    with np.load(tmp_path / "g" / "000000.npz") as file:
+        np.testing.assert_array_equal(file["range"], image.range)
 
 
 def test_scans_are_the_same_bytes_whatever_the_batch_and_the_count(run: Run, tiny: Path, tmp_path: Path):

@@ -34,12 +34,12 @@ def generate(
     loaded = load_with_bar(model, device)
     loaded = loaded.into(sensor) if sensor else loaded
     loaded = loaded.with_labels() if labels else loaded
-    steps = loaded.generation_steps(steps, sampler)
-    settings = {"weights": fingerprint(loaded), "format": format, "steps": steps, "sampler": sampler, "seed": seed}
+    calls = loaded.generation_steps(steps, sampler)
+    settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": sampler, "seed": seed}
     settings |= {"labels": True} if labels else {}
     with only_writer(out, "generation"):
         claim(out, settings)
         runs = batches(out, count, endings, loaded.at_once(batch_size))
-        with step_bar("generate", len(runs) * steps) as on_step:
+        with step_bar("generate", len(runs) * calls) as on_step:
             new = sum(1 for _ in generate_into(out, loaded, runs, batch_size, endings, steps, sampler, seed, on_step))
     say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

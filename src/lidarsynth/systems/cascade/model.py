@@ -41,11 +41,8 @@ SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
-GRAIN = (
-    1.0,
-    0.0,
-    0.0,
-)  # of the noises of training: speckle, but neither stripes nor patches (docs/training-default.md)
+# Of the kinds of noise of training, speckle, stripes, patches; chosen by street-1 and -2 (docs/training-default.md).
+GRAIN, GRAIN_REALISED = (1.0, 0.0, 0.0), (0.4, 0.4, 0.4)
 
 
 @dataclass(frozen=True, repr=False)
@@ -359,7 +356,8 @@ class CascadeModel(ScanModel):
         surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
-        filled, rays = self._network(known, rng, doubt=weights is not None, classify=self.labelled)
+        grain = GRAIN if surely is None else GRAIN_REALISED
+        filled, rays = self._network(known, rng, weights is not None, self.labelled, grain)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
@@ -373,14 +371,14 @@ class CascadeModel(ScanModel):
 
     @torch.inference_mode()
     def _network(
-        self, known: Known, rng: list[torch.Generator] | None, doubt: bool = False, classify: bool = False
+        self, known: Known, rng: list | None, doubt: bool = False, classify: bool = False, grain: tuple = GRAIN
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
         rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
-            kinds = torch.tensor(GRAIN)[:, None, None]
+            kinds = torch.tensor(grain)[:, None, None]
             noise = kinds * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
         device = self._device
         known = Known(*(part.to(device) for part in known))
