@@ -36,7 +36,8 @@ def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
     """Raises ValueError by the option's name unless each number is None or from `least` to 2^62."""
     for name, number in numbers.items():
         if number is not None and not least <= number < 2**62:
-            raise ValueError(f"expected --{name} of at least {least}, found {number}")
+            limit = f"at least {least}" if number < least else "at most 2^62 - 1"
+            raise ValueError(f"expected --{name} of {limit}, found {number}")
 
 
 @contextmanager
