@@ -45,6 +45,7 @@ class Forked:
         sys.stdout, sys.stderr = (open(fd, "w", closefd=False) for fd in (1, 2))  # noqa: SIM115
         signal.signal(signal.SIGINT, signal.default_int_handler)
         _forget_processes()
+        warnings.resetwarnings()  # pytest makes them errors; a command prints them
         code = 0
         try:
             self.run(self.words)
