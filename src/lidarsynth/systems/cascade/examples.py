@@ -134,9 +134,9 @@ def _responding(reflectance: np.ndarray, dim: np.ndarray, rng: np.random.Generat
     """Reflectance (R, C), at times of a sensor of another response, and how dim its beams then are, (R,)."""
     if rng.random() >= 0.3:
         return reflectance, dim[:, 0]
-    even = np.where(reflectance > 0, np.maximum(reflectance + dim, 0), 0)
+    seen, even = reflectance > 0, np.maximum(reflectance + dim, 0)  # what reads 0 reads 0 to others, too
     power, scale = math.exp(rng.normal(0, 0.25)), np.float32(rng.uniform(0.6, 1.2))
-    return np.clip(scale * (even**power - dim), 0, 1), scale * dim[:, 0]
+    return np.clip(scale * (even**power - dim), 0, 1) * seen, scale * dim[:, 0]
 
 
 def _window(sensor: Sensor, rng: np.random.Generator, first: bool = False) -> tuple[Sensor, np.ndarray]:
