@@ -184,3 +184,12 @@ def test_a_model_says_what_it_is_and_saves_itself(tmp_path: Path):
     assert len(lines) == 3 and "64 beams x 1024" in lines[1] and "parameters, on cpu" in lines[2]
     again = load(model.save(tmp_path / "m"))
     assert repr(again).splitlines()[1:] == lines[1:]
+
+
+def test_a_model_that_was_tuned_to_another_sensor_says_so(scans: Path, tmp_path: Path, capsys):
+    said = {}
+    for model in ("kitti", "default"):
+        main(["complete", str(scans / "d1" / "000.pcd"), "--model", model, "--out", str(tmp_path / "o.ply"), WORDS[0]])
+        said[model] = capsys.readouterr().err
+    assert "kitti was tuned to hdl-64e-kitti, and this is a scan of vlp-16; use --model default" in said["kitti"]
+    assert "tuned" not in said["default"]

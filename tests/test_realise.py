@@ -111,7 +111,7 @@ def test_a_model_that_cannot_is_refused_before_any_work(place: Path, capsys: pyt
     write("sim.pcd", perfect(SMALL))
     for words in (["realise", "sim.pcd", "--out", "o"], ["generate", "--labels", "--out", "o"]):
         with pytest.raises(SystemExit) as stop:
-            main([*words, "--model", "kitti"])
+            main([*words, "--model", "kitti-streets"])
         said = capsys.readouterr().err
         assert stop.value.code == 2 and said.count("expected a model that has learned") == 1
     assert not Path("o").exists()

@@ -131,6 +131,7 @@ def test_a_run_on_several_caches_says_so(cache: Path, tmp_path: Path):
         )
     )
     assert load(tmp_path / "run")[0].card.data == "48 images of several caches (24 of noise and 3 of few)"
+    assert load(tmp_path / "run")[0].card.sensor == SENSOR.name
     with pytest.raises(ValueError, match="nowhere"):
         list(run(tiny(2), f"{cache},nowhere", tmp_path / "other", options=QUIET))
 

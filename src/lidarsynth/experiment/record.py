@@ -193,6 +193,7 @@ class Card:
     data: str = ""  # what was learned from
     history: tuple[str, ...] = ()  # runs: steps, hardware, time
     results: tuple[str, ...] = ()  # measured numbers with their command
+    sensor: str = ""  # whose scans alone were seen last
 
 
 @dataclass(frozen=True)

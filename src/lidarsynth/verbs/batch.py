@@ -162,14 +162,15 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
 
 
 def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:
-    """That a model of one sensor is asked to complete another's scan, in one line."""
-    if not work.check or job.verb != "complete" or model is None or model.any_sensor:
+    """That a model of one sensor, or one that was tuned to one, gets another's scan, in one line."""
+    if not work.check or job.verb != "complete" or model is None:
         return None
-    name, _ = recognise(scan, work.item.path)
-    own = model.sensor.name
+    own = model.experiment.card.sensor if model.any_sensor else model.sensor.name
+    name, _ = recognise(scan, work.item.path) if own else (None, "")
     if name is None or name.removesuffix("-kitti") == own.removesuffix("-kitti"):
         return None
-    return f"{work.item.path}: {job.model} knows {own} alone, and this is a scan of {name}; use --model default"
+    knows = f"was tuned to {own}" if model.any_sensor else f"knows {own} alone"
+    return f"{work.item.path}: {job.model} {knows}, and this is a scan of {name}; use --model default"
 
 
 def _made(

@@ -20,7 +20,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import Streets, TrainingImages, open_images
+from lidarsynth.training.examples import VIRTUAL, Streets, TrainingImages, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
@@ -143,7 +143,8 @@ def _begin(
                          f"found {found.height} x {found.width}")  # fmt: skip
     with fixed_randomness(experiment.training.seed):
         network = build_network(experiment)
-    card = replace(experiment.card, data=_learned_from(images))
+    sensor = "" if images.source["name"] == VIRTUAL else images.sensor.name
+    card = replace(experiment.card, data=_learned_from(images), sensor=sensor)
     saved, note = newest_whole(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
@@ -152,7 +153,7 @@ def _begin(
         transfer(network, experiment, trained, source, weights)
         learned = "; ".join(filter(None, (source.card.data, card.data)))
         licence = card.licence or source.card.licence
-        card = Card(licence, learned, (*source.card.history, f"from {source.name}"))
+        card = Card(licence, learned, (*source.card.history, f"from {source.name}"), sensor=sensor)
     state = start(experiment, network, task_of(experiment), accelerator.scaler)
     if saved:
         card = _same_experiment(saved, experiment).card
