@@ -24,6 +24,7 @@ from lidarsynth.verbs.training import run
 TINY = with_fields(
     preset("default"),
     {"model.base_channels": 16, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1),
+     "model.guide_channels": 8,
      "training.batch_size": 2, "training.steps": 2, "training.warmup": 0, "model.gn_num_groups": 8},
 )  # fmt: skip
 
@@ -139,7 +140,7 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
     for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
         before = before or progress
     losses = progress.losses
-    assert {"sample", "median", "layout"} <= losses.keys()
+    assert {"sample", "median", "layout", "guide"} <= losses.keys()
     assert all(np.isfinite(value) for value in losses.values())
     from lidarsynth import load
 

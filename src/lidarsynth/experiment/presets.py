@@ -195,6 +195,7 @@ def default() -> Experiment:
             num_residual_blocks=(2, 2, 2, 2),  # of the coarse stage
             coords_encoding=None,  # both are told each pixel's rays
             classes=20,
+            guide_channels=32,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
         training=Training(

@@ -48,6 +48,7 @@ class Model:
     candidates: bool = False  # conditional-unet: chooses among the nearest known values, not only corrects their mean
     around: bool = False  # and the nearest known value in any direction
     classes: int = within(0, 0, 1000)  # cascade: SemanticKITTI classes that it names for each pixel, 0 = none
+    guide_channels: int = within(0, 0, 8192)  # cascade: width of the network that guides the coarse one, 0 = none
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):

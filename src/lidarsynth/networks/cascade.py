@@ -1,16 +1,43 @@
-"""Coarse first, then fill: two networks that generate and complete the scans of any sensor."""
+"""Coarse first, then fill: networks that generate and complete the scans of any sensor."""
 
 from __future__ import annotations
 
-from torch import nn
+import math
+
+import torch
+from torch import Tensor, nn
 
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.fill_unet import FillUNet
 
+GUIDANCE = 1.0  # how much further from the guide's velocity
+REST = 0.05  # of noise that samplers leave: chosen by street-2 (docs/training-default.md)
+
 
 class Cascade(nn.Module):
-    """Holds `coarse` (noise -> a grid of 16 beams x 128 columns) and `fill` (known pixels -> all pixels)."""
+    """Holds `coarse` (noise -> a grid of 16 beams x 128 columns) and `fill` (known pixels -> all pixels).
 
-    def __init__(self, coarse: CoarseUNet, fill: FillUNet):
+    guide  a smaller and worse network of the same task as `coarse`: where both err alike, it errs more, and away from
+           it is where grids are likelier (autoguidance, Karras et al. 2024)
+    """
+
+    def __init__(self, coarse: CoarseUNet, fill: FillUNet, guide: CoarseUNet | None = None):
         super().__init__()
-        self.coarse, self.fill = coarse, fill
+        self.coarse, self.fill, self.guide = coarse, fill, guide
+
+    def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
+        """What `coarse` answers, led away from the guide's answer."""
+        velocity = self.coarse(x_t, log_snr, rays)
+        if self.guide is None:
+            return velocity
+        return velocity + GUIDANCE * (velocity - self.guide(x_t, log_snr, rays))
+
+    @torch.no_grad()
+    def settled(self, x_0: Tensor, rays: Tensor) -> Tensor:
+        """Samples without the rest of their noise, in which neighbouring pixels disagree: waves on flat ground.
+
+        As if x_0 were scaled to x_t of t = REST, of which `coarse` says the rest.
+        """
+        x_t = (1 - REST) * x_0
+        log_snr = torch.full((len(x_0),), 2 * math.log((1 - REST) / REST), device=x_0.device)
+        return x_t - REST * self.coarse(x_t, log_snr, rays)

@@ -71,7 +71,7 @@ def assemble(experiment: Experiment, network: nn.Module) -> ScanModel:
         words = ", ".join(word for word, system in SYSTEMS.items() if system.model)
         raise ValueError(f"{experiment.name}: expected a network of {words}, which make scans, "
                          f"found {experiment.model.network}")  # fmt: skip
-    for part in (network.coarse, network.fill) if isinstance(network, Cascade) else (network,):
+    for part in tuple(network.children()) if isinstance(network, Cascade) else (network,):
         refuse_not_finite(part, experiment.name)
     return model(experiment, network.eval())
 

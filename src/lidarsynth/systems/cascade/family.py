@@ -24,8 +24,13 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     if len(set(model.num_residual_blocks)) > 1:
         raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
                          f"{model.num_residual_blocks}")  # fmt: skip
-    coarse = CoarseUNet(width, model.channel_multipliers, model.num_residual_blocks[0])
-    return Cascade(coarse, FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2), classes=model.classes))
+    coarse, guide = (
+        CoarseUNet(channels, model.channel_multipliers, model.num_residual_blocks[0]) if channels else None
+        for channels in (width, model.guide_channels)
+    )
+    assert coarse is not None
+    fill = FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2), classes=model.classes)
+    return Cascade(coarse, fill, guide)
 
 
 def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
@@ -35,8 +40,10 @@ def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
 
 
 def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str) -> None:
-    """All weights, of equally wide networks; the sensor may differ."""
-    load_weights(network, weights.state_dict(), name)
+    """All weights, of equally wide networks; the sensor may differ, and a guide, which not all have, starts fresh."""
+    assert isinstance(network, Cascade) and isinstance(weights, Cascade)
+    for part in ("coarse", "fill", "guide")[: 3 if weights.guide and network.guide else 2]:
+        load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
 
 
 CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer, graph=fill_graph)

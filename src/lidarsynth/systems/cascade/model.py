@@ -132,7 +132,7 @@ class CascadeModel(ScanModel):
                 x_0 = state.x_s
                 if on_step is not None:
                     on_step()
-            metres, reflectance = self.network.coarse.decode(x_0, standing, dim)
+            metres, reflectance = self.network.coarse.decode(self.network.settled(x_0, told), standing, dim)
             yield from self._filled_grids(metres, reflectance, rows, columns, rng)[: n - start]
             if on_step is not None:
                 on_step()
@@ -251,7 +251,7 @@ class CascadeModel(ScanModel):
         return sampler or "dpmpp-2m"
 
     def _coarse(self, told: Tensor) -> Denoiser:
-        return Denoiser(self.network.coarse, flow(BOUND), "velocity", clip=False, condition=(told,))
+        return Denoiser(self.network.velocity, flow(BOUND), "velocity", clip=False, condition=(told,))
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)

@@ -65,11 +65,12 @@ class FillObjective(nn.Module):
 
 
 class CoarseObjective(nn.Module):
-    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N)."""
+    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N); and
+    `guide`, that of the network that guides, where there is one."""
 
-    def __init__(self, network: CoarseUNet):
+    def __init__(self, network: CoarseUNet, guide: CoarseUNet | None = None):
         super().__init__()
-        self.network = network
+        self.network, self.guide = network, guide
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         metres, reflectance, rays, standing = batch.grids
@@ -77,8 +78,10 @@ class CoarseObjective(nn.Module):
         rngs = [sample_rng(seed, 1, 0) for seed in batch.crops.seeds]
         t = torch.sigmoid(1.1 * torch.cat([torch.randn(1, generator=rng) for rng in rngs])).to(x_0)
         eps = torch.stack([torch.randn(x_0.shape[1:], generator=rng) for rng in rngs]).to(x_0)
-        denoiser = Denoiser(self.network, flow(BOUND), "velocity", clip=False, condition=(rays,))
-        return {"layout": denoiser.loss(x_0, t, eps, gamma=None)}
+        learners = {"layout": self.network, **({"guide": self.guide} if self.guide else {})}
+        denoisers = {part: Denoiser(one, flow(BOUND), "velocity", clip=False, condition=(rays,))
+                     for part, one in learners.items()}  # fmt: skip
+        return {part: denoiser.loss(x_0, t, eps, gamma=None) for part, denoiser in denoisers.items()}
 
 
 def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor, Tensor]:
@@ -199,14 +202,17 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
     if bool((network.coarse.standard[1] == 1).all()):
         streets = VirtualStreets(experiment.training.seed + 1, FITTED)
         fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
-    return Phase(FillObjective(network.fill), "fill"), Phase(CoarseObjective(network.coarse), "coarse")
+    if network.guide is not None:
+        network.guide.standard.copy_(network.coarse.standard)
+    return Phase(FillObjective(network.fill), "fill"), Phase(CoarseObjective(network.coarse, network.guide), "coarse")
 
 
 def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.optim.Optimizer]:
-    """AdamW for each stage; the coarse one at half the rate."""
+    """AdamW for each stage; the coarse one, with its guide, at half the rate."""
     assert isinstance(network, Cascade)
     training = experiment.training
-    coarse = {"params": list(network.coarse.parameters()), "factor": 0.5}
+    stage = [*network.coarse.parameters(), *(network.guide.parameters() if network.guide else ())]
+    coarse = {"params": stage, "factor": 0.5}
     options = {"lr": training.learning_rate, "betas": training.betas, "weight_decay": 0.01}
     return {"fill": torch.optim.AdamW(network.fill.parameters(), **options),
             "coarse": torch.optim.AdamW([coarse], **options)}  # fmt: skip
@@ -238,7 +244,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "layout"),
+    parts=("sample", "median", "layout", "guide"),
     draw=draw,
     phases=phases,
     judge=judge,
