@@ -388,3 +388,25 @@ def test_bf16_errs_little_and_auto_asks_the_processor(model: CascadeModel, monke
         assert model.at_precision("auto").precision == ("bf16" if has else "fp32")
     with pytest.raises(ValueError, match="expected a precision of auto, fp32, bf16, found 'fp8'"):
         model.at_precision("fp8")
+
+
+class Constant(CoarseUNet):
+    """Believes in one grid: the velocity that leads there from anywhere."""
+
+    def __init__(self, grid: torch.Tensor):
+        torch.nn.Module.__init__(self)
+        self.grid = grid
+
+    def forward(self, x_t: torch.Tensor, log_snr: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
+        return (x_t - self.grid) / torch.sigmoid(-log_snr / 2)[:, None, None, None]
+
+
+def test_a_guide_is_led_away_from_and_the_rest_of_noise_is_taken_off(model: CascadeModel):
+    rng = torch.Generator().manual_seed(0)
+    good, bad, x_t = torch.randn(3, 2, 3, 16, 128, generator=rng)
+    rays, log_snr = torch.zeros(2, 8, 16, 128), torch.tensor([0.0, 3.0])
+    fill, t = model.network.fill, torch.sigmoid(-log_snr / 2)[:, None, None, None]
+    alone, led = Cascade(Constant(good), fill), Cascade(Constant(good), fill, Constant(bad))
+    assert_close(x_t - t * alone.velocity(x_t, log_snr, rays), good, rtol=0, atol=1e-5)
+    assert_close(x_t - t * led.velocity(x_t, log_snr, rays), 2 * good - bad, rtol=0, atol=1e-5)
+    assert_close(led.settled(good + 0.1 * x_t, rays), good, rtol=0, atol=1e-5)
