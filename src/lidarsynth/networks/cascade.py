@@ -10,7 +10,9 @@ from torch import Tensor, nn
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.fill_unet import FillUNet
 
-GUIDANCE = 1.0  # how much further from the guide's velocity
+# How much further from the guide's velocity, and between which log-SNR: at more noise it would make streets alike, at
+# less it would sharpen nothing (Kynkäänniemi et al. 2024).
+GUIDANCE, GUIDED = 1.5, (-3.0, 3.0)
 REST = 0.05  # of noise that samplers leave: chosen by street-2 (docs/training-default.md)
 
 
@@ -28,9 +30,11 @@ class Cascade(nn.Module):
     def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         """What `coarse` answers, led away from the guide's answer."""
         velocity = self.coarse(x_t, log_snr, rays)
-        if self.guide is None:
+        within = (GUIDED[0] < log_snr) & (log_snr < GUIDED[1])
+        if self.guide is None or not within.any():
             return velocity
-        return velocity + GUIDANCE * (velocity - self.guide(x_t, log_snr, rays))
+        further = GUIDANCE * within[:, None, None, None].to(velocity)
+        return velocity + further * (velocity - self.guide(x_t, log_snr, rays))
 
     @torch.no_grad()
     def settled(self, x_0: Tensor, rays: Tensor) -> Tensor:
