@@ -1,6 +1,7 @@
 """Data sets of labelled streets: read back by the published formats, stopped and gone on with, others refused."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,23 @@ DRIVE = Options(frames=7, deskewed=True)
 
 
 STREETS = LabelledStreets(0, 1, SENSOR, DRIVE)  # holds its world, so that it is built once
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cast_once() -> Iterator[None]:
+    """Each frame of a drive, which does not depend on when it is asked for, is cast once for all tests of this file."""
+    kept: dict[tuple, Frame] = {}
+    cast = LabelledStreets._driven
+
+    def driven(self: LabelledStreets, number: int, k: int) -> Frame:
+        key = (self.seed, self.sensor, self.options, number, k)
+        if key not in kept:
+            kept[key] = cast(self, number, k)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LabelledStreets, "_driven", driven)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,13 @@ from lidarsynth.streets.facades import shade
 from lidarsynth.streets.ground import Ground, Road
 from lidarsynth.streets.materials import MATERIALS, NUMBER, TABLE
 from lidarsynth.streets.objects import library
-from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.streets.reader import SyntheticStreets, Worlds
+from lidarsynth.streets.virtual import WIDEST, VirtualStreets
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
 KITTI = SENSORS["hdl-64e-kitti"]
+WORLDS = Worlds(1, WIDEST)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def test_scans_stay_the_same_from_machine_to_machine():
 @pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "os1-128"])
 def test_any_sensor(name: str):
     sensor = SENSORS[name].resized(width=256)
-    image = SyntheticStreets(seed=1, length=2, sensor=sensor).image(1)
+    image = SyntheticStreets(seed=1, length=2, sensor=sensor, worlds=WORLDS).image(1)
     assert image.shape == (sensor.height, 256)
     assert 0.3 < image.mask.mean() < 0.95
     assert image.range[image.mask].max() < sensor.max_range + 1
@@ -172,7 +173,7 @@ def test_a_pair_is_the_perfect_scan_and_todays_image():
     """The image bit by bit; the perfect one lies under it, but for noise, panes, and what was dropped."""
     for streets in (SyntheticStreets(seed=5, length=4), VirtualStreets(seed=6, length=8)):
         perfect, seen = streets.pair(2)
-        image = type(streets)(streets.seed, 8).image(2)
+        image = streets.image(2)
         for name in ("range", "reflectance", "mask", "label"):
             np.testing.assert_array_equal(getattr(seen, name), getattr(image, name))
         assert perfect.sensor == seen.sensor and perfect.label is not None and seen.label is not None
