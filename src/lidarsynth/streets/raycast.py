@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+
+from lidarsynth.streets.embree import PacketScene, library
 
 Hits = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -22,13 +25,11 @@ class Caster:
 
     def __init__(self, corners: np.ndarray):
         try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
+            packets = library()
         except ImportError as error:
             raise ImportError("synthetic streets need embreex: pip install 'lidarsynth[synthetic]'") from error
         corners = np.ascontiguousarray(corners, np.float32)
-        self.scene = EmbreeScene()
-        TriangleMesh(self.scene, corners)
+        self._faces = PacketScene(corners).faces if packets else one_by_one(corners)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         self.normal = normal.astype(np.float32)
@@ -41,10 +42,20 @@ class Caster:
         the distance, float32 metres, infinite for none; and |cos| of the angle between ray and normal, float32.
         times (N,) seconds: not used, nothing moves here.
         """
-        face = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(rays), query="INTERSECT")
+        face = self._faces(np.ascontiguousarray(origins), np.ascontiguousarray(rays))
         normal = self.normal[face]
         towards = np.einsum("ij,ij->i", normal, rays)
         gap = self.level[face] - np.einsum("ij,ij->i", normal, origins)
         hit = (face >= 0) & (towards != 0)
         distance = np.divide(gap, towards, out=np.full(len(rays), np.inf, np.float32), where=hit)
         return face, distance, np.abs(towards)
+
+
+def one_by_one(corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """As `PacketScene(corners).faces`, by embreex's own means: for wheels that keep Embree elsewhere."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, corners)
+    return lambda origins, rays: scene.run(origins, rays, query="INTERSECT")
