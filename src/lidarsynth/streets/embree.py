@@ -60,10 +60,10 @@ def _declared(embree: ctypes.PyDLL) -> ctypes.PyDLL:
         ("ReleaseGeometry", None, (handle,)),
         ("CommitScene", None, (handle,)),
         ("ReleaseScene", None, (handle,)),
-        ("Intersect16", None, (handle,) * 4),
     ):
         function = getattr(embree, f"rtc{name}")
         function.restype, function.argtypes = answer, arguments
+    embree.rtcIntersect16.restype = None  # is given handles: a list of numbers would have each converted
     return embree
 
 
@@ -107,37 +107,37 @@ class PacketScene:
         """(N,) int32: the triangle that each ray first meets, -1 for none. origins, rays (N, 3) float32."""
         count, found = len(rays), np.empty(len(rays), np.int32)
         packets = _aligned(min(BLOCK, -(-count // PACKET)))
-        arguments = _Arguments(COHERENT, NONE, None, None, None, 0)
-        size = BLOCK * PACKET
-        for start in range(0, count, size):
-            part = slice(start, start + size)
-            found[part] = self._block(packets, origins[part], rays[part], ctypes.addressof(arguments))
+        chosen, rest = _aligned(1)[0].view(np.int32), count % PACKET
+        chosen[0], chosen[1] = -1, np.where(np.arange(PACKET) < rest, -1, 0)  # all rays, and those of the last packet
+        every, last = (ctypes.c_void_p(row.ctypes.data) for row in chosen[:2])
+        scene, arguments = ctypes.c_void_p(self._scene), _Arguments(COHERENT, NONE, None, None, None, 0)
+        address, cast = ctypes.c_void_p(ctypes.addressof(arguments)), self._embree.rtcIntersect16
+        first, step = packets.ctypes.data, packets.strides[0]
+        places = [ctypes.c_void_p(first + step * packet) for packet in range(len(packets))]
+        for start in range(0, count, BLOCK * PACKET):
+            part = slice(start, start + BLOCK * PACKET)
+            mine = found[part]
+            _fill(packets, origins[part], rays[part])
+            full = len(mine) // PACKET
+            for place in places[:full]:
+                cast(every, scene, place, address)
+            if full * PACKET < len(mine):
+                cast(last, scene, places[full], address)
+            mine[:] = packets[:, TRIANGLE].reshape(-1)[: len(mine)].view(np.int32)
         return found
 
-    def _block(self, packets: np.ndarray, origins: np.ndarray, rays: np.ndarray, arguments: int) -> np.ndarray:
-        """(N,) faces of at most as many rays as `packets` (P, ROWS, PACKET) hold."""
-        count = len(rays)
-        full, rest = divmod(count, PACKET)
-        for first, values in ((0, origins), (DIRECTION, rays)):
-            rows = packets[:, first : first + 3]
-            rows[:full] = values[: full * PACKET].reshape(full, PACKET, 3).transpose(0, 2, 1)
-            if rest:
-                rows[full, :, :rest], rows[full, :, rest:] = values[full * PACKET :].T, 0
-        packets[:, NEAREST], packets[:, TIME], packets[:, FARTHEST] = 0, 0, np.inf
-        words = packets.view(np.uint32)
-        words[:, MASK : FLAGS + 1], words[:, FLAGS], words[:, TRIANGLE:] = NONE, 0, NONE
-        active = _aligned(2)  # two rows of words: for whole packets, and for the last
-        active[...] = 0
-        chosen = active.view(np.int32)
-        chosen[0, 0], chosen[1, 0, :rest] = -1, -1
-        intersect, scene, step = self._embree.rtcIntersect16, self._scene, packets.strides[0]
-        whole, last = active.ctypes.data, active.ctypes.data + active.strides[0]
-        begin = packets.ctypes.data
-        for packet in range(begin, begin + full * step, step):
-            intersect(whole, scene, packet, arguments)
+
+def _fill(packets: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> None:
+    """Writes (N, 3) rays into `packets` (P, ROWS, PACKET), as many as there is place for or fewer."""
+    full, rest = divmod(len(rays), PACKET)
+    for first, values in ((0, origins), (DIRECTION, rays)):
+        rows = packets[:, first : first + 3]
+        rows[:full] = values[: full * PACKET].reshape(full, PACKET, 3).transpose(0, 2, 1)
         if rest:
-            intersect(last, scene, begin + full * step, arguments)
-        return words[:, TRIANGLE].reshape(-1)[:count].view(np.int32)
+            rows[full, :, :rest], rows[full, :, rest:] = values[full * PACKET :].T, 0
+    packets[:, NEAREST], packets[:, TIME], packets[:, FARTHEST] = 0, 0, np.inf
+    words = packets.view(np.uint32)
+    words[:, MASK : FLAGS + 1], words[:, FLAGS], words[:, TRIANGLE:] = NONE, 0, NONE
 
 
 def _aligned(count: int) -> np.ndarray:

@@ -43,9 +43,10 @@ class Caster:
         times (N,) seconds: not used, nothing moves here.
         """
         face = self._faces(np.ascontiguousarray(origins), np.ascontiguousarray(rays))
-        normal = self.normal[face]
+        triangle = face.astype(np.intp)
+        normal = self.normal.take(triangle, axis=0)
         towards = np.einsum("ij,ij->i", normal, rays)
-        gap = self.level[face] - np.einsum("ij,ij->i", normal, origins)
+        gap = self.level[triangle] - np.einsum("ij,ij->i", normal, origins)
         hit = (face >= 0) & (towards != 0)
         distance = np.divide(gap, towards, out=np.full(len(rays), np.inf, np.float32), where=hit)
         return face, distance, np.abs(towards)
