@@ -35,6 +35,10 @@ class Caster:
         self.normal = normal.astype(np.float32)
         self.level = np.einsum("ij,ij->i", self.normal, corners[:, 0])
 
+    def faces(self, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """(N,) int32: the number of the triangle that each ray first meets, -1 for none; rays as in `cast`."""
+        return self._faces(np.ascontiguousarray(origins), np.ascontiguousarray(rays))
+
     def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
         """Where each ray first meets the scene.
 
@@ -42,7 +46,7 @@ class Caster:
         the distance, float32 metres, infinite for none; and |cos| of the angle between ray and normal, float32.
         times (N,) seconds: not used, nothing moves here.
         """
-        face = self._faces(np.ascontiguousarray(origins), np.ascontiguousarray(rays))
+        face = self.faces(origins, rays)
         triangle = face.astype(np.intp)
         normal = self.normal.take(triangle, axis=0)
         towards = np.einsum("ij,ij->i", normal, rays)
