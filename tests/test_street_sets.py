@@ -79,6 +79,7 @@ def test_poses_are_those_of_the_drive(tmp_path: Path, frames: list[Frame]):
     tr = np.eye(4)
     tr[:3] = np.array(calibration["Tr"], float).reshape(3, 4)
     poses = np.loadtxt(sequence / "poses.txt").reshape(-1, 3, 4)
+    assert (tmp_path / "set" / "poses" / "00.txt").read_bytes() == (sequence / "poses.txt").read_bytes()
     whole = np.tile(np.eye(4), (7, 1, 1))
     whole[:, :3] = poses
     truth = np.linalg.inv(frames[0].to_world) @ np.stack([frame.to_world for frame in frames])
