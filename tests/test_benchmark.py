@@ -435,7 +435,7 @@ def test_range_only_models_have_no_feature_distance(generation: Path, tiny: Path
 def test_streets_are_cast_once(tmp_path: Path):
     pytest.importorskip("embreex")
     told: list[str] = []
-    config = written(tmp_path / "g.toml", '[[method]]\nname = "noise"\nnoise = true\n')
+    config = written(tmp_path / "g.toml", 'count = 2\n[[method]]\nname = "noise"\nnoise = true\n')
     times = set()
     for _ in range(2):
         benchmark("generation", config, tmp_path / "out", no_model, data="synthetic:2:5",

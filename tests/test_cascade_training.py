@@ -18,6 +18,7 @@ from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import training as cascade_training
 from lidarsynth.systems.cascade.examples import crop, pattern
 from lidarsynth.systems.cascade.training import absolute_errors, energy_score, fit_standard, misnamed
+from lidarsynth.training import monitor
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
 
@@ -63,9 +64,12 @@ def test_absolute_errors_count_hidden_returns_of_the_sensor_alone():
     assert absolute_errors(Filled(code, *filled[1:]), known, rays, metres, metres / 50).item() > 0
 
 
+STREETS = VirtualStreets(6, 32)  # holds its world, so that it is built once
+
+
 @lru_cache
 def street(place: int) -> RangeImage:
-    return VirtualStreets(6, 32).image(4 * place)
+    return STREETS.image(4 * place)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -117,7 +121,7 @@ def test_patterns_leave_something_known_and_something_to_learn():
 def test_standards_make_the_ground_as_wide_as_the_horizon():
     network = CoarseUNet(16, (1, 1, 1, 1), 1)
     streets = VirtualStreets(6, 64)
-    images = [streets.image(i) for i in range(0, 64, 6)]
+    images = [streets.image(i) for i in range(0, 32, 4)]
     fit_standard(network, images)
     assert network.standard.shape == (2, 2, BINS)
     values = []
@@ -135,7 +139,8 @@ def test_standards_make_the_ground_as_wide_as_the_horizon():
 
 @pytest.mark.slow
 def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cascade_training, "FITTED", 12)
+    monkeypatch.setattr(cascade_training, "FITTED", 8)
+    monkeypatch.setattr(monitor, "IMAGES", 1)  # each is a street of its own
     before = None
     for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
         before = before or progress

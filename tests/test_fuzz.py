@@ -1,4 +1,4 @@
-"""A minute of damaged files: no traceback, no hang, nothing left behind; `make fuzz` goes on as long as one likes."""
+"""A thousand damaged files: no traceback, no hang, nothing left behind; `make fuzz` goes on as long as one likes."""
 
 import os
 import time
@@ -9,9 +9,9 @@ import pytest
 
 @pytest.mark.slow
 @pytest.mark.timeout(180)
-def test_a_minute_of_damaged_files_gives_answers_or_one_line():
+def test_a_thousand_damaged_files_give_answers_or_one_line():
     seed, end = int(os.environ.get("LIDARSYNTH_FUZZ_SEED", "0")), time.monotonic() + 60
-    bad = [(n, text) for n, _, text in fuzz.run(seed, lambda i: time.monotonic() < end and i < 4000) if text]
+    bad = [(n, text) for n, _, text in fuzz.run(seed, lambda i: time.monotonic() < end and i < 1000) if text]
     assert not bad, (
         f"cases {[f'{seed}:{n}' for n, _ in bad]}; python tests/fuzz.py --case {seed}:{bad[0][0]}\n{bad[0][1]}"
     )

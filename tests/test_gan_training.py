@@ -250,7 +250,7 @@ def test_a_broken_run_continues_bit_by_bit(cache: Path, tmp_path: Path, word: st
 def test_two_processes_give_the_curve_of_one(cache: Path, tmp_path: Path):
     words = ["train", "tiny-gan", "--data", str(cache), "--sample-every", "0", "--threads", "1", "--workers", "0"]
     # dusty-v1 has no statistics of batches in a forward pass; the warm-up and the augmentation act from the start
-    fields = {"model.network": "dusty-v1", "training.steps": 5, "adversarial.augmentation_images": 30,
+    fields = {"model.network": "dusty-v1", "training.steps": 3, "adversarial.augmentation_images": 30,
               "adversarial.augmentation_every": 2, "adversarial.augmentation_target": -1.5}  # fmt: skip
     list(run(tiny(**fields), cache, tmp_path / "one", options=Options(sample_every=0, workers=0)))
     changes = ["--set", *(f"{name}={value}" for name, value in fields.items())]

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from voxel_weights import cached
 
-from lidarsynth.evaluation import accumulation, evaluate
+from lidarsynth.evaluation import evaluate
 from lidarsynth.evaluation.protocols import LIDM, LIDM_RECONSTRUCTION, R2FLOW, R3DPA
 from lidarsynth.evaluation.statistics import load_statistics
 from lidarsynth.lidar.corner_grid import corner_channels, corner_image, decoded, drawn_and_coded, on_corner_grid
@@ -263,24 +264,16 @@ def test_lidms_rangenet_comes_from_its_own_folder_and_from_r2flows_archive(tmp_p
 
 @pytest.fixture
 def published(tmp_path: Path, monkeypatch, oracle_tensors) -> Path:
-    """A cache folder that holds seeded weights under the published names; no network is asked."""
-    cache = tmp_path / "cache"
-    monkeypatch.setenv("LIDARSYNTH_CACHE", str(cache))
-    weights = oracle_tensors("lidm_spvcnn_weights")
-    saved(cache / "spvcnn_lidm/model.ckpt", {"state_dict": weights})
-    branch = {name: value for name, value in weights.items() if not name.startswith("point_transforms")}
-    saved(cache / "minkowskinet_lidm/model.ckpt", {"state_dict": branch})
-    monkeypatch.setattr(accumulation, "URLS", dict.fromkeys(accumulation.URLS, "http://127.0.0.1:9"))
-    return cache
+    return cached(tmp_path / "cache", oracle_tensors("lidm_spvcnn_weights"), monkeypatch)
 
 
 def folder_of_scans(path: Path, count: int, seed: int) -> Path:
     path.mkdir()
     rng = np.random.default_rng(seed)
     for i in range(count):
-        angle, distance = rng.uniform(-np.pi, np.pi, 900), rng.uniform(2, 54, 900)
-        xyz = np.stack([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-1.7, 0.5, 900)], 1)
-        np.column_stack([xyz, np.zeros(900)]).astype(np.float32).tofile(path / f"{i:06}.bin")
+        angle, distance = rng.uniform(-np.pi, np.pi, 300), rng.uniform(2, 54, 300)
+        xyz = np.stack([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-1.7, 0.5, 300)], 1)
+        np.column_stack([xyz, np.zeros(300)]).astype(np.float32).tofile(path / f"{i:06}.bin")
     return path
 
 

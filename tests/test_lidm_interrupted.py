@@ -1,8 +1,7 @@
 """lidm-2024, r2flow-2025 and r3dpa-2026 killed, shared by two machines, and over a folder that is still written."""
 
 import os
-import subprocess
-import sys
+import signal
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -10,57 +9,48 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forked import Forked
+from voxel_weights import cached
 
 from lidarsynth.evaluation import accumulation, evaluate
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.statistics import load_statistics
 
 PROTOCOLS = ("lidm-2024", "r2flow-2025", "r3dpa-2026")
-# Each protocol in a child of its own, killed by -9 in the second sample; the first is in the cache folder.
-KILLED = """
-import os, signal, sys
-from lidarsynth.evaluation import accumulation, evaluate
-accumulation.SAVE_EVERY = 0.0
-def kill(what, done, total):
-    if done == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-for protocol in sys.argv[2:]:
-    if (child := os.fork()) == 0:
-        evaluate.gather_part(sys.argv[1], "1/1", "out.safetensors", protocol, batch_size=1, on_images=kill)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL, protocol
-"""
+
+
+def killed_at_the_second(words: list[str]) -> None:
+    """Gather a folder's samples for a protocol, and be killed by -9 in the second; the first is in the cache folder."""
+    folder, protocol = words
+    accumulation.SAVE_EVERY = 0.0
+
+    def kill(what: str, done: int, total: int) -> None:
+        if done == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    evaluate.gather_part(folder, "1/1", "out.safetensors", protocol, batch_size=1, on_images=kill)
 
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch, oracle_tensors) -> Path:
-    """A cache folder with seeded weights under the published names; no network is asked."""
-    weights = oracle_tensors("lidm_spvcnn_weights")
-    branch = {name: value for name, value in weights.items() if not name.startswith("point_transforms")}
-    for name, tensors in (("spvcnn", weights), ("minkowskinet", branch)):
-        (tmp_path / f"cache/{name}_lidm").mkdir(parents=True)
-        torch.save({"state_dict": tensors}, tmp_path / f"cache/{name}_lidm/model.ckpt")
-    monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(accumulation, "URLS", dict.fromkeys(accumulation.URLS, "http://127.0.0.1:9"))
-    return tmp_path / "cache"
+    return cached(tmp_path / "cache", oracle_tensors("lidm_spvcnn_weights"), monkeypatch)
 
 
 def scans(folder: Path, numbers: Iterator[int] | range, seed: int) -> Path:
     folder.mkdir(exist_ok=True)
     for i in numbers:
         rng = np.random.default_rng([seed, i])
-        angle, distance = rng.uniform(-np.pi, np.pi, 300), rng.uniform(2, 54, 300)
-        xyz = np.stack([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-1.7, 0.5, 300)], 1)
-        np.column_stack([xyz, np.zeros(300)]).astype(np.float32).tofile(folder / f"{i:06}.bin")
+        angle, distance = rng.uniform(-np.pi, np.pi, 100), rng.uniform(2, 54, 100)
+        xyz = np.stack([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-1.7, 0.5, 100)], 1)
+        np.column_stack([xyz, np.zeros(100)]).astype(np.float32).tofile(folder / f"{i:06}.bin")
     return folder
 
 
 def test_killed_and_continued_what_is_gathered_is_the_same_bit_by_bit(tmp_path: Path, cache: Path):
     samples, out = scans(tmp_path / "samples", range(3), 0), tmp_path / "out.safetensors"
-    command = [sys.executable, "-c", KILLED, str(samples), *PROTOCOLS]
-    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
-    done = subprocess.run(command, env=environment, capture_output=True, timeout=300)
-    assert done.returncode == 0, done.stderr.decode()[-2000:]
     for protocol in PROTOCOLS:
+        killed = Forked(samples, protocol, run=killed_at_the_second)
+        assert killed.wait() == -signal.SIGKILL, killed.communicate()
         seen: list[int] = []
         note = partial(lambda seen, what, done, total: seen.append(done), seen)
         continued = evaluate.gather_part(samples, "1/1", out, protocol, batch_size=1, on_images=note)

@@ -21,8 +21,9 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "ray_complete.py"
 @pytest.mark.filterwarnings("ignore")  # of Ray about itself
 def test_two_workers_complete_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     sensor = ls.SENSORS["vlp-16"].resized(width=512)
+    streets = SyntheticStreets(0, 4, sensor)
     for i in range(4):
-        image = SyntheticStreets(i, 1, sensor).image(0)
+        image = streets.image(i)
         folder = tmp_path / "scans" / f"d{i % 2}"
         folder.mkdir(parents=True, exist_ok=True)
         ls.write(folder / f"{i}.ply", image.keep(corrupt(image, "points:0.5")))

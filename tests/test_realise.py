@@ -54,6 +54,30 @@ def test_fields_and_points_survive(place: Path, capsys: pytest.CaptureFixture[st
     np.testing.assert_array_equal(library.reflectance, real.reflectance)
 
 
+def test_axes_and_files_of_simulators(place: Path, capsys: pytest.CaptureFixture[str]):
+    """CARLA's left-handed text, AirSim's z down, Isaac's rows with what did not return: the same points stay."""
+    scan = perfect(SMALL)
+    lines = [f"{x:.9g} {-y:.9g} {z:.9g} 1" for x, y, z in scan.xyz]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(lines)}"]
+    header += [f"property float32 {name}" for name in ("x", "y", "z", "I")]
+    Path("carla.ply").write_text("\n".join([*header, "end_header", *lines, ""]))
+    np.save("airsim.npy", scan.xyz * np.array([1, -1, -1], np.float32))
+    rows = np.full((2, len(scan) // 2 + 3, 3), np.inf, np.float32)
+    rows.reshape(-1, 3)[: len(scan)] = scan.xyz
+    np.save("isaac.npy", rows)
+    kept = is_part_of(load("model").realise(scan, "own.toml"), scan)
+    for name, axes, signs in (
+        ("carla.ply", "fru", (1, -1, 1)),
+        ("airsim.npy", "frd", (1, -1, -1)),
+        ("isaac.npy", "flu", (1, 1, 1)),
+    ):
+        main(["realise", name, "--out", "real.ply", "--axes", axes, "--model", "model", *WORDS])
+        np.testing.assert_array_equal(read("real.ply").xyz, scan.xyz[kept] * np.array(signs, np.float32))
+    with pytest.raises(SystemExit):
+        main(["realise", "isaac.npy", "--out", "real.ply", "--axes", "fuu", "--model", "model", *WORDS])
+    assert "one each of f b, l r and u d, such as flu or fru, found 'fuu'" in capsys.readouterr().err
+
+
 def test_a_folder_draws_each_scan_anew_and_thins_its_labels(place: Path):
     scan = perfect(SMALL)
     folder = place / "00" / "velodyne"

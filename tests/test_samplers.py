@@ -123,11 +123,11 @@ def test_order_of_convergence(name, order, schedule):
     one = torch.ones(4, dtype=DOUBLE)
     exact = gaussian_flow(chosen, x_1, one, 0 * one)
     errors = []
-    for steps in (128, 256):
+    for steps in (64, 128):
         *_, last = sample(denoiser, x_1, STEPS[name], steps, rng, even_log_snr)
         errors.append(float((last.x_s - exact).abs().max()))
     assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
-    assert errors[1] < {1: 3e-2, 2: 1e-3}[order]
+    assert errors[1] < {1: 6e-2, 2: 4e-3}[order]
 
 
 @pytest.mark.parametrize("name", sorted(STEPS))

@@ -208,14 +208,14 @@ def trained(experiment: Experiment, cache: Path, stop: int | None = None, state:
 
 
 def test_the_loss_falls(cache: Path):
-    _, losses = trained(small(60, **{"model.base_channels": 4}), cache)
-    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])
+    _, losses = trained(small(25, **{"model.base_channels": 4, "training.learning_rate": 0.01}), cache)
+    assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:5])
 
 
 def test_a_resumed_run_is_bit_identical_with_its_batch_statistics(cache: Path):
-    experiment = small(8, **{"model.dropout": 0.1})
+    experiment = small(4, **{"model.dropout": 0.1})
     whole, losses = trained(experiment, cache)
-    half, first = trained(experiment, cache, stop=5)
+    half, first = trained(experiment, cache, stop=2)
     resumed, second = trained(experiment, cache, state=half.state_dict())
     assert first + second == losses
     for ours, theirs in ((resumed.network, whole.network), (resumed.ema, whole.ema)):

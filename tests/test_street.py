@@ -133,7 +133,7 @@ def test_worse_scans_get_worse_scores(network: StreetFeatures):
     pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
     benchmark = runpy.run_path(str(REPO_ROOT / "benchmarks/street.py"))
     judge_of = benchmark["Judge"](STREET_1, accumulation.Loaded({"rangenet": network}, {"rangenet": WEIGHTS}))
-    scans = list(benchmark["streets"](3000, 4))
+    scans = list(benchmark["streets"](3000, 2))
     real = judge_of.gather(scans, "real")
 
     def score(corrupt) -> float:

@@ -1,6 +1,7 @@
 """Data sets of labelled streets: read back by the published formats, stopped and gone on with, others refused."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,23 @@ DRIVE = Options(frames=7, deskewed=True)
 
 
 STREETS = LabelledStreets(0, 1, SENSOR, DRIVE)  # holds its world, so that it is built once
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cast_once() -> Iterator[None]:
+    """Each frame of a drive, which does not depend on when it is asked for, is cast once for all tests of this file."""
+    kept: dict[tuple, Frame] = {}
+    cast = LabelledStreets._driven
+
+    def driven(self: LabelledStreets, number: int, k: int) -> Frame:
+        key = (self.seed, self.sensor, self.options, number, k)
+        if key not in kept:
+            kept[key] = cast(self, number, k)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LabelledStreets, "_driven", driven)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +79,7 @@ def test_poses_are_those_of_the_drive(tmp_path: Path, frames: list[Frame]):
     tr = np.eye(4)
     tr[:3] = np.array(calibration["Tr"], float).reshape(3, 4)
     poses = np.loadtxt(sequence / "poses.txt").reshape(-1, 3, 4)
+    assert (tmp_path / "set" / "poses" / "00.txt").read_bytes() == (sequence / "poses.txt").read_bytes()
     whole = np.tile(np.eye(4), (7, 1, 1))
     whole[:, :3] = poses
     truth = np.linalg.inv(frames[0].to_world) @ np.stack([frame.to_world for frame in frames])

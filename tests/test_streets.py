@@ -1,15 +1,18 @@
 """Labelled streets: labels, instances and boxes fit the points, drives move as they say, weather as its formulas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
-from lidarsynth.streets.areas import Density
+from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+from lidarsynth.streets.layout import build
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.recordings import RecordedStreets
 from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
@@ -21,6 +24,7 @@ from lidarsynth.streets.weather import (
     rain_extinction,
     strongest_drop,
 )
+from lidarsynth.streets.world import World, visible
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
@@ -37,6 +41,11 @@ def still() -> list[Frame]:
 def driven() -> list[Frame]:
     reader = LabelledStreets(1, 1, SMALL, Options(frames=30, deskewed=True, density=Density(traffic=4)))
     return [reader[index] for index in (0, 1, 2, 29)]
+
+
+def world(seed: int, density: Density) -> World:
+    """The first of a seed, as `SMALL` can see it."""
+    return visible(build(np.random.default_rng((seed, 0)), density), SMALL)
 
 
 def inside(box: Box, xyz: np.ndarray, slack: float) -> np.ndarray:
@@ -127,8 +136,10 @@ def test_what_stands_is_at_one_place_through_a_drive(driven: list[Frame]):
 
 def test_a_moving_turn_smears_and_deskewing_undoes_it():
     options = Options(frames=3, speed=12.0)
-    raw = LabelledStreets(4, 1, SMALL, options)[1]
-    flat = LabelledStreets(4, 1, SMALL, Options(frames=3, speed=12.0, deskewed=True))[1]
+    streets = LabelledStreets(4, 1, SMALL, options)
+    raw = streets[1]
+    streets.options = replace(options, deskewed=True)  # of the same drive
+    flat = streets[1]
     np.testing.assert_array_equal(raw.raw, flat.raw)
     apart = np.linalg.norm(raw.scan.xyz - flat.scan.xyz, axis=1)
     assert raw.scan.time is not None
@@ -173,8 +184,7 @@ def test_the_carrier_stays_on_its_road_and_meets_nobody():
 
 
 def test_density_does_what_it_says():
-    base = LabelledStreets(6, 1, SMALL)._worlds[0][0]
-    bare = LabelledStreets(6, 1, SMALL, Options(density=Density(0, 0, 0, 0)))._worlds[0][0]
+    base, bare = (world(6, density) for density in (TODAY, Density(0, 0, 0, 0)))
     kinds = set(bare.things["kind"])
     assert not kinds & {"person", "tree", "bush", "thicket"}
     assert len(bare.things) < len(base.things)
@@ -247,8 +257,7 @@ def test_a_perfect_sensor_reports_what_its_beams_meet(still: list[Frame]):
 
 def test_more_comes_beside_what_is_there():
     """People in groups, motorcycles and works: all else of the world stays where it was, to the bit."""
-    plain = LabelledStreets(0, 2, SMALL)._worlds[0][0]
-    crowded = LabelledStreets(0, 2, SMALL, Options(density=Density(groups=3, motorcycles=3, works=2)))._worlds[0][0]
+    plain, crowded = (world(0, density) for density in (TODAY, Density(groups=3, motorcycles=3, works=2)))
     before = {corners.tobytes() for corners in plain.corners}
     after = {corners.tobytes() for corners in crowded.corners}
     assert before <= after and len(after) > len(before) + 1000
@@ -259,7 +268,7 @@ def test_more_comes_beside_what_is_there():
 
 
 def test_kerbs_are_as_high_as_asked_and_all_else_stays():
-    low, plain = (LabelledStreets(0, 1, SMALL, Options(density=Density(kerbs=k)))._worlds[0][0] for k in (0.5, 1))
+    low, plain = (world(0, Density(kerbs=k)) for k in (0.5, 1))
     assert low.ground.kerb == pytest.approx(0.06) and plain.ground.kerb == 0.12
     np.testing.assert_array_equal(low.corners[..., :2], plain.corners[..., :2])
     raised = plain.corners[..., 2] - low.corners[..., 2]

@@ -10,13 +10,17 @@ from lidarsynth.streets import hdl64e
 from lidarsynth.streets.facades import shade
 from lidarsynth.streets.ground import Ground, Road
 from lidarsynth.streets.materials import MATERIALS, NUMBER, TABLE
+from lidarsynth.streets.moving import Bundles, meets
 from lidarsynth.streets.objects import library
-from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.streets.raycast import one_by_one
+from lidarsynth.streets.reader import SyntheticStreets, Worlds
+from lidarsynth.streets.turn import attitudes, world_rays
+from lidarsynth.streets.virtual import WIDEST, VirtualStreets
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
 KITTI = SENSORS["hdl-64e-kitti"]
+WORLDS = Worlds(1, WIDEST)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +81,7 @@ def test_scans_stay_the_same_from_machine_to_machine():
 @pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "os1-128"])
 def test_any_sensor(name: str):
     sensor = SENSORS[name].resized(width=256)
-    image = SyntheticStreets(seed=1, length=2, sensor=sensor).image(1)
+    image = SyntheticStreets(seed=1, length=2, sensor=sensor, worlds=WORLDS).image(1)
     assert image.shape == (sensor.height, 256)
     assert 0.3 < image.mask.mean() < 0.95
     assert image.range[image.mask].max() < sensor.max_range + 1
@@ -172,7 +176,7 @@ def test_a_pair_is_the_perfect_scan_and_todays_image():
     """The image bit by bit; the perfect one lies under it, but for noise, panes, and what was dropped."""
     for streets in (SyntheticStreets(seed=5, length=4), VirtualStreets(seed=6, length=8)):
         perfect, seen = streets.pair(2)
-        image = type(streets)(streets.seed, 8).image(2)
+        image = streets.image(2)
         for name in ("range", "reflectance", "mask", "label"):
             np.testing.assert_array_equal(getattr(seen, name), getattr(image, name))
         assert perfect.sensor == seen.sensor and perfect.label is not None and seen.label is not None
@@ -184,3 +188,27 @@ def test_a_pair_is_the_perfect_scan_and_todays_image():
         assert np.median(apart) < 0.04 and (apart < 0.5).mean() > 0.97
         assert (perfect.label == seen.label)[both].mean() > 0.97
         assert not perfect.mask[hdl64e.hidden(seen.sensor)].any()
+
+
+def test_packets_meet_what_single_rays_meet():
+    """Sixteen at once or one by one: the same triangles, single rays at edges aside; no part of a packet is lost."""
+    reader = SyntheticStreets(0, 1, SENSORS["hdl-32e"].resized(width=256))
+    world, caster = reader._worlds[0]
+    sensor, pose = reader.sensor, attitudes(reader.sensor, world.poses[3][None])
+    origins, rays = world_rays(sensor, sensor.directions(), np.ones((sensor.height, sensor.width), bool), pose)
+    single = one_by_one(world.corners)(origins, rays)
+    assert np.mean(caster.faces(origins, rays) != single) < 5e-4 and (single >= 0).mean() > 0.5
+    for count in (0, 1, 15, 17, 8209):
+        np.testing.assert_array_equal(caster.faces(origins[:count], rays[:count]) >= 0, single[:count] >= 0)
+
+
+def test_bundles_find_every_ray_that_passes():
+    """Of rays in any order, from places metres apart, the same as one by one."""
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(1000, 3)).astype(np.float32)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for order in (np.arange(1000), np.lexsort(np.round(rays.T, 1))):
+        ways, origins = rays[order], rng.uniform(-1, 1, (1000, 3)).astype(np.float32)
+        for middle, radius in ((rng.uniform(-30, 30, 3), r) for r in (0.3, 2.0, 6.0, 40.0)):
+            found = Bundles(origins, ways).meet(middle, radius)
+            np.testing.assert_array_equal(found, meets(origins, ways, middle, radius))

@@ -277,7 +277,7 @@ def test_r2dm_s_mean_weight_is_that_of_the_global_batch():
     torch.testing.assert_close(whole.mean(), reference.mean())
 
 
-def curve(passes: int = 1, workers: int = 0, steps: int = 4, **changes) -> list[float]:
+def curve(passes: int = 1, workers: int = 0, steps: int = 2, **changes) -> list[float]:
     experiment = with_fields(TINY, {"training.steps": steps, "diffusion.mean_weight": True, **changes})
     run = start(experiment, network(experiment), task_of(experiment))
     options = Options(accumulate=passes, workers=workers)
@@ -322,7 +322,7 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_scans():
 
 
 def test_training_lowers_the_loss_on_fixed_noise():
-    changes = {"training.steps": 60, "training.learning_rate": 3e-3, "data.roll": False, "data.mirror": False}
+    changes = {"training.steps": 30, "training.learning_rate": 6e-3, "data.roll": False, "data.mirror": False}
     experiment, images = with_fields(TINY, changes), Noise(1)
     run = start(experiment, network(experiment), task_of(experiment))
     before = fixed_losses(experiment, run.network.eval(), images.x_0([0]))
@@ -330,7 +330,7 @@ def test_training_lowers_the_loss_on_fixed_noise():
     after = fixed_losses(experiment, run.network.eval(), images.x_0([0]))
     assert set(after) == {*(f"t_{time}" for time in TIMES), "completion"}
     # min-SNR weighting looks at low noise first
-    assert after["t_0.1"] < 0.6 * before["t_0.1"] and after["t_0.3"] < 0.8 * before["t_0.3"]
+    assert after["t_0.1"] < 0.75 * before["t_0.1"] and after["t_0.3"] < 0.9 * before["t_0.3"]
     assert fixed_losses(experiment, run.network, images.x_0([0])) == after, "the noise is fixed"
 
 

@@ -174,18 +174,18 @@ def test_presets_know_that_they_have_no_reflectance(word):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_loss_falls(kind):
-    experiment = tiny(kind, **{"training.steps": 40})
+    experiment = tiny(kind, **{"training.steps": 20, "training.learning_rate": 4e-3})
     losses = [p.losses["range"] for p in train(experiment, fresh(experiment), Walls(4), Options(workers=0))]
     assert np.mean(losses[-4:]) < 0.7 * np.mean(losses[:4]), losses
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_stopped_run_continues_bit_by_bit(kind):
-    experiment = tiny(kind, **{"training.steps": 6})
+    experiment = tiny(kind, **{"training.steps": 3})
     whole, broken = fresh(experiment), fresh(experiment)
     curve = [p.losses["loss"] for p in train(experiment, whole, Walls(), Options(workers=0))]
     steps = train(experiment, broken, Walls(), Options(workers=0))
-    first = [next(steps).losses["loss"] for _ in range(3)]
+    first = [next(steps).losses["loss"] for _ in range(2)]
     file = io.BytesIO()
     torch.save(broken.state_dict(), file)
     file.seek(0)
@@ -200,7 +200,7 @@ def test_a_stopped_run_continues_bit_by_bit(kind):
 
 def test_shared_batches_give_the_curve_of_one_where_nothing_is_normalised_or_dropped():
     def curve(kind: str, passes: int, **changes) -> list[float]:
-        experiment = tiny(kind, **{"training.steps": 3, **changes})
+        experiment = tiny(kind, **{"training.steps": 2, **changes})
         steps = train(experiment, fresh(experiment), Walls(), Options(workers=0, accumulate=passes))
         return [p.losses["loss"] for p in steps]
 

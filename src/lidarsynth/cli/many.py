@@ -34,6 +34,13 @@ class Many:
             metavar="T", help="brings points into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers."
         ),
     ] = None
+    axes: Annotated[
+        str,
+        arg(
+            metavar="XYZ",
+            help="where x, y, z of the files point (f b l r u d): CARLA's fru is left-handed, AirSim has frd.",
+        ),
+    ] = "flu"
     mount: Annotated[
         float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0, where that is the ground.")
     ] = None
@@ -57,7 +64,7 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
 
     if many.workers < 0:
         raise ValueError(f"expected --workers of at least 0, found {many.workers}")
-    transform = read_transform(many.transform, many.mount)
+    transform = read_transform(many.transform, many.mount, many.axes)
     inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise"))
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):

@@ -32,6 +32,9 @@ def view(
         str | None,
         arg(metavar="T", help="brings points into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4."),
     ] = None,
+    axes: Annotated[
+        str, arg(metavar="XYZ", help="where x, y, z of the files point: CARLA has fru, AirSim frd.")
+    ] = "flu",
     mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0.")] = None,
 ) -> None:
     """Scans in the browser, from a page on this machine alone; or, with --out, as one file to send."""
@@ -43,7 +46,7 @@ def view(
     at_least(0, {"port": port})
     if out is not None and out.suffix.lower() not in ENDINGS:
         raise ValueError(f"{out}: expected a name that ends in .html, found {out.name[-20:]!r}")
-    series = compared(scans, other, Reading(intensity, topic, metadata, read_transform(transform, mount)))
+    series = compared(scans, other, Reading(intensity, topic, metadata, read_transform(transform, mount, axes)))
     title = next(iter(series))
     if out is None:
         return _serve(Show(title, series), port, browser)

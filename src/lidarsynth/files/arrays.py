@@ -61,7 +61,8 @@ def _floats(data: bytes, columns: int, hint: str) -> Fields:
 
 
 def read_npy(data: bytes) -> Fields:
-    """An (N, 3) to (N, 10) array of x y z intensity ..., or a structured array (N,) whose fields have names.
+    """An (N, 3) to (N, 10) array of x y z intensity ..., also in rows (H, W, 3 to 10), or a structured array (N,) whose
+    fields have names.
 
     A fifth column of whole numbers 0-255 is the ring, as in nuScenes; any other further columns are left out.
     """
@@ -72,6 +73,8 @@ def fields_of(array: np.ndarray) -> Fields:
     """Columns of an array of points, see `read_npy`. Raises FileError for any other shape or type."""
     if array.dtype.names:
         return {name: array[name].reshape(-1) for name in array.dtype.names if array[name].ndim == array.ndim}
+    if array.ndim == 3 and 3 <= array.shape[2] <= 10:
+        array = array.reshape(-1, array.shape[2])
     if array.ndim != 2 or not 3 <= array.shape[1] <= 10 or array.dtype.kind not in "fiu":
         raise FileError(f"expected an (N, 3) to (N, 10) array of points, found {array.shape} of {array.dtype}")
     fields = dict(zip(COLUMNS, array.T, strict=False))

@@ -180,6 +180,22 @@ def _onto_z(axis: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
+WAYS = {"f": (1, 0, 0), "b": (-1, 0, 0), "l": (0, 1, 0), "r": (0, -1, 0), "u": (0, 0, 1), "d": (0, 0, -1)}
+
+
+def parse_axes(text: str) -> np.ndarray:
+    """(4, 4) from where a file's x, y and z point, as `flu` for forward, left, up: a turn, or a mirror for left-handed
+    ones such as `fru`. Raises ValueError for anything but one letter each of f b, l r and u d.
+    """
+    if len(text) != 3 or [len(set(text.lower()) & set(pair)) for pair in ("fb", "lr", "ud")] != [1, 1, 1]:
+        raise ValueError(
+            f"expected axes of three letters, one each of f b, l r and u d, such as flu or fru, found {text!r}"
+        )
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array([WAYS[letter] for letter in text.lower()]).T
+    return matrix
+
+
 def parse_transform(text: str) -> np.ndarray:
     """(4, 4) from x:y:z:roll:pitch:yaw (metres, degrees: roll about x, then pitch about y, then yaw about z).
 
@@ -214,5 +230,5 @@ def pose_of(matrix: np.ndarray) -> tuple[float, ...]:
 
 
 def transformed(xyz: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 points through a (4, 4) rigid transform."""
+    """(N, 3) float32 points through a (4, 4) rigid transform or mirror."""
     return (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)

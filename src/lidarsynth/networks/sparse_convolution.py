@@ -193,10 +193,12 @@ def with_norm(kernel: Tensor, norm: nn.BatchNorm1d, bias: Tensor | float = 0.0) 
 
 
 class Kernel(nn.Module):
-    """Weights of one convolution without bias, under the published name `kernel`: (27 or 8, C, C'), or (C, C')."""
+    """Weights of one convolution without bias, under the published name `kernel`: (27 or 8, C, C'), or (C, C').
+
+    Zeros, for they are read and never trained.
+    """
 
     def __init__(self, cells: int, inputs: int, outputs: int):
         super().__init__()
         shape = (inputs, outputs) if cells == 1 else (cells, inputs, outputs)
-        self.kernel = nn.Parameter(torch.empty(shape), requires_grad=False)
-        nn.init.normal_(self.kernel, std=(cells * inputs) ** -0.5)
+        self.kernel = nn.Parameter(torch.zeros(shape), requires_grad=False)

@@ -139,10 +139,11 @@ def _hidden(
         return 0
     row, column = (of[index] for of, index in zip((rows, columns), np.nonzero(ended), strict=True))
     origins, rays = some_rays(sensor, turn.rays, row, column, frames)
-    after = np.zeros(len(rays)) if late is None else late[column]
-    place = moment.place[actor] + after[:, None] * moment.velocity[actor]
-    yaw = moment.yaw[actor] + after * moment.spin[actor]
-    return int((bodies.alone(actor, place, yaw, origins, rays)[0] >= 0).sum())
+    place, yaw = moment.place[actor], moment.yaw[actor]
+    if late is not None:
+        after = late[column]
+        place, yaw = place + after[:, None] * moment.velocity[actor], yaw + after * moment.spin[actor]
+    return bodies.met(actor, place, yaw, origins, rays)
 
 
 def _columns(sensor: Sensor, here: np.ndarray, radius: float) -> np.ndarray:

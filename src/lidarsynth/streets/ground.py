@@ -35,7 +35,7 @@ class Road:
         """Sideways shift (m) and slope of the centre line at s."""
         size, length, phase = self.wave
         k = 2 * np.pi / length
-        return size * (np.sin(k * s + phase) - np.sin(phase)), size * k * np.cos(k * s + phase)
+        return size * (np.sin(k * s + phase) - float(np.sin(phase))), size * k * np.cos(k * s + phase)
 
     def at(self, s: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """World x, y and direction (radians) of the point at (s, d)."""

@@ -40,8 +40,13 @@ class Bodies:
         if caster is None:
             nothing = np.zeros(len(rays), np.float32)
             return np.full(len(rays), -1, np.int32), nothing + np.inf, nothing
-        face, distance, cosine = caster.cast(turned(origins - place.astype(np.float32), -yaw), turned(rays, -yaw))
+        face, distance, cosine = caster.cast(*_from(place, yaw, origins, rays))
         return np.where(face >= 0, self._faces[actor][face], -1).astype(np.int32), distance, cosine
+
+    def met(self, actor: int, place: np.ndarray, yaw: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> int:
+        """How many of the rays meet this actor if it is alone, at a place (3,) and yaw () or as in `alone`."""
+        caster = self.caster(actor)
+        return 0 if caster is None else int((caster.faces(*_from(place, yaw, origins, rays)) >= 0).sum())
 
 
 class MovingCaster:
@@ -54,11 +59,11 @@ class MovingCaster:
         """As `Caster.cast`; times (N,) seconds on the drive's clock, None = all at the turn's stamp."""
         face, distance, cosine = self.fixed.cast(origins, rays)
         late = np.zeros(len(rays)) if times is None else times - self.stamp
-        now = self.moment
+        now, bundles = self.moment, Bundles(origins, rays)
         for actor in self.movers.tolist():
             middle = now.place[actor] + [0, 0, self.bodies.actors.middle[actor, 2]]
             slack = np.linalg.norm(now.velocity[actor]) * 0.06
-            near = meets(origins, rays, middle, self.bodies.reach[actor] + slack)
+            near = bundles.meet(middle, self.bodies.reach[actor] + slack)
             if not len(near):
                 continue
             place = now.place[actor] + late[near, None] * now.velocity[actor]
@@ -75,6 +80,50 @@ def meets(origins: np.ndarray, rays: np.ndarray, middle: np.ndarray, radius: flo
     away = middle.astype(np.float32) - origins
     along = np.einsum("ij,ij->i", away, rays)
     return np.flatnonzero((np.einsum("ij,ij->i", away, away) - along**2 < radius**2) & (along > -radius))
+
+
+class Bundles:
+    """Rays in bundles of neighbours, so that most of those that pass by something are not looked at one by one.
+
+    origins, rays (N, 3) float32, any number; rays of length 1.
+    """
+
+    SIZE = 16  # rays
+
+    def __init__(self, origins: np.ndarray, rays: np.ndarray):
+        self.origins, self.rays = origins, rays
+        starts, ways = (_bundled(values, self.SIZE) for values in (origins, rays))
+        self._start, self._way = starts.mean(axis=1), ways.mean(axis=1)
+        self._way /= np.maximum(np.linalg.norm(self._way, axis=1, keepdims=True), 1e-6)
+        self._apart, self._bend = (
+            np.sqrt(((values - middle[:, None]) ** 2).sum(axis=2).max(axis=1))
+            for values, middle in ((starts, self._start), (ways, self._way))
+        )
+
+    def meet(self, middle: np.ndarray, radius: float) -> np.ndarray:
+        """Numbers of the rays that pass within `radius` m of a point (3,), as `meets` finds them."""
+        away = middle.astype(np.float32) - self._start
+        along, square = np.einsum("ij,ij->i", away, self._way), np.einsum("ij,ij->i", away, away)
+        # A ray of a bundle is at t metres at most `apart + t bend` from where the bundle's middle is.
+        slack = np.float32(radius) + self._apart
+        slack = np.float32(1.001) * (slack + (np.sqrt(square) + slack) * self._bend) + np.float32(0.01)
+        bundle = np.flatnonzero((square - along**2 < slack**2) & (along > -slack))
+        chosen = (bundle[:, None] * self.SIZE + np.arange(self.SIZE)).ravel()
+        chosen = chosen[chosen < len(self.rays)]
+        origins, rays = self.origins.take(chosen, axis=0), self.rays.take(chosen, axis=0)
+        return chosen[meets(origins, rays, middle, radius)]
+
+
+def _bundled(values: np.ndarray, size: int) -> np.ndarray:
+    """(B, size, 3) of values (N, 3); the last one fills what is missing."""
+    missing = -len(values) % size
+    whole = np.concatenate([values, np.repeat(values[-1:], missing, axis=0)]) if missing else values
+    return whole.reshape(-1, size, 3)
+
+
+def _from(place: np.ndarray, yaw: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rays as seen from something at `place` that is turned by `yaw`."""
+    return turned(origins - place.astype(np.float32), -yaw), turned(rays, -yaw)
 
 
 def turned(vectors: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:

@@ -151,10 +151,12 @@ def sense(
     through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
     if through.any():
         when = None if times is None else times[through]
-        far = _behind(world, caster, origins[through], rays[through], distance[through], when)
+        where = np.flatnonzero(through)
+        starts, beams = origins.take(where, axis=0), rays.take(where, axis=0)
+        far = _behind(world, caster, starts, beams, distance[through], when)
         for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
             mine[through] = theirs
-    optics = eye.table[material]
+    optics = eye.table.take(material, axis=0)
     strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
@@ -171,9 +173,8 @@ def sense(
     grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
     reflectance = REPORTED[np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.int32)]
     reflectance = eye.reported(reflectance)
-    zero = np.float32(0)
-    reported = (np.where(gone, zero, distance), np.where(gone, zero, reflectance), np.where(gone, 0, label))
-    return Returns(*reported, face, first, surface, surface_label)
+    distance[gone], reflectance[gone], label[gone] = 0, 0, 0
+    return Returns(distance, reflectance, label, face, first, surface, surface_label)
 
 
 def _signal(
@@ -209,16 +210,16 @@ def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.nda
 
 def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
     """Material, label, tint and depth behind the face of N hits; misses get the last triangle's."""
-    kind, material, label = world.kind[face], world.material[face], world.label[face]
-    tint, depth = world.tint[face], np.zeros(len(face), np.float32)
-    hit = face >= 0
+    hit, triangle = face >= 0, face.astype(np.intp)
+    kind, material, label = world.kind[triangle], world.material[triangle], world.label[triangle]
+    tint, depth = world.tint[triangle], np.zeros(len(face), np.float32)
     low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
-    spot = origins[low] + rays[low] * distance[low, None]
+    spot = origins.take(low, axis=0) + rays.take(low, axis=0) * distance[low, None]
     material[low], label[low], wear, depth[low] = world.ground.surface(spot[:, 0], spot[:, 1], kind[low] == SLAB)
     tint[low] = wear / TABLE[material[low], 1]
     wall = np.flatnonzero(hit & (kind == FRONT))
-    spot = origins[wall] + rays[wall] * distance[wall, None]
-    material[wall], depth[wall] = facades.shade(spot, world.fronts[world.front[face[wall]]])
+    spot = origins.take(wall, axis=0) + rays.take(wall, axis=0) * distance[wall, None]
+    material[wall], depth[wall] = facades.shade(spot, world.fronts.take(world.front[triangle[wall]], axis=0))
     return material, label, tint, depth
 
 

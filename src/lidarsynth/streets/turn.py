@@ -55,17 +55,21 @@ def shoot(
     lasers = hdl64e.lasers(sensor, optics.loss, optics.dip, optics.shift)
     when = None if times is None else np.broadcast_to(times, seen.shape)[seen]
     found = sense(world, caster, origins, directions, lasers, rng, sensor.max_range, optics, when)
-    kept = found.distance >= sensor.min_range
-    reported = [_whole(seen, np.where(kept, v, 0), v.dtype) for v in (found.distance, found.reflectance, found.label)]
-    faces = [_whole(seen, values, np.int32, -1) for values in (found.face, found.first)]
-    within = (found.surface >= sensor.min_range) & (found.surface < sensor.max_range)
-    surface = [_whole(seen, np.where(within, v, 0), v.dtype) for v in (found.surface, found.surface_label)]
+    lost = ~(found.distance >= sensor.min_range)
+    reported = [_whole(seen, v, v.dtype, lost) for v in (found.distance, found.reflectance, found.label)]
+    faces = [_whole(seen, values, np.int32, empty=-1) for values in (found.face, found.first)]
+    beyond = ~((found.surface >= sensor.min_range) & (found.surface < sensor.max_range))
+    surface = [_whole(seen, v, v.dtype, beyond) for v in (found.surface, found.surface_label)]
     return Turn(rays, local_points(rays, reported[0], sensor), *reported, *faces, *surface)
 
 
-def _whole(seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, empty: int = 0) -> np.ndarray:
-    """(H, W) image of the values (N,) of the rays that are `seen` (H, W) bool."""
+def _whole(
+    seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, without: np.ndarray | None = None, empty: int = 0
+) -> np.ndarray:
+    """(H, W) image of the values (N,) of the rays that are `seen` (H, W) bool; 0 where `without` (N,) bool says so."""
     image = np.full(seen.shape, empty, kind)
+    if without is not None:
+        values[without] = 0
     image[seen] = values
     return image
 
@@ -92,7 +96,7 @@ def world_rays(
     if len(turns) == 1:
         turn, place = turns[0], places[0]
         origins = np.repeat(start @ turn.T + place, seen.sum(axis=1), axis=0)
-        return origins, rays.reshape(-1, 3)[seen.reshape(-1)] @ turn.T
+        return origins, rays.reshape(-1, 3).take(np.flatnonzero(seen), axis=0) @ turn.T
     origins = np.einsum("hj,wij->hwi", start, turns) + places
     return origins[seen], np.einsum("hwj,wij->hwi", rays, turns)[seen]
 

@@ -184,12 +184,14 @@ def visible(world: World, sensor: Sensor) -> World:
     spot = world.corners[:, 0]
     high = np.flatnonzero((world.kind == THING) & (spot[:, 2] > poses[:, 2].min() + sensor.mount + 0.8))
     steep = np.float32(np.tan(np.radians(sensor.elevations[0]) + 0.06))  # 0.06 rad: pitch, roll and slope of the poses
-    shown = np.zeros(len(high), bool)
-    for x, y, z, *_ in poses:
-        away = np.hypot(spot[high, 0] - x, spot[high, 1] - y)
-        shown |= (away < sensor.max_range + 5) & (spot[high, 2] - z - sensor.mount - 0.8 < steep * away)
     seen = np.ones(len(spot), bool)
-    seen[high] = shown
+    seen[high] = False
+    open_ = spot.take(high, axis=0)  # those that no pose so far has seen
+    for x, y, z, *_ in poses[np.argsort(np.arange(len(poses)) % 4, kind="stable")]:  # far apart first
+        away = np.hypot(open_[:, 0] - x, open_[:, 1] - y)
+        shown = (away < sensor.max_range + 5) & (open_[:, 2] - z - sensor.mount - 0.8 < steep * away)
+        seen[high[shown]] = True
+        high, open_ = high[~shown], open_.compress(~shown, axis=0)
     table = {
         key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front", "thing")
     }

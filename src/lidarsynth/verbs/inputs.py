@@ -18,7 +18,7 @@ from lidarsynth.data.folder import scan_files
 from lidarsynth.files.fields import Fields, FileError, find, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.files.labels import label_path
-from lidarsynth.lidar.frame import parse_transform, transformed
+from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.small_file import LARGEST, check_regular
 
@@ -255,18 +255,21 @@ def _metadata_beside(path: Path) -> Path:
     raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one beside the capture, found {listed}")
 
 
-def read_transform(text: str | None, mount: float | None = None) -> np.ndarray | None:
+def read_transform(text: str | None, mount: float | None = None, axes: str = "flu") -> np.ndarray | None:
     """(4, 4) from x:y:z:roll:pitch:yaw, or a file of 12 or 16 numbers (.txt, .npy), and then down by `mount` metres.
 
-    mount  height of the sensor above the points' z = 0, such as the ground; None with None is no transform at all
+    mount  height of the sensor above the points' z = 0, such as the ground
+    axes   where the points' own x, y and z point, as `parse_axes` reads it; undone first
+    None of them is no transform at all.
     Raises ValueError for anything that is no rigid motion.
     """
-    if text is None and mount is None:
+    turned = parse_axes(axes)
+    if text is None and mount is None and np.array_equal(turned, np.eye(4)):
         return None
     matrix = np.eye(4) if text is None else _matrix_file(Path(text)) if Path(text).is_file() else parse_transform(text)
     down = np.eye(4)
     down[2, 3] = -(mount or 0.0)
-    return down @ matrix
+    return down @ matrix @ turned
 
 
 def _matrix_file(path: Path) -> np.ndarray:

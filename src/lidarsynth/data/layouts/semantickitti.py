@@ -51,7 +51,9 @@ def _tables(streets: LabelledStreets, folder: Path) -> Content:
         names = [name for of, name in places if of == sequence]
         records = [read_record(folder / sequence / "boxes" / f"{name}.json") for name in names]
         poses = camera_poses(np.array([record["pose"] for record in records]))
-        yield f"{sequence}/poses.txt", "".join(numbers(pose) + "\n" for pose in poses).encode()
+        lines = "".join(numbers(pose) + "\n" for pose in poses).encode()
+        yield f"{sequence}/poses.txt", lines
+        yield sequence.replace("sequences/", "poses/") + ".txt", lines  # where KITTI's odometry has them
         stamps = [record["stamp"] - records[0]["stamp"] for record in records]
         yield f"{sequence}/times.txt", "".join(f"{stamp:.6e}\n" for stamp in stamps).encode()
         moved = {f"{int(name)}": record["boxes"] for name, record in zip(names, records, strict=True)}
