@@ -102,8 +102,8 @@ class FillUNet(nn.Module):
     noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
     the grain of a recorded scan. For each pixel the network chooses among `candidates` by a softmax, corrects the
     choice, and says whether the ray returns at all; and, if it has learned `classes`, of which class the surface is.
-    In use, not in training, a choice close to a candidate is that candidate. Reflectances are compared as even beams
-    would read them: what a beam loses (`dimness`) is added before, and taken off after.
+    In use, not in training, a choice close to a candidate is that candidate, and ranges have no grain. Reflectances are
+    compared as even beams would read them: what a beam loses (`dimness`) is added before, and taken off after.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class FillUNet(nn.Module):
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
         out = _to_pixels(self.out(h))
-        filled, shares = _assemble(out, guesses, noise, rays.dimness)
+        filled, shares = _assemble(out, guesses, noise, rays.dimness, self.training)
         if not self.training:
             filled = filled._replace(code=_snapped(filled.code, guesses))
         if doubt:
@@ -167,14 +167,17 @@ def _through(blocks: nn.Module, h: Tensor) -> Tensor:
     return h
 
 
-def _assemble(out: Tensor, guesses: Candidates, noise: Tensor, dimness: Tensor) -> tuple[Filled, Tensor]:
+def _assemble(
+    out: Tensor, guesses: Candidates, noise: Tensor, dimness: Tensor, training: bool
+) -> tuple[Filled, Tensor]:
     """The image, and the shares of the candidates in its ranges, (B, 10, H, W)."""
     scores, shift, grain, f_scores, f_shift, f_gain, logit, gain = out.split(
         [RANGE_CANDIDATES, 1, 1, REFLECTANCE_CANDIDATES, 1, NOISES, 1, NOISES], 1
     )
     shares = _shares(scores)
     code = (shares * guesses.code).sum(1, keepdim=True) + 0.1 * shift
-    code = code + 0.02 * grain * noise[:, :1]
+    if training:  # the learned grain of ranges; in use a sensor's own noise is added in the end, which planes need
+        code = code + 0.02 * grain * noise[:, :1]
     reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
     reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True) - dimness
     return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0), shares
