@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,19 @@ def grid_of(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"expected a sensor of at least {ROWS} beams and {COLUMNS} columns to generate, found "
                          f"{sensor.name} with {sensor.height} and {sensor.width}")  # fmt: skip
     return grid_rows(sensor.height), grid_columns(sensor.width)
+
+
+def blocks(first: int, n: int, size: int, alone: bool) -> Iterator[tuple[int, int]]:
+    """(start, count) of the grids that are made at once for scans `first` .. n - 1.
+
+    From multiples of `size` on, so that a scan is the same wherever one begins; the last ones, which fill no block,
+    each `alone`, or in a whole one.
+    """
+    for start in range(first - first % size, n, size):
+        if start + size <= n or not alone:
+            yield start, size
+        else:
+            yield from ((i, 1) for i in range(max(start, first), n))
 
 
 def placed(
