@@ -160,7 +160,7 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="a folder of KITTI's .bin files or labelled .npz images")
     parser.add_argument("--sensor", default="hdl-64e-kitti")
     parser.add_argument("--model", default="default")
-    parser.add_argument("--inversion", help="a GAN beside it, of the same sensor: DUSty v2, trained on its scans")
+    parser.add_argument("--inversion", help="a GAN beside it: DUSty v2, trained on scans of the sensor")
     args = parser.parse_args()
     torch.set_num_threads(1)
     sensor = get_sensor(args.sensor)
@@ -171,7 +171,7 @@ def main() -> None:
     else:
         pairs = list(street_pairs(sensor, args.streets))
         others = [SyntheticStreets(SEED, 1 << 40, sensor, apart=True).image(k) for k in range(args.streets)]
-    gan = None if args.inversion is None else load(args.inversion)
+    gan = None if args.inversion is None else load(args.inversion).into(sensor)
     if not (gan is None or isinstance(gan, GanModel)):
         raise SystemExit(f"{args.inversion}: expected a GAN, found {gan.experiment.model.network}")
     print(f"{len(pairs)} scans of {sensor.name}, {args.model}\n")
