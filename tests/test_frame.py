@@ -78,6 +78,11 @@ def test_points_on_no_beams_have_no_stand():
     assert stand_of_beams(np.random.default_rng(0).normal(0, 10, (9000, 3))) is None
 
 
+def test_a_scan_whose_ground_is_at_zero_is_not_upside_down():
+    frame = check_frame(moved(street("hdl-64e-kitti"), parse_transform("0:0:1.9:0:0:0")))
+    assert frame.faults == ("with the sensor 2.10 m above the origin",)
+
+
 @pytest.mark.parametrize("axis", [axis for axis in AXES if axis not in ("+z", "-z")])
 def test_other_axes_are_named(axis: str):
     matrix = np.eye(4)

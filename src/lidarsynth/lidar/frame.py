@@ -6,7 +6,7 @@ that was raised, tilted or written in other axes shows it, whatever the road doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -130,14 +130,27 @@ def _upright(scan: Scan) -> tuple[str, bool]:
 
 
 def _side(scan: Scan, axis: str) -> str:
-    """+axis or -axis: where the ground is below; where both sides look alike, where the beams are a known sensor's."""
-    upper, lower = _shares(scan, "+" + axis), _shares(scan, "-" + axis)
+    """+axis or -axis: where the ground is below the sensor, wherever the origin; where both sides look alike, where the
+    beams are a known sensor's."""
+    seen = _from_sensor(scan, np.array(AXES["+" + axis][0]))
+    upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > 0.6 and upper > UPSIDE * lower:
         return "+" + axis
-    up, down = (_known(scan, sign + axis) for sign in "+-")
+    up, down = (_known(seen, sign + axis) for sign in "+-")
     if up != down:
         return ("+" if up else "-") + axis
     return ("-" if lower > UPSIDE * upper and lower > 1 / 3 else "+") + axis
+
+
+def _from_sensor(scan: Scan, rotation: np.ndarray) -> Scan:
+    """The scan, its origin at the height along the axis that `rotation` makes z from which its rings are cones, where
+    rings are said."""
+    xyz = scan.xyz @ rotation.T.astype(np.float32)
+    ring = scan.ring if scan.ring is not None else rings_in_order(xyz)
+    if ring is None:
+        return scan
+    height = fit_cones(xyz, ring).height
+    return replace(scan, xyz=(scan.xyz - height * rotation[2]).astype(np.float32))
 
 
 def _known(scan: Scan, up: str) -> bool:

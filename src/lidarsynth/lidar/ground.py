@@ -92,8 +92,8 @@ def leaning(x: float, y: float) -> np.ndarray:
 def road_axis(xyz: np.ndarray) -> float:
     """-1 to 1: how much farther the ground is seen along x (road ahead) than along y; about 0 where neither is.
 
-    The mean of cos(2 azimuth) over 72 sectors, each by the farthest ground point in it, up to 50 m; 0 where fewer than a
-    third of them have any.
+    The mean of cos(2 azimuth) over 72 sectors, each by the farthest ground point in it, up to 50 m; 0 where fewer than
+    a third of them have any.
     """
     below, _ = levels(xyz)
     rho = np.hypot(xyz[:, 0], xyz[:, 1])

@@ -31,10 +31,11 @@ def recognise(scan: Scan, path: str | Path | None = None) -> tuple[str | None, s
     if len(scan) < 100:
         return None, f"{where}expected at least 100 points to tell the sensor, found {len(scan)}: name it with --sensor"
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
-    if ring is not None and ring.min() < ring.max():
-        name, reason = _by_rings(scan.xyz, ring)
-    else:
-        name, reason = _by_points(scan.xyz)
+    told = ring is not None and ring.min() < ring.max()
+    name, reason = _by_rings(scan.xyz, ring) if told else _by_points(scan.xyz)  # type: ignore[arg-type]
+    if name is None and told and scan.ring is None:  # the order may miscount them
+        name, other = _by_points(scan.xyz)
+        reason = reason if name is None else other
     if name is None:
         reason = f"expected the beams of {', '.join(SENSORS)}, found {reason}: name the sensor with --sensor"
     return name, where + reason
