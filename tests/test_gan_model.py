@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracle import assert_close
 from torch import Tensor
-from torch.testing import assert_close
 
 import lidarsynth
 from lidarsynth.cli.main import main
