@@ -5,7 +5,8 @@ python benchmarks/realise.py --real FOLDER [--model default]           real scan
 
 The perfect scan of a street is what its rays meet; that of a real scan is its completion by the same model. Both are
 judged against what the sensor really reported. Beside it: nothing dropped, as many rays dropped at random, and in each
-beam as many as the truth drops there (cf. the frequency maps of DUSty v2); these get the mean reflectance of the truth.
+beam as many as the truth drops there (cf. the frequency maps of DUSty v2), and with --inversion what a GAN drops whose
+image is that scan (DUSty v2, WACV 2023); these get the mean reflectance of the truth.
 Columns:
 
 dropped          share of the perfect scan's rays that do not return
@@ -36,6 +37,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.gan.model import GanModel
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.segmentation.training import confusion
 from lidarsynth.weights.load import load, load_parts
@@ -70,7 +72,7 @@ def real_image(path: Path, sensor: Sensor) -> RangeImage | None:
     return RangeImage(**values, mask=values["range"] > 0, sensor=sensor) if fits else None
 
 
-def made(pairs: Sequence[Pair], model: ScanModel) -> dict[str, list[RangeImage]]:
+def made(pairs: Sequence[Pair], model: ScanModel, gan: GanModel | None = None) -> dict[str, list[RangeImage]]:
     """The images of each method."""
     perfect = [p for p, _ in pairs]
     lost = 1 - np.mean([s.mask[p.mask].mean() for p, s in pairs])
@@ -82,10 +84,14 @@ def made(pairs: Sequence[Pair], model: ScanModel) -> dict[str, list[RangeImage]]
     beams = [p.keep(np.random.default_rng(k).random(p.shape) < kept[:, None]) for k, p in enumerate(lit)]
     real = [model.realised(p.to_scan(), p.sensor, seed=k) for k, p in enumerate(perfect)]
     real = [replace(r, completed=None, xyz=None) for r in real]
+    inverted = {} if gan is None else {
+        f"{gan.experiment.name}, inverted": [p.keep(gan.returned(p, seed=k)) for k, p in enumerate(lit)]
+    }  # fmt: skip
     return {
         "nothing dropped": lit,
         "as many at random": thinned,
         "as many in each beam": beams,
+        **inverted,
         "realised": real,
         "as the sensor saw it": [s for _, s in pairs],
     }
@@ -131,7 +137,9 @@ def right(network: RangeNet, images: Sequence[RangeImage]) -> float:
     return float(np.trace(counts[:, 1:]) / counts.sum())
 
 
-def table(pairs: Sequence[Pair], model: ScanModel, others: Sequence[RangeImage]) -> Iterator[str]:
+def table(
+    pairs: Sequence[Pair], model: ScanModel, others: Sequence[RangeImage], gan: GanModel | None = None
+) -> Iterator[str]:
     """Lines of a Markdown table, as they are computed."""
     yield "| | dropped, % | beam | range | class | same, % | MAE | histogram | FRD | read, % |"
     yield "|---|" + "---:|" * 9
@@ -139,7 +147,7 @@ def table(pairs: Sequence[Pair], model: ScanModel, others: Sequence[RangeImage])
     assert isinstance(network, RangeNet)
     protocol, plain = get_protocol(WORD), pairs[0][0].shape == (64, 1024)
     judge = Judge(protocol, load_networks(protocol, 1024)) if plain else None
-    for name, images in made(pairs, model).items():
+    for name, images in made(pairs, model, gan).items():
         distance = "-" if judge is None else f"{frechet(judge, images, others):.2f}"
         labelled = plain and all(image.label is not None for image in images)
         share = f"{100 * right(network, images):.1f}" if labelled else "-"
@@ -152,6 +160,7 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="a folder of KITTI's .bin files or labelled .npz images")
     parser.add_argument("--sensor", default="hdl-64e-kitti")
     parser.add_argument("--model", default="default")
+    parser.add_argument("--inversion", help="a GAN beside it: DUSty v2, trained on scans of the sensor")
     args = parser.parse_args()
     torch.set_num_threads(1)
     sensor = get_sensor(args.sensor)
@@ -162,8 +171,11 @@ def main() -> None:
     else:
         pairs = list(street_pairs(sensor, args.streets))
         others = [SyntheticStreets(SEED, 1 << 40, sensor, apart=True).image(k) for k in range(args.streets)]
+    gan = None if args.inversion is None else load(args.inversion).into(sensor)
+    if not (gan is None or isinstance(gan, GanModel)):
+        raise SystemExit(f"{args.inversion}: expected a GAN, found {gan.experiment.model.network}")
     print(f"{len(pairs)} scans of {sensor.name}, {args.model}\n")
-    for line in table(pairs, model, others):
+    for line in table(pairs, model, others, gan):
         print(line, flush=True)
 
 

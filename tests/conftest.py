@@ -9,7 +9,6 @@ from pathlib import Path
 import oracle
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
@@ -46,13 +45,35 @@ def fixture_tensors() -> Callable[[str], dict[str, Tensor]]:
     fixtures or, of large ones a sample (`oracle.load`), from tests/oracles; skips where neither has them."""
 
     def load(name: str) -> dict[str, Tensor]:
-        paths = [folder / f"{name}.safetensors" for folder in (SHARED / "fixtures", ORACLES)]
-        found = next((path for path in paths if path.is_file()), None)
-        if found is None:
-            pytest.skip(f"reference values are not here: {paths[0]}")
-        return oracle.load(found)
+        return oracle.load(reference_file(f"{name}.safetensors"))
 
     return load
+
+
+def reference_file(name: str) -> Path:
+    """Of the shared folder's fixtures, or packed in tests/oracles; skips where neither has it."""
+    paths = SHARED / "fixtures" / name, ORACLES / f"{name}.xz"
+    found = next((path for path in paths if path.is_file()), None)
+    if found is None:
+        pytest.skip(f"reference values are not here: {paths[0]}")
+    return found
+
+
+@pytest.fixture(scope="session")
+def official_file(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """`official_file("r2dm/config_A.pth")` -> a file as the published program writes it, from the shared folder or
+    made of the tensors in tests/oracles, where only its averaged weights may be left (both sets are the same then)."""
+    folder = tmp_path_factory.mktemp("official")
+
+    def make(name: str) -> Path:
+        whole, made = SHARED / "fixtures" / name, folder / name
+        if whole.is_file() or made.is_file():
+            return whole if whole.is_file() else made
+        made.parent.mkdir(exist_ok=True)
+        torch.save(oracle.unpacked(reference_file(str(Path(name).with_suffix(".safetensors")))), made)
+        return made
+
+    return make
 
 
 @pytest.fixture(scope="session")
@@ -63,5 +84,5 @@ def scan64() -> bytes:
 
 @pytest.fixture(scope="session")
 def oracle_tensors() -> Callable[[str], dict[str, Tensor]]:
-    """`oracle_tensors("lidm_points")` -> the tensors of tests/oracles/lidm_points.safetensors, of every checkout."""
-    return lambda name: load_file(REPO_ROOT / "tests/oracles" / f"{name}.safetensors")
+    """`oracle_tensors("lidm_points")` -> the tensors of tests/oracles/lidm_points.safetensors.xz, of every checkout."""
+    return lambda name: oracle.load(ORACLES / f"{name}.safetensors.xz")

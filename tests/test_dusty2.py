@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
+from oracle import assert_close
 from test_gan import TOLERANCE, check_discriminator, check_structure, load
-from torch.testing import assert_close
 
 from lidarsynth.networks.gan.dusty2 import Discriminator, Generator, unshift
 from lidarsynth.networks.gan.modulated import RandomFourierFeatures

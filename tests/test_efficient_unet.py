@@ -1,9 +1,11 @@
 """R2DM's U-Net: official weights, official sizes, and the ring."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
+from oracle import assert_close
 
 from lidarsynth.networks.efficient_unet import EfficientUNet
 
@@ -24,8 +26,8 @@ def randomised(net: EfficientUNet, seed: int = 0) -> EfficientUNet:
     return net.eval()
 
 
-def official(shared, name: str, weights: str) -> EfficientUNet:
-    checkpoint = torch.load(shared / "fixtures" / "r2dm" / f"{name}.pth", weights_only=True)
+def official(path: Path, weights: str) -> EfficientUNet:
+    checkpoint = torch.load(path, weights_only=True)
     cfg = checkpoint["cfg"]["model"]
     net = EfficientUNet(
         resolution=tuple(checkpoint["cfg"]["data"]["resolution"]),
@@ -45,9 +47,9 @@ def official(shared, name: str, weights: str) -> EfficientUNet:
 
 
 @pytest.mark.parametrize("name", ["config_A", "config_F", "config_G", "config_H", "tiny_H"])
-def test_outputs_equal_the_reference(shared, fixture_tensors, name):
+def test_outputs_equal_the_reference(official_file, fixture_tensors, name):
     expected = fixture_tensors(f"r2dm/{name}_io")
-    net = official(shared, name, "ema_weights")
+    net = official(official_file(f"r2dm/{name}.pth"), "ema_weights")
     torch.testing.assert_close(net.coords, expected["coords"], atol=0, rtol=0)
     inner = {key.removeprefix("inter."): value for key, value in expected.items() if key.startswith("inter.")}
     inner["time_embedding.0"] = inner.pop("time_sinusoid")
@@ -56,14 +58,14 @@ def test_outputs_equal_the_reference(shared, fixture_tensors, name):
     for path in inner:
         net.get_submodule(path).register_forward_hook(lambda _, __, output, path=path: seen.update({path: output}))
     output = net(expected["input"], expected["log_snr"])
-    torch.testing.assert_close(output, expected["output"], atol=1e-4, rtol=0)
+    assert_close(output, expected["output"], atol=1e-4, rtol=0)
     for path, value in inner.items():  # large maps are stored for sample 0 only
-        torch.testing.assert_close(seen[path][: len(value)], value, atol=1e-4, rtol=0)
+        assert_close(seen[path][: len(value)], value, atol=1e-4, rtol=0)
 
 
 def test_online_weights_give_another_output(shared, fixture_tensors):
     expected = fixture_tensors("r2dm/config_H_io")
-    output = official(shared, "config_H", "weights")(expected["input"], expected["log_snr"])
+    output = official(shared / "fixtures/r2dm/config_H.pth", "weights")(expected["input"], expected["log_snr"])
     torch.testing.assert_close(output, expected["output_online_weights"], atol=1e-4, rtol=0)
     assert (output - expected["output"]).abs().max() > 1e-2
 

@@ -259,14 +259,15 @@ def test_a_stopped_evaluation_goes_on(tmp_path: Path, real: Path, cache: Path, m
 
 
 def test_networks_are_downloaded_or_make_rows_na(
-    tmp_path: Path, real: Path, cache: Path, shared: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, real: Path, cache: Path, official_file, monkeypatch: pytest.MonkeyPatch
 ):
     report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
     assert report.values["FPD"] is None and report.values["JSD x1e2"] is not None
     assert f"without a network, put the file at {cache / 'cls_model_39.pth'}" in str(report)
     assert "N/A: FPD, FPD squared MMD: file:" in str(report), "the reason stands there once"
     assert "no official rangenet for 64 columns, only for 2048, 1024, 512" in str(report)
-    monkeypatch.setitem(accumulation.URLS, "pointnet", (shared / "fixtures/pointnet").as_uri())
+    folder = official_file("pointnet/cls_model_39.pth").parent
+    monkeypatch.setitem(accumulation.URLS, "pointnet", folder.as_uri())
     report = ls.evaluate(STREETS, real, protocol="r2dm-2024")
     assert report.values["FPD"] is not None and report.values["FPD squared MMD"] is not None
     assert len(report.hashes["pointnet"]) == 64

@@ -203,8 +203,13 @@ def test_las(suffix: str, scan: Scan, tmp_path: Path):
     las.gps_time = scan.time - scan.time.min()
     las.add_extra_dim(laspy.ExtraBytesParams("ring", "uint8"))
     las.ring = (9 - scan.ring).astype(np.uint8)
+    las.add_extra_dims([laspy.ExtraBytesParams("echo_width", "float32"), laspy.ExtraBytesParams("normal", "3f4")])
+    las.echo_width = np.arange(len(scan), dtype=np.float32)
     las.write(str(tmp_path / f"scan{suffix}"))
-    check(read(tmp_path / f"scan{suffix}"), scan, exact=False)
+    found = read(tmp_path / f"scan{suffix}")
+    check(found, scan, exact=False)
+    np.testing.assert_array_equal(np.sort(found.extra["echo_width"]), np.arange(len(scan)))
+    assert list(found.extra) == ["echo_width"], "three numbers a point are no field of a scan"
     whole = (tmp_path / f"scan{suffix}").read_bytes()
     (tmp_path / f"cut{suffix}").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"^\S*: expected .* found"):

@@ -7,7 +7,7 @@ import pytest
 
 from lidarsynth.files.formats import read
 from lidarsynth.lidar.cones import fit_cones, fit_ring
-from lidarsynth.lidar.crowding import height_of_beams
+from lidarsynth.lidar.crowding import stand_of_beams
 from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
@@ -61,15 +61,26 @@ def test_a_moved_scan_is_found_out_and_its_transform_undoes_it(name: str, move: 
 
 
 @pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e"])
-def test_height_shows_without_rings_and_in_any_order(name: str):
+def test_height_and_tilt_show_without_rings_and_in_any_order(name: str):
     scan = street(name, rings=False)
     scan = scan[np.random.default_rng(1).permutation(len(scan))]
     assert check_frame(scan).warning() is None
     for lift in (1.73, -1.0):
         frame = check_frame(moved(scan, parse_transform(f"0:0:{lift}:0:0:0")))
         assert frame.faults and frame.transform[2, 3] == pytest.approx(-lift, abs=0.25)
-    rng = np.random.default_rng(0)
-    assert height_of_beams(rng.normal(0, 10, (9000, 3))) is None, "a cloud has no beams"
+    tilt = parse_transform("0:0:0:-4:5:0")
+    frame = check_frame(moved(scan, tilt))
+    assert "tilted by 6.4 degrees" in str(frame.warning())
+    np.testing.assert_allclose((frame.transform @ tilt)[:3, 2], [0, 0, 1], atol=2e-3)
+
+
+def test_points_on_no_beams_have_no_stand():
+    assert stand_of_beams(np.random.default_rng(0).normal(0, 10, (9000, 3))) is None
+
+
+def test_a_scan_whose_ground_is_at_zero_is_not_upside_down():
+    frame = check_frame(moved(street("hdl-64e-kitti"), parse_transform("0:0:1.9:0:0:0")))
+    assert frame.faults == ("with the sensor 2.10 m above the origin",)
 
 
 @pytest.mark.parametrize("axis", [axis for axis in AXES if axis not in ("+z", "-z")])

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
+from oracle import assert_close, largest
 from procedural_weights import gan_weights, procedural_uniform
-from torch.testing import assert_close
 
 from lidarsynth.networks.gan.dcgan import Discriminator, Generator
 from lidarsynth.networks.gan.layers import HEIGHT, WIDTH, BlurVH, MinibatchStdDev, Pad, Resample
@@ -93,8 +93,9 @@ def check_discriminator(net: torch.nn.Module, expected) -> None:
     (grad,) = torch.autograd.grad(logits.sum(), images, retain_graph=True)
     assert_close(grad[:1], expected["r1_input_grad"], **TOLERANCE)
     # on some processors one activation rounds to the other side of a leaky ReLU's kink, which a few pixels feel
-    error, largest = (grad[:1] - expected["r1_input_grad"]).abs(), expected["r1_input_grad"].abs().max()
-    assert error.max() < 5e-3 * largest and error.flatten().quantile(0.9) < 1e-4 * largest
+    kept = ~expected["r1_input_grad"].isnan()
+    error, most = (grad[:1] - expected["r1_input_grad"])[kept].abs(), largest(expected["r1_input_grad"])
+    assert error.max() < 5e-3 * most and error.quantile(0.9) < 1e-4 * most
     penalty = r1_penalty(logits, images)
     assert_close(penalty.detach(), expected["r1_penalty"], atol=0, rtol=1e-4)
     for key in (key for key in expected if key.startswith("r1_grad.")):

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracle import assert_close
 from torch import Tensor
-from torch.testing import assert_close
 
 import lidarsynth
 from lidarsynth.cli.main import main
@@ -136,6 +136,20 @@ def test_inversion_finds_its_own_image_again(model: GanModel):
     assert errors[0] < 0.8 * errors[1]
     again = model.complete(before, known, steps=1)
     np.testing.assert_array_equal(again.range, start.range)
+
+
+def test_inversion_tells_which_rays_of_a_simulation_return():
+    """DUSty's simulation-to-real: drop is drawn anew by each seed, about as often as the network drops."""
+    model = model_of(tiny("dusty-v2"))
+    height, width = model.sensor.height, model.sensor.width
+    far = np.full((height, width), 6.0, np.float32)
+    perfect = RangeImage(far, np.zeros_like(far), far > 0, model.sensor)
+    small = RangeImage(far[:16], 0 * far[:16], far[:16] > 0, get_sensor("vlp-16").resized(width=width))
+    kept = [model.returned(perfect, seed=seed, steps=3) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(kept[0], kept[1])
+    assert (kept[0] != kept[2]).mean() > 0.05 and 0 < kept[0].mean() < 1
+    with pytest.raises(ValueError, match="expected an image of"):
+        model.returned(small)
 
 
 def test_a_sparse_scan_becomes_an_image_of_the_model(model: GanModel):

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from torch.testing import assert_close
+from oracle import assert_close
 
 from lidarsynth.networks.gan.dcgan import Discriminator, Generator
 from lidarsynth.networks.gan.iros21 import generator_weights

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from oracle import assert_within
 from oracles import gaussian_denoiser
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from lidarsynth.networks.refinenet import from_official
 
 
 def assert_net(actual: Tensor, expected: Tensor) -> None:
-    torch.testing.assert_close(actual, expected, atol=1e-4 * expected.abs().max().item(), rtol=0)
+    assert_within(actual, expected, 1e-4)
 
 
 @pytest.fixture
@@ -25,10 +26,8 @@ def trajectories(fixture_tensors):
 
 
 @pytest.fixture(scope="module")
-def denoiser(shared):
-    path = shared / "fixtures" / "lidargen" / "checkpoint_100.pth"
-    if not path.is_file():
-        pytest.skip(f"reference values are not here: {path}")
+def denoiser(official_file):
+    path = official_file("lidargen/checkpoint_100.pth")
     return Denoiser(from_official(torch.load(path, weights_only=True)), ve(), "score", clip=False)
 
 

@@ -65,7 +65,7 @@ def test_the_keras_program_is_reproduced(fixture_tensors):
     network = from_keras([stored[name] for name in names])
     with torch.no_grad():
         found = network(stored["input"].permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-    torch.testing.assert_close(found, stored["output"], atol=1e-5, rtol=0)
+    assert_close(found, stored["output"], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("fixture", "scale"), SMALL.items())
@@ -75,7 +75,7 @@ def test_monte_carlo_passes_equal_the_reference(fixture_tensors, fixture, scale)
     network = from_official(official(expected), scale)
     masks = [expected[f"mc.mask{index}"][:, :, None, None] for index in range(8)]
     outputs = network(expected["input"][:1].expand(len(masks[0]), -1, -1, -1), masks)
-    torch.testing.assert_close(outputs, expected["mc.outputs"], atol=1e-5, rtol=0)
+    assert_close(outputs, expected["mc.outputs"], atol=1e-5, rtol=0)
     torch.testing.assert_close(outputs.mean(0), expected["mc.mean"], atol=1e-5, rtol=0)
     torch.testing.assert_close(outputs.std(0, correction=0), expected["mc.std"], atol=1e-5, rtol=0)
 
@@ -98,7 +98,7 @@ def test_training_equals_the_reference(fixture_tensors, fixture, scale):
     loss.backward()
     # Batch statistics amplify rounding: float64 is 1.1e-5 from the stored float32, which puts some ReLUs of the first
     # layers on the other side of their kink, as other processors' float32 does (AVX2 as stored, AVX-512 as float64).
-    torch.testing.assert_close(output, expected["train.output"], atol=2e-5, rtol=0)
+    assert_close(output, expected["train.output"], atol=2e-5, rtol=0)
     torch.testing.assert_close(loss, expected["train.loss"])
     gradients = {key: value for key, value in expected.items() if key.startswith("train.grad.")}
     assert len(gradients) == 2

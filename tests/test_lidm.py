@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracle import assert_within
 from torch import Tensor
 from voxel_weights import cached
 
@@ -35,7 +36,7 @@ ORACLES = Path(__file__).parent / "oracles"
 
 
 def assert_net(actual: Tensor, expected: Tensor) -> None:
-    torch.testing.assert_close(actual, expected, atol=1e-4 * expected.abs().max().item(), rtol=0)
+    assert_within(actual, expected, 1e-4)
 
 
 def filled(kind: type, weights: dict[str, Tensor]) -> MinkowskiUNet | SPVCNN:
@@ -49,8 +50,8 @@ def vector_of(network: MinkowskiUNet | SPVCNN, clouds: list[np.ndarray], near: f
     return shell_means(values, where, len(clouds))
 
 
-def test_spvcnn_and_the_features_of_both_networks_are_the_published_ones(oracle_tensors):
-    o, weights = oracle_tensors("lidm_clouds"), oracle_tensors("lidm_spvcnn_weights")
+def test_spvcnn_and_the_features_of_both_networks_are_the_published_ones(oracle_tensors, fixture_tensors):
+    o, weights = oracle_tensors("lidm_clouds"), fixture_tensors("lidm/spvcnn_weights")
     clouds = [o["cloud0"].numpy(), o["cloud1"].numpy()]
     features, voxels = collate([quantise(cloud) for cloud in clouds])
     assert torch.equal(voxels, o["coords"].long())
@@ -69,12 +70,15 @@ def test_spvcnn_and_the_features_of_both_networks_are_the_published_ones(oracle_
 
 
 @pytest.mark.parametrize(("name", "kind"), [("minkowskinet", MinkowskiUNet), ("spvcnn", SPVCNN)])
-def test_every_stage_is_the_published_one(name: str, kind: type, fixture_tensors: Callable, reference: Path):
-    o, clouds = fixture_tensors(f"lidm/{name}_io"), fixture_tensors("lidm/clouds")
+def test_every_stage_is_the_published_one(name: str, kind: type, fixture_tensors: Callable, oracle_tensors: Callable):
+    o, clouds = fixture_tensors(f"lidm/{name}_io"), oracle_tensors("lidm_clouds")
+    both = [clouds["cloud0"].numpy(), clouds["cloud1"].numpy()]
+    features, voxels = collate([quantise(cloud) for cloud in both])
+    assert torch.equal(voxels, clouds["coords"].long())
     network, found = filled(kind, fixture_tensors(f"lidm/{name}_weights")), {}
     for part in ("stem", "stage1", "stage2", "stage3", "stage4", "up1", "up2", "up3", "up4"):
         getattr(network, part).register_forward_hook(lambda _m, _i, out, part=part: found.__setitem__(part, out))
-    values, where = network(clouds["feats"], clouds["coords"])
+    values, where = network(features, voxels)
     hashed = ("stem", "up4") if name == "spvcnn" else ()  # rows in another order there, told by stem.coords
     order = {tuple(voxel): row for row, voxel in enumerate(clouds["coords"].tolist())}
     rows = torch.tensor([order[tuple(voxel)] for voxel in o["stem.coords"].tolist()])
@@ -83,7 +87,6 @@ def test_every_stage_is_the_published_one(name: str, kind: type, fixture_tensors
     assert_net(values, o["final.feats"])
     torch.testing.assert_close(where[:, :3], o["final.coords"].float(), atol=0, rtol=0)
     assert_net(shell_means(values, where, 2), o["vector"])
-    both = [clouds["cloud0"].numpy(), clouds["cloud1"].numpy()]
     assert_net(vector_of(network, both, 0, math.inf), o["vector_r2flow"])
 
 
@@ -192,8 +195,8 @@ def saved(path: Path, state: object) -> Path:
     return path
 
 
-def test_weights_are_read_by_name_below_any_prefix_and_all_of_them(tmp_path: Path, oracle_tensors):
-    weights = oracle_tensors("lidm_spvcnn_weights")
+def test_weights_are_read_by_name_below_any_prefix_and_all_of_them(tmp_path: Path, fixture_tensors):
+    weights = fixture_tensors("lidm/spvcnn_weights")
     config = "model_params: {cr: 0.125, num_class: 20}\n"
     nested = {
         "state_dict": {**{f"model_3d.{k}": v for k, v in weights.items()}, "criterion.w": torch.ones(2)},
@@ -263,8 +266,8 @@ def test_lidms_rangenet_comes_from_its_own_folder_and_from_r2flows_archive(tmp_p
 
 
 @pytest.fixture
-def published(tmp_path: Path, monkeypatch, oracle_tensors) -> Path:
-    return cached(tmp_path / "cache", oracle_tensors("lidm_spvcnn_weights"), monkeypatch)
+def published(tmp_path: Path, monkeypatch, fixture_tensors) -> Path:
+    return cached(tmp_path / "cache", fixture_tensors("lidm/spvcnn_weights"), monkeypatch)
 
 
 def folder_of_scans(path: Path, count: int, seed: int) -> Path:

@@ -32,8 +32,8 @@ def killed_at_the_second(words: list[str]) -> None:
 
 
 @pytest.fixture
-def cache(tmp_path: Path, monkeypatch, oracle_tensors) -> Path:
-    return cached(tmp_path / "cache", oracle_tensors("lidm_spvcnn_weights"), monkeypatch)
+def cache(tmp_path: Path, monkeypatch, fixture_tensors) -> Path:
+    return cached(tmp_path / "cache", fixture_tensors("lidm/spvcnn_weights"), monkeypatch)
 
 
 def scans(folder: Path, numbers: Iterator[int] | range, seed: int) -> Path:

@@ -11,8 +11,8 @@ from lidarsynth.networks.pointnet import PointNet, point_features, read_pointnet
 
 
 @pytest.fixture(scope="module")
-def network(shared: Path) -> PointNet:
-    return read_pointnet(shared / "fixtures/pointnet/cls_model_39.pth")
+def network(official_file) -> PointNet:
+    return read_pointnet(official_file("pointnet/cls_model_39.pth"))
 
 
 def test_features_equal_the_reference(network, fixture_tensors):

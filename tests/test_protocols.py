@@ -73,7 +73,7 @@ def test_every_published_number_comes_out_of_files_of_statistics(fixture_tensors
     assert seeded["FPD squared MMD"] == pytest.approx(values["squared_mmd_np_seed123"], rel=1e-5)
 
 
-def test_features_of_the_official_networks_come_out_of_images(fixture_tensors, shared: Path):
+def test_features_of_rangenet_come_out_of_images(fixture_tensors, shared: Path):
     tensors = fixture_tensors("rangenet/darknet21_io")
     image, mask = tensors["image"][0].numpy(), tensors["mask"][0, 0].numpy() > 0
     sensor = SENSORS["hdl-64e"]
@@ -88,9 +88,12 @@ def test_features_of_the_official_networks_come_out_of_images(fixture_tensors, s
         statistics.features("rangenet"), expected, atol=1e-4 * float(expected.abs().max()), rtol=0
     )
 
+
+def test_features_of_pointnet_come_out_of_images(fixture_tensors, official_file):
+    protocol = replace(R2DM, near=0.0, far=float("inf"), gated=())
     tensors = fixture_tensors("pointnet/io")
     clouds = tensors["points_metric"].transpose(1, 2)
-    network = read_pointnet(shared / "fixtures/pointnet/cls_model_39.pth")
+    network = read_pointnet(official_file("pointnet/cls_model_39.pth"))
     row = Sensor("points", (0.0,), clouds.shape[1])
     statistics = Statistics(protocol, row, "real", {"pointnet": network})
     distance = clouds.norm(dim=-1)[:, None].numpy()

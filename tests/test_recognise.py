@@ -35,12 +35,23 @@ def test_every_sensor_is_recognised_by_the_order_of_its_points(name: str):
     assert recognise(turn(SENSORS[name], rings=False))[0] == name
 
 
-@pytest.mark.parametrize("name", ["hdl-32e", "vlp-16", "vlp-32c", "os1-64", "os1-128", "pandar64"])
+@pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e", "vlp-16", "vlp-32c", "os1-64", "os1-128", "pandar64"])
 def test_a_sensor_without_rings_is_recognised_by_its_points(name: str):
     scan = turn(SENSORS[name], rings=False)
     shuffled = scan[np.random.default_rng(1).permutation(len(scan))]
     assert rings_in_order(shuffled.xyz) is None
     assert recognise(shuffled)[0] == name
+
+
+def shuffled_turn(elevations: np.ndarray) -> Scan:
+    scan = turn(Sensor("unit", tuple(elevations)), rings=False)
+    return scan[np.random.default_rng(1).permutation(len(scan))]
+
+
+def test_a_unit_off_the_table_is_recognised_without_rings_and_one_that_shares_its_beams_is_not():
+    off = np.random.default_rng(2).uniform(-0.2, 0.2, 64)
+    assert recognise(shuffled_turn(np.array(SENSORS["os1-64"].elevations) + off))[0] == "os1-64"
+    assert recognise(shuffled_turn(np.arange(16.0, -16, -1)))[0] is None, "every second beam is a VLP-16's"
 
 
 @pytest.mark.parametrize("first", range(4))

@@ -256,15 +256,26 @@ def test_a_perfect_sensor_reports_what_its_beams_meet(still: list[Frame]):
 
 
 def test_more_comes_beside_what_is_there():
-    """People in groups, motorcycles and works: all else of the world stays where it was, to the bit."""
-    plain, crowded = (world(0, density) for density in (TODAY, Density(groups=3, motorcycles=3, works=2)))
+    """People in groups, motorcycles, works and cyclists: all else of the world stays where it was, to the bit."""
+    more = Density(groups=3, motorcycles=3, works=2, cyclists=3)
+    plain, crowded = (world(0, density) for density in (TODAY, more))
     before = {corners.tobytes() for corners in plain.corners}
     after = {corners.tobytes() for corners in crowded.corners}
     assert before <= after and len(after) > len(before) + 1000
     np.testing.assert_array_equal(plain.poses, crowded.poses)
     kinds = [[str(kind) for kind in actors_of(world).kind] for world in (plain, crowded)]
-    for kind in ("person", "motorcycle"):
+    for kind in ("person", "motorcycle", "bicyclist"):
         assert kinds[1].count(kind) > kinds[0].count(kind) + 3
+
+
+def test_cyclists_ride_forward_beside_the_road():
+    drive = draw_drive(1, 0, 2.0, Density(cyclists=4, traffic=0))
+    moment = drive.moment(1.0)
+    rides = moment.present & (drive.actors.kind == "bicyclist") & (drive.number >= 0)
+    speed = np.linalg.norm(moment.velocity[rides], axis=1)
+    assert rides.sum() > 5 and np.all((speed > 3.8) & (speed < 6.2))
+    ahead = np.column_stack([np.cos(moment.yaw[rides]), np.sin(moment.yaw[rides])])
+    np.testing.assert_allclose(np.sum(ahead * moment.velocity[rides, :2], axis=1), speed, rtol=0.02)
 
 
 def test_kerbs_are_as_high_as_asked_and_all_else_stays():

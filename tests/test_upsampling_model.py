@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from networks import angle_queries
+from oracle import assert_close
 from torch import Tensor
 
 import lidarsynth
@@ -335,7 +336,7 @@ def test_official_lidar_sr_is_recognised_and_answers_as_stored(fixture_tensors, 
     model = lidarsynth.load(tmp_path / "lsr_4h_1w_100.pth")
     assert isinstance(model, UpsamplingModel) and model.experiment.name == "lsr_4h_1w_100"
     with torch.no_grad():
-        torch.testing.assert_close(model.network(stored["input"]), stored["output"], atol=1e-5, rtol=0)
+        assert_close(model.network(stored["input"]), stored["output"], atol=1e-5, rtol=0)
     group, sensor = model.experiment.upsampling, model.sensor
     assert group is not None and (group.factor, group.spread, group.norm, group.max_range) == ((4, 1), True, 90, 70)
     assert (sensor.height, sensor.width, sensor.min_range, sensor.max_range) == (64, 64, 2, 70)
@@ -438,7 +439,7 @@ def test_keras_weights_load_and_answer_as_stored(fixture_tensors, reference, tmp
     assert isinstance(model, UpsamplingModel) and model.network.keras and model.experiment.upsampling.first == 3
     with torch.no_grad():
         found = model.network(stored["input"].permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-    torch.testing.assert_close(found, stored["output"], atol=1e-5, rtol=0)
+    assert_close(found, stored["output"], atol=1e-5, rtol=0)
     whole = path.read_bytes()
     write([*[stored[name] for name in names[:-1]], torch.zeros(3)])
     with pytest.raises(ValueError, match=r"weights.h5: expected outc.conv.1.bias \(1,\), found \(3,\)"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracle import assert_close
 
 from lidarsynth.experiment.folder import WEIGHTS, save
 from lidarsynth.experiment.presets import preset
@@ -52,12 +53,12 @@ def edited(tiny, tmp_path):
 
 @pytest.mark.parametrize("name", ["config_A", "config_F", "config_G", "config_H", "tiny_H"])
 @torch.no_grad()
-def test_loaded_networks_say_what_the_reference_says(shared, fixture_tensors, name):
+def test_loaded_networks_say_what_the_reference_says(official_file, fixture_tensors, name):
     expected = fixture_tensors(f"r2dm/{name}_io")
-    experiment, network = read_official(shared / "fixtures" / "r2dm" / f"{name}.pth")
+    experiment, network = read_official(official_file(f"r2dm/{name}.pth"))
     assert not network.training
     output = network(expected["input"], expected["log_snr"])
-    torch.testing.assert_close(output, expected["output"], atol=1e-4, rtol=0)
+    assert_close(output, expected["output"], atol=1e-4, rtol=0)
     torch.testing.assert_close(network.get_buffer("coords"), expected["coords"], atol=0, rtol=0)
     angles = torch.from_numpy(build_sensor(experiment).ray_angles())
     torch.testing.assert_close(angles[None], expected["coords"], atol=1e-6, rtol=0)
@@ -226,9 +227,9 @@ def test_files_that_are_no_checkpoints_get_one_line(tiny, tmp_path):
         )
 
 
-def test_checkpoints_of_other_systems_are_named_by_their_keys(shared):
+def test_checkpoints_of_other_systems_are_named_by_their_keys(official_file):
     with pytest.raises(ValueError, match=r"found 74 keys \['feat.stn"):
-        read_official(shared / "fixtures" / "pointnet" / "cls_model_39.pth")
+        read_official(official_file("pointnet/cls_model_39.pth"))
 
 
 def test_words_and_paths_that_are_nothing_get_one_line(tmp_path):

@@ -36,6 +36,7 @@ def streets(
     groups: Annotated[float, arg(help="of people who stand together, per 100 m and side of the street.")] = 0.0,
     motorcycles: Annotated[float, arg(help="places with parked ones, likewise.")] = 0.0,
     works: Annotated[float, arg(help="construction sites, likewise.")] = 0.0,
+    cyclists: Annotated[float, arg(help="on the sidewalk's edge, likewise.")] = 0.0,
     kerbs: Annotated[float, arg(help="their height: 1 = 12 cm, 0.5 = half of it.")] = 1.0,
     rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
     fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
@@ -51,7 +52,7 @@ def streets(
     from lidarsynth.streets.weather import Weather
 
     density, weather = (
-        Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs),
+        Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs, cyclists),
         Weather(rain, fog),
     )
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)

@@ -104,7 +104,15 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    later: dict[str, Any] = {"perfect": False, "groups": 0, "motorcycles": 0, "works": 0, "kerbs": 1, "rough": 1}
+    later: dict[str, Any] = {
+        "perfect": False,
+        "groups": 0,
+        "motorcycles": 0,
+        "works": 0,
+        "kerbs": 1,
+        "rough": 1,
+        "cyclists": 0,
+    }
     for of in (options, options["density"], options["optics"]):
         for name in later.keys() & of.keys():
             if of[name] == later[name]:

@@ -77,8 +77,11 @@ def read_las(data: bytes) -> Fields:
     try:
         with laspy.open(BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as reader:
             points = reader.read()
-            names = set(points.point_format.dimension_names) & {n for usual in NAMES.values() for n in usual}
-            return {axis: np.asarray(points[axis]) for axis in "xyz"} | {n: np.asarray(points[n]) for n in names}
+            usual = {name for names in NAMES.values() for name in names}
+            told = [n for n in points.point_format.dimension_names if n in usual]
+            added = [n for n in points.point_format.extra_dimension_names if n not in told]
+            columns = {name: np.asarray(points[name]) for name in ("x", "y", "z", *told, *added)}
+            return {name: column for name, column in columns.items() if column.ndim == 1}
     except FileError:
         raise
     except BaseException as error:  # laspy and its Rust decoder raise a dozen types on broken files

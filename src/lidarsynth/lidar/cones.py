@@ -130,3 +130,10 @@ def _medians(values: np.ndarray, ring: np.ndarray) -> np.ndarray:
     order = np.lexsort((values, ring))
     ends = np.cumsum(np.bincount(ring))
     return values[order][(ends + np.concatenate([[0], ends[:-1]])) // 2]
+
+
+def onto_z(axis: np.ndarray) -> np.ndarray:
+    """(3, 3) the shortest rotation that brings a unit vector onto z (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])  # of axis x z, as a matrix
+    return np.eye(3) + cross + cross @ cross / (1 + z)

@@ -6,12 +6,12 @@ that was raised, tilted or written in other axes shows it, whatever the road doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarsynth.lidar.cones import fit_cones
-from lidarsynth.lidar.crowding import height_of_beams
+from lidarsynth.lidar.cones import fit_cones, onto_z
+from lidarsynth.lidar.crowding import stand_of_beams
 from lidarsynth.lidar.ground import levels, road_axis
 from lidarsynth.lidar.recognition import recognise, rings_by_elevation, rings_in_order
 from lidarsynth.lidar.scan import Scan
@@ -61,8 +61,8 @@ class Frame:
 def check_frame(scan: Scan) -> Frame:
     """In which frame a scan's points are.
 
-    Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height by where
-    elevations crowd; a tilt only where they crowd on rings all the same.
+    Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height or tilt,
+    not both at once, by where elevations crowd.
     """
     up, has_rings = _upright(scan)
     rotation, words = np.array(AXES[up][0], np.float64), AXES[up][1]
@@ -88,11 +88,9 @@ def _stand(scan: Scan, rotation: np.ndarray, has_rings: bool) -> tuple[np.ndarra
     xyz = (scan.xyz @ rotation.T).astype(np.float32)
     if scan.ring is not None or rings_in_order(xyz) is not None:
         return _tilt_and_height(scan, rotation) if has_rings else (np.eye(3), 0.0)
-    height = height_of_beams(xyz)
-    if height is not None or not has_rings:
-        return np.eye(3), height or 0.0
-    tip, height = _tilt_and_height(scan, rotation)
-    return (tip, height) if np.degrees(np.arccos(np.clip(tip[2, 2], -1, 1))) > TILTED else (np.eye(3), 0.0)
+    if (stand := stand_of_beams(xyz)) is not None:
+        return onto_z(stand[0]), stand[1]
+    return np.eye(3), 0.0
 
 
 def _tilt_and_height(scan: Scan, rotation: np.ndarray) -> tuple[np.ndarray, float]:
@@ -110,7 +108,7 @@ def _tilt_and_height(scan: Scan, rotation: np.ndarray) -> tuple[np.ndarray, floa
             break  # cones about z through the origin fit as well
         if cones.tilt < TILTED / 10 and abs(cones.height) < RAISED / 2:
             break
-        tip, height = _onto_z(cones.axis) @ tip, height + cones.height * float(cones.axis[2])
+        tip, height = onto_z(cones.axis) @ tip, height + cones.height * float(cones.axis[2])
     return tip, height
 
 
@@ -132,14 +130,27 @@ def _upright(scan: Scan) -> tuple[str, bool]:
 
 
 def _side(scan: Scan, axis: str) -> str:
-    """+axis or -axis: where the ground is below; where both sides look alike, where the beams are a known sensor's."""
-    upper, lower = _shares(scan, "+" + axis), _shares(scan, "-" + axis)
+    """+axis or -axis: where the ground is below the sensor, wherever the origin; where both sides look alike, where the
+    beams are a known sensor's."""
+    seen = _from_sensor(scan, np.array(AXES["+" + axis][0]))
+    upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > 0.6 and upper > UPSIDE * lower:
         return "+" + axis
-    up, down = (_known(scan, sign + axis) for sign in "+-")
+    up, down = (_known(seen, sign + axis) for sign in "+-")
     if up != down:
         return ("+" if up else "-") + axis
     return ("-" if lower > UPSIDE * upper and lower > 1 / 3 else "+") + axis
+
+
+def _from_sensor(scan: Scan, rotation: np.ndarray) -> Scan:
+    """The scan, its origin at the height along the axis that `rotation` makes z from which its rings are cones, where
+    rings are said."""
+    xyz = scan.xyz @ rotation.T.astype(np.float32)
+    ring = scan.ring if scan.ring is not None else rings_in_order(xyz)
+    if ring is None:
+        return scan
+    height = fit_cones(xyz, ring).height
+    return replace(scan, xyz=(scan.xyz - height * rotation[2]).astype(np.float32))
 
 
 def _known(scan: Scan, up: str) -> bool:
@@ -171,13 +182,6 @@ def rings_of(scan: Scan, xyz: np.ndarray | None = None) -> np.ndarray | None:
     ring = scan.ring if scan.ring is not None else rings_in_order(xyz)
     ring = rings_by_elevation(xyz) if ring is None else ring
     return None if ring is None or np.count_nonzero(np.bincount(ring)) < 4 else ring
-
-
-def _onto_z(axis: np.ndarray) -> np.ndarray:
-    """(3, 3) the shortest rotation that brings a unit vector onto z (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])  # of axis x z, as a matrix
-    return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
 WAYS = {"f": (1, 0, 0), "b": (-1, 0, 0), "l": (0, 1, 0), "r": (0, -1, 0), "u": (0, 0, 1), "d": (0, 0, -1)}

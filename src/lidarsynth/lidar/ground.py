@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
-from lidarsynth.lidar.cones import robust_weight
+from lidarsynth.lidar.cones import onto_z, robust_weight
 
 SECTORS, RINGS = 24, 6  # cells around the sensor
 NEAR, FAR = 3.0, 20.0  # metres of the cells
 REACH, STEP = 4.0, 0.25  # heights that are tried, and their step
+LEAN, LEANS = 8, 2  # degrees that the ground may lean, in which steps
+POINTS = 8_000  # of a scan are enough
 
 
 @dataclass(frozen=True)
@@ -68,10 +71,29 @@ def plane(xyz: np.ndarray) -> tuple[float, float, float] | None:
     return float(-fitted[0]), float(pitch), float(roll)
 
 
+def normal(xyz: np.ndarray, seed: int = 0) -> np.ndarray:
+    """(3,) unit normal of the ground, which may lean by 8 degrees along x and along y; z where no level is seen."""
+    few = xyz[np.random.default_rng(seed).permutation(len(xyz))[:POINTS]]
+    side = range(-LEAN, LEAN + 1, LEANS)
+    axes = [leaning(a, b) for a, b in sorted(product(side, side), key=lambda ab: ab[0] ** 2 + ab[1] ** 2)]
+    shares = [levels(few @ onto_z(axis).T.astype(np.float32))[0].share for axis in axes]
+    level = onto_z(axes[int(np.argmax(shares))])
+    if (found := plane((xyz @ level.T).astype(np.float32))) is None:
+        return np.array([0.0, 0.0, 1.0])
+    return leaning(*found[1:]) @ level
+
+
+def leaning(x: float, y: float) -> np.ndarray:
+    """(3,) the unit vector that leans from z by degrees along x and along y."""
+    axis = np.append(np.tan(np.radians([x, y])), 1.0)
+    return axis / np.linalg.norm(axis)
+
+
 def road_axis(xyz: np.ndarray) -> float:
     """-1 to 1: how much farther the ground is seen along x (road ahead) than along y; about 0 where neither is.
 
-    The mean of cos(2 azimuth) over 72 sectors, each by the farthest ground point in it, up to 50 m.
+    The mean of cos(2 azimuth) over 72 sectors, each by the farthest ground point in it, up to 50 m; 0 where fewer than
+    a third of them have any.
     """
     below, _ = levels(xyz)
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
@@ -80,4 +102,4 @@ def road_axis(xyz: np.ndarray) -> float:
     far = np.zeros(72)
     np.maximum.at(far, sector, np.minimum(rho[ground], 50))
     angle = (np.arange(72) + 0.5) / 36 * np.pi - np.pi
-    return float((far * np.cos(2 * angle)).sum() / far.sum()) if far.any() else 0.0
+    return float((far * np.cos(2 * angle)).sum() / far.sum()) if np.count_nonzero(far) >= 24 else 0.0

@@ -145,10 +145,12 @@ def _set_off(
     number[~walks & (actors.pace != TRAFFIC)] = -1
     along, aside = s[number, np.arange(count)], d[number, np.arange(count)]
     ahead = np.where(actors.pace == TRAFFIC, np.where(aside < 0, 1, -1), np.where(draw[1] < 0.5, 1, -1))
-    ahead = np.where(_in_the_way(actors, aside, number, roads, lane, ahead), 0, ahead)
     slow = actors.kind == "bicyclist"
+    rides = walks & slow  # beside the road, with the traffic of that side
+    ahead = np.where(rides, np.where(aside < 0, 1, -1), ahead)
+    ahead = np.where(_in_the_way(actors, aside, number, roads, lane, ahead), 0, ahead)
     pace = np.where(slow, 4 + 2 * draw[2], usual * (0.8 + 0.3 * draw[2]))
-    pace = np.where(walks, 0.9 + 0.7 * draw[2], pace)
+    pace = np.where(walks & ~rides, 0.9 + 0.7 * draw[2], pace)
     track = along + ahead * pace * STEP * np.arange(steps)[:, None] * walks
     mine = None
     for way in (1, -1):

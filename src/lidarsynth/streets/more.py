@@ -1,4 +1,4 @@
-"""What a street has more of when it is asked for: people who stand together, parked motorcycles, road works.
+"""What a street has more of when it is asked for: people in groups, parked motorcycles, road works, cyclists.
 
 All of it is drawn after everything else, so that the rest of a world is the same with and without.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.streets.ground import Road
-from lidarsynth.streets.world import WorldBuilder
+from lidarsynth.streets.world import WALK, WorldBuilder
 
 
 def more(builder: WorldBuilder) -> None:
@@ -16,7 +16,7 @@ def more(builder: WorldBuilder) -> None:
     for road in builder.ground.roads:
         for side in (-1, 1):
             for per_100, put in ((builder.area.groups, _group), (builder.area.motorcycles, _motorcycles),
-                                 (builder.area.works, _works)):  # fmt: skip
+                                 (builder.area.works, _works), (builder.area.cyclists, _cyclists)):  # fmt: skip
                 if per_100 > 0:
                     count = int(builder.rng.poisson(per_100 * (road.stop - road.start) / 100))
                     for s in builder.rng.uniform(road.start, road.stop, count):
@@ -44,6 +44,18 @@ def _motorcycles(builder: WorldBuilder, road: Road, side: int, s: float) -> None
     x, y, along = road.at(place, np.full(count, side * (road.half + 1.1)))
     yaw = along + rng.choice([0.5, np.pi / 2]) + rng.normal(0, 0.08, count)
     builder.put("motorcycle", x, y, yaw, up=builder.ground.kerb if road.walk > 0 else 0.0, clear=0.0)
+
+
+def _cyclists(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """One, or two in a row, along the sidewalk's edge, with the traffic of their side; none without a sidewalk."""
+    rng = builder.rng
+    place = s - 4.0 * np.arange(1 + int(rng.random() < 0.25))
+    aside, sway = road.half + 0.7 + rng.normal(0, 0.1), rng.normal(0, 0.05)
+    if road.walk < 1.3:
+        return
+    x, y, along = road.at(place, np.full(len(place), side * aside))
+    yaw = along + sway + (np.pi if side > 0 else 0.0)
+    builder.put("bicyclist", x, y, yaw, up=builder.ground.kerb, clear=0.0, size=(0.96, 1.04), pace=WALK)
 
 
 def _works(builder: WorldBuilder, road: Road, side: int, s: float) -> None:

@@ -111,6 +111,21 @@ class GanModel(ScanModel):
             images = self.network.synthesize(w, torch.full((1, 1, 1, 1), 0.5, device=self._device)).image
         return with_known(self._image(images[0]), image, known, keep_reflectance=False)
 
+    def returned(self, perfect: RangeImage, seed: int = 0, steps: int = STEPS) -> np.ndarray:
+        """(H, W) bool: which rays of a simulator's image a real sensor would report, as DUSty v2 tells (WACV 2023).
+
+        The network is inverted to the image's ranges and its own ray-drop drawn. Raises ValueError for an image of
+        another size, or when nothing is measured.
+        """
+        if perfect.shape != self._size:
+            raise ValueError(f"expected an image of {self._size}, found {perfect.shape}")
+        rng = torch.Generator().manual_seed(seed)
+        w = self._inverted(perfect, perfect.mask, steps, rng, None)
+        uniform = torch.rand(1, 1, *self._size, generator=rng).to(self._device)
+        with torch.no_grad():
+            images = self.network.synthesize(w, uniform).image
+        return perfect.mask & self._image(images[0]).mask
+
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """1, how often `generate` evaluates the network per batch. Raises ValueError for other wishes."""
         self._refuse(sampler)
