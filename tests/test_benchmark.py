@@ -16,7 +16,7 @@ from PIL import Image
 
 import lidarsynth as ls
 from lidarsynth.benchmark import drawings, run
-from lidarsynth.benchmark.config import read_config, rows
+from lidarsynth.benchmark.config import UpsamplingMethod, read_config, rows
 from lidarsynth.benchmark.published import PUBLISHED, published, why_not
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.run import benchmark
@@ -32,6 +32,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import interpolated
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
@@ -557,3 +558,17 @@ def test_the_commands_of_the_results_name_files_that_are_there():
         assert read_config(kind, REPO_ROOT / path).method
     for path in re.findall(r"\]\((images/\S+)\)", text):
         assert (REPO_ROOT / "docs" / path).is_file()
+
+
+@pytest.mark.parametrize("name", ["benchmark_upsampling", "benchmark_synthetic", "benchmark_generation"])
+def test_the_examples_ask_the_shipped_models_for_what_they_do(name: str):
+    path = Path(__file__).parents[1] / "examples" / f"{name}.toml"
+    config = read_config("generation" if name.endswith("generation") else "upsampling", path)
+    asked = [method for _, method in rows(config.method) if method.model]
+    assert asked
+    for method in asked:
+        model = ls.load(method.model or "")
+        if isinstance(method, UpsamplingMethod):
+            model.resolved(Filling(method.method or "auto", method.steps_asked, method.resamples, method.sampler))
+        else:
+            assert model.generation_steps(method.steps_asked, method.sampler) > 0
