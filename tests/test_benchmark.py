@@ -563,7 +563,7 @@ def test_the_commands_of_the_results_name_files_that_are_there():
 @pytest.mark.parametrize("name", ["benchmark_upsampling", "benchmark_synthetic", "benchmark_generation"])
 def test_the_examples_ask_the_shipped_models_for_what_they_do(name: str):
     path = Path(__file__).parents[1] / "examples" / f"{name}.toml"
-    config = read_config("generation" if name.endswith("generation") else "upsampling", path)
+    config: Any = read_config("generation" if name.endswith("generation") else "upsampling", path)
     asked = [method for _, method in rows(config.method) if method.model]
     assert asked
     for method in asked:
