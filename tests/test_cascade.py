@@ -255,6 +255,11 @@ def test_repaint_fills_a_lost_sector_and_leaves_the_rest(model: CascadeModel):
     filled = model.complete(image.keep(known), known, method="repaint", steps=2, resamples=1, seed=1)
     np.testing.assert_array_equal(filled.range[known], image.range[known])
     assert filled.mask[~known].any()
+    network = Cascade(model.network.coarse, model.network.fill, Constant(torch.full((3, 16, 128), 9.0)))
+    guided = replace(model, network=network)
+    same = guided.complete(image.keep(known), known, method="repaint", steps=2, resamples=1, seed=1)
+    np.testing.assert_array_equal(same.range, filled.range)  # known pixels guide enough
+    assert (guided.generate(1, steps=2)[0].range != model.generate(1, steps=2)[0].range).any()
 
 
 @pytest.mark.parametrize(
