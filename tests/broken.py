@@ -202,7 +202,7 @@ BROKEN: dict[str, Maker] = {
     "npy one-dimensional": _bytes("flat.npy", _npy(np.arange(200, dtype=np.float32))),
     "npy two columns": _bytes("pairs.npy", _npy(points()[:, :2])),
     "npy an image": _bytes("image.npy", _npy(np.ones((64, 1024), np.float32))),
-    "npy three-dimensional": _bytes("cube.npy", _npy(np.ones((2, 64, 8), np.float32))),
+    "npy three-dimensional": _bytes("cube.npy", _npy(np.ones((2, 64, 2), np.float32))),
     "npy without intensity": _bytes("xyz.npy", _npy(points()[:, :3].copy())),
     "npy complex": _bytes("complex.npy", _npy(points().astype(np.complex64))),
     "npy strings": _bytes("strings.npy", _npy(points().astype("U8"))),

@@ -170,7 +170,6 @@ def test_arrays_are_scans():
     image = model.complete(table.astype(np.float32))
     expected = model.complete(Scan(scan.xyz, np.full(len(scan), 0.5, np.float32)))
     np.testing.assert_array_equal(image.range, expected.range)
-    assert len(model.complete_all([table, scan])) == 2
     assert Scan(scan.xyz).reflectance.sum() == 0 and len(scan_of(scan.xyz).reflectance) == len(scan)
     for wrong, words in ((table * 300, "0 to 1 in the fourth"), (table[0], "(N, 3)"), (table * np.nan, "finite")):
         with pytest.raises(ValueError, match=words.replace("(", r"\(").replace(")", r"\)")):

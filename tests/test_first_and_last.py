@@ -72,6 +72,15 @@ def test_pipes_are_refused_whatever_their_name_promises(name: str, tmp_path: Pat
     assert end.value.code == 2 and line.count("\n") == 1 and "expected a file, found a device or pipe" in line
 
 
+@pytest.mark.parametrize(("name", "found"), [("a.bin", "no file or folder of that name"), ("empty", "nothing")])
+def test_what_is_not_there_is_said_without_a_list_of_models(name: str, found: str, tmp_path: Path, capsys):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SystemExit):
+        main(["info", str(tmp_path / name)])
+    line = capsys.readouterr().err
+    assert line.endswith(f"found {found}\n") and "kitti" not in line
+
+
 def test_a_toml_of_one_long_word_is_read_in_linear_time(tmp_path: Path):
     (tmp_path / "a.toml").write_text(f'{"word" * 100_000} = "{"word " * 50_000}"\n')
     start = time.process_time()

@@ -12,7 +12,6 @@ import lidarsynth as ls
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.streets.reader import SyntheticStreets
 
-ray = pytest.importorskip("ray", reason="the extra ray is not installed")
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "ray_complete.py"
 
 
@@ -20,6 +19,7 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "ray_complete.py"
 @pytest.mark.timeout(900)
 @pytest.mark.filterwarnings("ignore")  # of Ray about itself
 def test_two_workers_complete_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    ray = pytest.importorskip("ray", reason="the extra ray is not installed")  # here, for it takes seconds to import
     sensor = ls.SENSORS["vlp-16"].resized(width=512)
     streets = SyntheticStreets(0, 4, sensor)
     for i in range(4):

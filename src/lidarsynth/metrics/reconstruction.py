@@ -107,27 +107,6 @@ def _harmonic(precision: float, recall: float) -> float:
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-@dataclass(frozen=True)
-class VoxelErrors:
-    """Overlap of the occupied voxels of a result and of the truth, each in [0, 1]."""
-
-    iou: float
-    precision: float
-    recall: float
-    f1: float
-
-
-def voxel_errors(result: Array, truth: Array, size: float = 0.1) -> VoxelErrors:
-    """Overlap of the voxels floor(x / size) that points (N, 3) and (M, 3) in metres occupy; one scan (ILN, TULIP).
-
-    Means over scans are taken of these. Raises ValueError for other shapes, no points or NaN.
-    """
-    first, second = ({*map(tuple, np.floor(_points(p) / size).astype(np.int64).tolist())} for p in (result, truth))
-    both = len(first & second)
-    precision, recall = both / len(first), both / len(second)
-    return VoxelErrors(both / len(first | second), precision, recall, _harmonic(precision, recall))
-
-
 def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.ndarray:
     """(classes, classes) int64 pixels, truth by row, predicted by column; those of several scans simply add up.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -137,16 +137,6 @@ class ScanModel(ABC):
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
         """
         return self.filled(scan, Filling(method, steps, resamples, sampler, seed, precision), known, on_step)
-
-    def complete_all(
-        self,
-        scans: Iterable[Scan | RangeImage | np.ndarray],
-        method: str = "auto",
-        steps: int | None = None,
-        seed: int = 0,
-    ) -> list[RangeImage]:
-        """`complete` of each of several scans, in order."""
-        return [self.complete(scan, method=method, steps=steps, seed=seed) for scan in scans]
 
     def upsample(
         self,

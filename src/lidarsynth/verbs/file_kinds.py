@@ -32,9 +32,15 @@ def file_lines(path: Path) -> Lines | None:
     Raises FileError, in one line, for a file that is broken or of no kind that is known.
     """
     model = path.name in (WEIGHTS, RECORD) or (path.is_dir() and (path / RECORD).exists())
-    if model or not path.exists() or path.suffix.lower() in MODELS:
+    if model or path.suffix.lower() in MODELS:
+        return None
+    if not path.exists():
+        if path.name.lower().endswith((*READERS, *KINDS, *STREAMS)):
+            raise FileError(f"{path}: expected a file, found no file or folder of that name")
         return None
     if path.is_dir():
+        if not any(path.iterdir()):
+            raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
         if not (is_bag(path) or (path / INDEX).exists() or has_scans(path)):
             return None
         return _bag(path) if is_bag(path) else _cache(path) if (path / INDEX).exists() else _folder(path)
@@ -156,4 +162,5 @@ def _json(path: Path) -> Lines:
 
 
 MODELS = (".pth", ".pt", ".h5", ".toml")  # `load_parts` and `get_sensor` know them
+STREAMS = (".bag", ".mcap", ".db3", ".pcap", ".pcapng")
 KINDS: dict[str, Callable[[Path], Lines]] = {".safetensors": _tensors, ".json": _json}
