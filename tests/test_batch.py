@@ -2,6 +2,7 @@
 
 import errno
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from test_recognise import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.data.windows import in_window
+from lidarsynth.experiment.folder import save
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.frame import parse_transform, transformed
 from lidarsynth.lidar.scan import Scan, scan_of
@@ -19,7 +21,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.batch_report import merge_shards, parse_shard
 from lidarsynth.verbs.inputs import inputs_of
-from lidarsynth.weights.load import load
+from lidarsynth.weights.load import load, load_parts
 
 
 @pytest.fixture
@@ -186,9 +188,13 @@ def test_a_model_says_what_it_is_and_saves_itself(tmp_path: Path):
 
 
 def test_a_model_that_was_tuned_to_another_sensor_says_so(scans: Path, tmp_path: Path, capsys):
+    experiment, network = load_parts("default")
+    save(tmp_path / "tuned", replace(experiment, card=replace(experiment.card, sensor="hdl-64e-kitti")), network)
     said = {}
-    for model in ("kitti", "default"):
-        main(["complete", str(scans / "d1" / "000.pcd"), "--model", model, "--out", str(tmp_path / "o.ply"), WORDS[0]])
+    for model in ("tuned", "default", "kitti"):
+        source = str(tmp_path / "tuned") if model == "tuned" else model
+        main(["complete", str(scans / "d1" / "000.pcd"), "--model", source, "--out", str(tmp_path / "o.ply"), WORDS[0]])
         said[model] = capsys.readouterr().err
-    assert "kitti was tuned to hdl-64e-kitti, and this is a scan of vlp-16; use --model default" in said["kitti"]
-    assert "tuned" not in said["default"]
+    assert "tuned was tuned to hdl-64e-kitti, and this is a scan of vlp-16; use --model default" in said["tuned"]
+    assert "kitti knows hdl-64e-kitti alone, and this is a scan of vlp-16; use --model default" in said["kitti"]
+    assert "this is a scan of" not in said["default"]

@@ -12,7 +12,7 @@ import pytest
 import torch
 from oracle import assert_close
 
-from lidarsynth.experiment.folder import WEIGHTS, save
+from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Data, Model
 from lidarsynth.experiment.sensor import build_sensor
@@ -254,26 +254,6 @@ def test_shipped_words_come_first_and_a_path_is_still_reachable(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=r"tiny: expected"):
         load_parts("./tiny")
-
-
-def test_weights_that_are_a_part_take_the_rest_from_the_folder_beside_theirs(tmp_path):
-    experiment = preset("tiny")
-    whole, tuned = build_network(experiment), build_network(experiment)
-    first = ".".join(next(iter(whole.state_dict())).split(".")[:2])
-    others = {k: v for k, v in whole.state_dict().items() if not k.startswith(first)}
-    assert others, "the part leaves something out"
-    tuned.load_state_dict({**tuned.state_dict(), **others})
-    save(tmp_path / "a", experiment, whole)
-    save(tmp_path / "b", experiment, tuned, part=first, rest="a")
-    assert (tmp_path / "b" / WEIGHTS).stat().st_size < (tmp_path / "a" / WEIGHTS).stat().st_size
-    read = load_parts(tmp_path / "b")[1].state_dict()
-    assert all(torch.equal(read[k], v) for k, v in tuned.state_dict().items())
-    (tmp_path / "a" / WEIGHTS).unlink()
-    with pytest.raises(ValueError, match=r"expected the rest of its weights in .*a.model.safetensors, found no such"):
-        load_parts(tmp_path / "b")
-    save(tmp_path / "b", experiment, tuned, part=first, rest="../a")
-    with pytest.raises(ValueError, match=r"in a folder beside its own, found '../a'"):
-        load_parts(tmp_path / "b")
 
 
 class Server(http.server.ThreadingHTTPServer):

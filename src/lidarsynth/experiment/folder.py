@@ -14,33 +14,19 @@ from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import whole_file
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
-REST = "rest"  # in the metadata of weights that are a part: the folder beside theirs that holds the others
 
 
-def save(
-    folder: str | Path,
-    experiment: Experiment,
-    network: nn.Module,
-    half: bool = False,
-    part: str = "",
-    rest: str | None = None,
-) -> Path:
-    """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete.
-
-    part  only tensors whose names begin so, where the others are equal to those of the folder `rest` beside this one
-    """
+def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
+    """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     dtype = torch.float16 if half else torch.float32
     # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
     exact = {name for name, _ in network.named_buffers()}
-    weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()
-               if k.startswith(part)}  # fmt: skip
+    weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()}
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
-        file.write_bytes(
-            serialized(weights, None if rest is None else {REST: rest})
-        )  # save_file would hide it from other users
+        file.write_bytes(serialized(weights))  # save_file would hide it from other users
     return folder
 
 

@@ -212,15 +212,26 @@ def default() -> Experiment:
 
 
 def kitti() -> Experiment:
-    """`default` fine-tuned on real scans of one sensor (`--from default`), for completion first of all."""
-    start = default()
+    """`kitti-streets` fine-tuned on real scans (`--from kitti-streets`), for completion first of all."""
+    start = kitti_streets()
     return replace(
         start,
         name="kitti",
-        training=replace(start.training, steps=3_000, learning_rate=1e-3, warmup=100, generation_share=0.25),
+        data=replace(start.data, mend=False, roll=True, mirror=True, scale=0.15, mix=0.8),
+        training=replace(
+            start.training,
+            steps=5_000,
+            batch_size=2,
+            learning_rate=2e-3,
+            warmup=50,
+            ema_start=100,
+            generation_share=0.1,
+            upsampling_share=0.75,
+            metres_weight=0.2,
+        ),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",
-            data="from `default`, on 105 real HDL-64E scans of KITTI (about 75 different views)",
+            data="from `kitti-streets`, on 105 real HDL-64E scans of KITTI (about 75 different views)",
         ),
     )
 

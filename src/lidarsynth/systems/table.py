@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import Tensor, nn
+from torch import nn
 
-from lidarsynth.experiment.folder import RECORD, REST, WEIGHTS, read_experiment
+from lidarsynth.experiment.folder import RECORD, WEIGHTS, read_experiment
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
@@ -124,25 +124,10 @@ def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
     network = build_network(experiment)
     try:
         check_regular(path, LARGEST_WEIGHTS)
-        weights = _tensors(path)
+        weights = load_file(path)
     except FileNotFoundError:
         raise ValueError(f"{folder}: expected {WEIGHTS} beside {RECORD}, found none") from None
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: expected safetensors weights, found {error}") from None
     load_weights(network, weights, str(path))
     return experiment, network
-
-
-def _tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, and where it says that it is a part, the others from the folder beside its own."""
-    with safe_open(path, "pt") as file:
-        rest = (file.metadata() or {}).get(REST)
-    if rest is None:
-        return load_file(path)
-    if rest != Path(rest).name:
-        raise ValueError(f"{path}: expected the rest of the weights in a folder beside its own, found {rest!r}")
-    whole = path.parent.parent / rest / WEIGHTS
-    if not whole.is_file():
-        raise ValueError(f"{path}: expected the rest of its weights in {whole}, found no such file")
-    check_regular(whole, LARGEST_WEIGHTS)
-    return {**load_file(whole), **load_file(path)}
