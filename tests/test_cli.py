@@ -435,7 +435,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("project SCAN --out i.npz --sensor vlp-16 --method unfolding", "16 rings"),
         ("project SCAN --out i.npz --width 0", "--width of at least 4"),
         ("info nothing", "nothing: expected"),
-        ("info .", "experiment.json"),
+        ("info .", "a model in the folder, found nothing"),
         ("info none.bin", "no file or folder of that name"),
         ("info none.toml", "none.toml"),
         ("data files . ", "CACHE"),
