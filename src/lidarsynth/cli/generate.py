@@ -26,7 +26,7 @@ def generate(
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.generation import batches, claim, endings_of, generate_into
+    from lidarsynth.verbs.generation import claim, endings_of, generate_into, missing
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
     at_least(0, {"seed": seed})
@@ -39,7 +39,7 @@ def generate(
     settings |= {"labels": True} if labels else {}
     with only_writer(out, "generation"):
         claim(out, settings)
-        runs = batches(out, count, endings, loaded.at_once(batch_size))
-        with step_bar("generate", len(runs) * calls) as on_step:
+        runs, size = missing(out, count, endings), loaded.at_once(batch_size)
+        with step_bar("generate", sum(-(-len(run) // size) for run in runs) * calls) as on_step:
             new = sum(1 for _ in generate_into(out, loaded, runs, batch_size, endings, steps, sampler, seed, on_step))
     say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

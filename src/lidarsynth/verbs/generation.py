@@ -59,8 +59,8 @@ def _recorded(record: Path) -> dict[str, Any]:
     return found
 
 
-def batches(folder: Path, count: int, endings: tuple[str, ...], size: int) -> list[range]:
-    """The scans of 0 .. count - 1 that lack a file, as runs of at most `size` numbers in a row.
+def missing(folder: Path, count: int, endings: tuple[str, ...]) -> list[range]:
+    """The scans of 0 .. count - 1 that lack a file, as runs of numbers in a row.
 
     endings  of a finished scan's files, such as (".ply", ".png")
     """
@@ -69,7 +69,7 @@ def batches(folder: Path, count: int, endings: tuple[str, ...], size: int) -> li
     for i in range(count):
         if all(f"{i:06d}{ending}" in there for ending in endings):
             continue
-        if runs and runs[-1].stop == i and len(runs[-1]) < size:
+        if runs and runs[-1].stop == i:
             runs[-1] = range(runs[-1].start, i + 1)
         else:
             runs.append(range(i, i + 1))
@@ -79,7 +79,7 @@ def batches(folder: Path, count: int, endings: tuple[str, ...], size: int) -> li
 def generate_into(
     folder: Path,
     model: ScanModel,
-    runs: list[range],  # of `batches`
+    runs: list[range],  # of `missing`
     batch_size: int,
     endings: tuple[str, ...],
     steps: int | None = None,
