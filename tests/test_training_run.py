@@ -25,7 +25,7 @@ from lidarsynth.verbs.training import resolve, run
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 QUIET = Options(sample_every=0, workers=0)
-STEPS = 14  # of the killed run
+STEPS = 20  # of the killed run
 
 
 def noise_image(i: int, sensor: Sensor = SENSOR) -> RangeImage:
@@ -73,12 +73,12 @@ def test_killed_and_stopped_a_run_continues_bit_by_bit(cache: Path, tmp_path: Pa
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     list(run(tiny(STEPS), cache, whole, options=QUIET))
     more = ("--set", f"training.steps={STEPS}", "--save-every", "2")
-    killed = started(cache, broken, random.randint(2, 3), *more)
+    killed = started(cache, broken, random.randint(3, 5), *more)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
     (kept, *_), done = reversed(checkpoints(broken)), len(table(broken))
     assert killed.returncode == -signal.SIGKILL and 2 <= int(kept.name[5:]) <= done < STEPS
-    stopped = started(cache, broken, done + random.randint(1, 2), *more, "--resume")
+    stopped = started(cache, broken, done + random.randint(1, 3), *more, "--resume")
     stopped.send_signal(signal.SIGTERM)
     output, errors = stopped.communicate(timeout=60)
     assert stopped.returncode == 0, errors
