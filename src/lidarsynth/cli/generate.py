@@ -19,7 +19,7 @@ def generate(
     steps: GenerationSteps = None,
     sampler: Sampler = None,
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
-    batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one, as fast.")] = 4,
+    batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one.")] = 4,
     device: Device = "cpu",
     picture: Picture = True,
 ) -> None:

@@ -86,9 +86,9 @@ class ScanModel(ABC):
     ) -> list[RangeImage]:
         """`n` new scans as range images; scan i depends on seed + i only.
 
-        A CPU makes scans one by one, which is as fast, so that there this holds bit by bit for any n and batch_size,
-        with one number of threads; a GPU makes batch_size at once, and there it holds for one batch_size. Other
-        numbers of threads, batches and processors add up in another order: scans differ by rounding.
+        A CPU makes scans one by one, a cascade's grids in whole blocks, so that this holds bit by bit for any n and
+        batch_size, with one number of threads; a GPU makes batch_size at once, and there it holds for one batch_size.
+        Other numbers of threads, batches and processors add up in another order: scans differ by rounding.
 
         labels  the class of each return too, as `with_labels`
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -24,17 +23,9 @@ def grid_of(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     return grid_rows(sensor.height), grid_columns(sensor.width)
 
 
-def blocks(first: int, n: int, size: int, alone: bool) -> Iterator[tuple[int, int]]:
-    """(start, count) of the grids that are made at once for scans `first` .. n - 1.
-
-    From multiples of `size` on, so that a scan is the same wherever one begins; the last ones, which fill no block,
-    each `alone`, or in a whole one.
-    """
-    for start in range(first - first % size, n, size):
-        if start + size <= n or not alone:
-            yield start, size
-        else:
-            yield from ((i, 1) for i in range(max(start, first), n))
+def parts(first: int, stop: int, size: int) -> list[slice]:
+    """Numbers `first` (or 0) to `stop` - 1 of a block of grids, at most `size` at a time: what is filled at once."""
+    return [slice(i, min(i + size, stop)) for i in range(max(first, 0), stop, size)]
 
 
 def placed(

@@ -27,7 +27,7 @@ from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.images import answered, blocks, grid_of, noisy, placed
+from lidarsynth.systems.cascade.images import answered, grid_of, noisy, parts, placed
 from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.description import Description
@@ -122,23 +122,20 @@ class CascadeModel(ScanModel):
         sampler, steps = self._sampler(sampler), STEPS_DEFAULT if steps is None else steps
         if n < 1 or steps < 1 or batch_size < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
-        rows, columns = grid_of(self.sensor)
-        tell = on_step or (lambda: None)
+        (rows, columns), tell = grid_of(self.sensor), on_step or (lambda: None)
         dim, size = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device), self.at_once(batch_size)
-        for start, count in blocks(first, n, GRIDS if size == 1 else size, alone=size == 1):
-            rng, skipped = generators(seed, count, offset=start), max(first - start, 0)
+        count = max(size, GRIDS)
+        for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
+            rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
             told, standing = self._grid_rays(rows, columns, count)
             x_0 = x_1 = noise_like(torch.zeros(count, 3, ROWS, COLUMNS, device=self._device), rng)
             for state in sample(self._coarse(told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
                 x_0 = state.x_s
-                for _ in range(skipped, count, size):
+                for _ in wanted:
                     tell()
             metres, reflectance = self.network.coarse.decode(self.network.settled(x_0, told), standing, dim)
-            for i in range(skipped, min(count, n - start), size):
-                part = slice(i, i + size)
-                yield from self._filled_grids(metres[part], reflectance[part], rows, columns, rng[part])[
-                    : n - start - i
-                ]
+            for part in wanted:
+                yield from self._filled_grids(metres[part], reflectance[part], rows, columns, rng[part])
                 tell()
 
     def resolved(self, how: Filling) -> Filling:
