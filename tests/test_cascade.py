@@ -20,8 +20,10 @@ from lidarsynth.networks.rays import decode_range, encode_range, level_sines, pa
 from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade import model as cascade_model
+from lidarsynth.systems.cascade.images import noisy
 from lidarsynth.systems.cascade.known import spread
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.surfaces import straightened
 
 SMALL = Sensor("small", tuple(np.linspace(5, -25, 24).tolist()), 256, 0.5, 120.0, mount=1.8)
 
@@ -94,6 +96,46 @@ def test_the_plane_candidate_goes_around_the_turn_where_nothing_is_above_or_belo
     errors = [(decode_range(guesses.code[0, k, 12]) - metres[0, 0, 12]).abs()[near].max() for k in (2, 0)]
     assert near.sum() > 20
     assert errors[0] < 0.2 * errors[1] and errors[0] < 0.05
+
+
+def test_what_stands_beside_is_one_surface_where_it_goes_on_straight_and_two_at_an_edge():
+    wall = plane(SMALL, (1.0, 0.7, 0.0), 8.0)
+    metres = torch.where(torch.arange(256) < 30, wall, 2 * wall)  # the wall lies ahead, around columns 100 to 150
+    told = torch.zeros(metres.shape, dtype=torch.bool)
+    told[:, :, 12, ::4] = True
+    rays = rays_of(SMALL, SMALL.blocked_rays())
+    rays = type(rays)(*(part[:, :, :24] if part.shape[2] == 32 else part for part in rays))
+    metres = torch.where(torch.arange(256) < 102, metres, 1.5 * metres)
+    codes = decode_range(candidates(metres, torch.zeros_like(metres), told, told, rays).code)[0, :, 12]
+    for column in (94, 110):
+        assert_close(codes[5:7, column], metres[0, 0, 12, column].expand(2), rtol=2e-3, atol=0)
+    edge = [metres[0, 0, 12, column] for column in (100, 104)]
+    assert_close(codes[5:7, 102], torch.stack(edge), rtol=1e-5, atol=0)
+
+
+def test_generated_grids_get_flat_ground_and_upright_walls_and_keep_their_edges():
+    rows = grid_rows(64)
+    sensor = SENSORS["hdl-64e-kitti"]
+    down = np.radians(np.asarray(sensor.elevations))[rows]
+    ground = np.where(down < -0.06, sensor.mount / np.maximum(-np.sin(down), 1e-3), 0)
+    wall = np.where(np.arange(128) < 64, 12.0, 20.0)[None] / np.cos(down)[:, None]
+    truth = np.where((ground > 0)[:, None] & (ground[:, None] < wall), ground[:, None], wall)
+    truth[:, 20:24] = 0
+    waves = 1 + 0.01 * np.random.default_rng(0).standard_normal((3, *truth.shape))
+    found = straightened(torch.from_numpy(truth * waves).float(), rows, sensor).numpy()
+    empty = np.broadcast_to(truth == 0, found.shape)
+    assert not found[empty].any() and (found[~empty] > 0).all()
+    before, after = (np.abs(part / np.where(truth, truth, 1) - 1)[~empty] for part in (truth * waves, found))
+    assert after.mean() < 0.5 * before.mean() and np.quantile(after, 0.99) < np.quantile(before, 0.99)
+    again = straightened(torch.from_numpy(truth)[None], rows, sensor).numpy()[0]
+    np.testing.assert_allclose(again, truth, rtol=0.03)
+
+
+def test_samples_are_rough_where_something_grows():
+    label = np.repeat(np.array([[9, 15, 17, 9]]), 64, 1).repeat(24, 0)
+    image = RangeImage(np.full(label.shape, 10.0), np.ones(label.shape), np.ones(label.shape, bool), SMALL, label)
+    spread = noisy(image, torch.Generator().manual_seed(0)).range.reshape(24, 4, 64).std((0, 2))
+    assert spread[1] > 0.04 and 0.02 < spread[2] < 0.04 and max(spread[0], spread[3]) < 0.015
 
 
 def test_what_beams_lose_is_added_before_and_taken_off_after():

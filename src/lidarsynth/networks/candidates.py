@@ -17,6 +17,9 @@ REFLECTANCE_CANDIDATES = 6  # mean of the sides, above, below, left, right, near
 LOW, AT_LEAST = 0.01, 0.004  # radians below the horizon from which on a plane may be the ground, and least sine
 SHIFTS = (0, -1, 1, -2, 2)  # rows in which the nearest value at all is sought, the nearer ones first
 NOWHERE = 1 << 30  # eighths of squared pixels
+# One surface to the left and right: how much 1 / range changes from one to the other at most, and how far from straight
+# it goes on to the next known pixel on either side, as a share of that change and of 1 / range. Chosen on streets.
+STEEP, BEND, LEAST = 0.2, 1.0, 0.01
 
 
 class Candidates(NamedTuple):
@@ -49,14 +52,18 @@ class _Around(NamedTuple):
     """The N pixels that are to be filled, and the known ones around each.
 
     place (N,) in the flattened batch; found, distance, source (4, N): whether there is a known pixel above, below, left
-    and right, how many pixels away, and its flat index; nearest (N,): the flat index of the nearest known one within
-    two rows, by those to the left and right in each, where `some` (N,) says that there is one.
+    and right, how many pixels away, and its flat index; beyond, apart (2, N): the flat index of the known one to the
+    left of that to the left, and to the right of that to the right, and how many columns lie between; nearest (N,): the
+    flat index of the nearest known one within two rows, by those to the left and right in each, where `some` (N,) says
+    that there is one.
     """
 
     place: Tensor
     found: Tensor
     distance: Tensor
     source: Tensor
+    beyond: Tensor
+    apart: Tensor
     nearest: Tensor
     some: Tensor
 
@@ -79,13 +86,27 @@ def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
     column = torch.where(both, code[0] * (1 - share) + code[1] * share, one)
     inverse = (1 - share) / r[0].clamp_min(0.1) + share / r[1].clamp_min(0.1)
     turn = distance[2] / (distance[2] + distance[3]).clamp_min(1)
-    beside = (1 - turn) / r[2].clamp_min(0.1) + turn / r[3].clamp_min(0.1)
-    across = torch.where(found[2] & found[3] & ~found[0] & ~found[1], encode_range(1 / beside), column)
+    beside = encode_range(1 / ((1 - turn) / r[2].clamp_min(0.1) + turn / r[3].clamp_min(0.1)))
+    across = torch.where(found[2] & found[3] & ~found[0] & ~found[1], beside, column)
     plane = torch.where(both, encode_range(1 / inverse), across)
     sides = torch.where(found, encode_range(wall), cross)
     grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
     nearest = torch.where(around.some, encode_range(metres.flatten()[around.nearest]), sides[2])
+    flat = _one_surface(metres, around)  # there all that is taken over from the side would make steps
+    sides = torch.cat([sides[:2], torch.where(flat, beside, sides[2:])])
+    nearest = torch.where(flat, beside, nearest)
     return torch.cat([torch.stack([cross, column, plane]), sides, grounds, nearest[None]])
+
+
+def _one_surface(metres: Tensor, around: _Around) -> Tensor:
+    """(N,) bool: whether the pixels to the left and right lie on one plane, along which 1 / range is straight."""
+    left, right, before, after = (1 / metres.flatten()[torch.cat([around.source[2:], around.beyond])]).clamp(max=10)
+    between = (around.distance[2] + around.distance[3]).clamp_min(1)
+    step = right - left
+    bends = ((left - before) / around.apart[0] * between - step, (after - right) / around.apart[1] * between - step)
+    bend = torch.minimum(bends[0].abs(), bends[1].abs())
+    straight = (step.abs() < STEEP * left) & (bend < BEND * step.abs() + LEAST * left)
+    return around.found[2] & around.found[3] & straight
 
 
 def _reflectances(reflectance: Tensor, around: _Around) -> Tensor:
@@ -129,8 +150,21 @@ def _nearest(known: Tensor) -> _Around:
     rows = torch.stack([up - row, down - row]) * width
     columns = torch.stack([_turned(left, width), _turned(right, width)]) - column
     source = place + torch.where(found, torch.cat([rows, columns]), 0)
+    beyond, apart = _beyond(source[2:], sides)
     some, nearest = _nearest_at_all(place, row, sides)
-    return _Around(place, found, distance.float(), source, nearest, some)
+    return _Around(place, found, distance.float(), source, beyond, apart, nearest, some)
+
+
+def _beyond(beside: Tensor, sides: _Sides) -> tuple[Tensor, Tensor]:
+    """`beyond` and `apart` of `_Around`, of the flat indices `beside` (2, N) to the left and right."""
+    width = sides.row.shape[2]
+    column = sides.column.flatten()[beside]
+    start, one = beside - column, torch.tensor([[-1], [1]], device=beside.device)
+    before, after = start + _turned(column + one, width)
+    there = torch.stack([sides.before.flatten()[before], sides.after.flatten()[after]])
+    there = _turned(there, width).clamp(0, width - 1)  # of a row without any it would be outside
+    apart = (column - there) * -one
+    return start + there, (apart + width * (apart <= 0).int()).float()
 
 
 def _nearest_at_all(place: Tensor, row: Tensor, sides: _Sides) -> tuple[Tensor, Tensor]:

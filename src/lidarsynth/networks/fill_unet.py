@@ -17,7 +17,8 @@ NOISES = 3  # per pixel, along a ring, in patches
 INPUTS = 34
 OUTPUTS = (RANGE_CANDIDATES + 2) + (REFLECTANCE_CANDIDATES + 1 + NOISES) + (1 + NOISES)
 PRIOR = 2.0  # score of the first guess before any training
-SNAP = 0.01  # of the code, 3 % of the range: from so near a hypothesis is taken as it is
+# Of the code: from so near a hypothesis is taken as it is, 3 % of the range; from anywhere, in samples.
+SNAP, ANYHOW = 0.01, 2.0
 
 
 class Known(NamedTuple):
@@ -102,8 +103,9 @@ class FillUNet(nn.Module):
     noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
     the grain of a recorded scan. For each pixel the network chooses among `candidates` by a softmax, corrects the
     choice, and says whether the ray returns at all; and, if it has learned `classes`, of which class the surface is.
-    In use, not in training, a choice close to a candidate is that candidate, and ranges have no grain. Reflectances are
-    compared as even beams would read them: what a beam loses (`dimness`) is added before, and taken off after.
+    In use, not in training, a choice closer than `reach` (of the code) to a candidate is that candidate, and ranges
+    have no grain. Reflectances are compared as even beams would read them: what a beam loses (`dimness`) is added
+    before, and taken off after.
     """
 
     def __init__(
@@ -130,7 +132,9 @@ class FillUNet(nn.Module):
         nn.init.zeros_(self.out.bias)
         self.classes = Pointwise(2 * widths[0], classes * patch) if classes else None
 
-    def forward(self, known: Known, rays: Rays, noise: Tensor, classify: bool = False, doubt: bool = False) -> Filled:
+    def forward(
+        self, known: Known, rays: Rays, noise: Tensor, classify: bool = False, doubt: bool = False, reach: float = SNAP
+    ) -> Filled:
         with torch.no_grad():
             even = (known.reflectance + rays.dimness) * known.lit
             guesses = candidates(known.metres, even, known.returned, known.lit, rays)
@@ -150,7 +154,7 @@ class FillUNet(nn.Module):
         out = _to_pixels(self.out(h))
         filled, shares = _assemble(out, guesses, noise, rays.dimness, self.training)
         if not self.training:
-            filled = filled._replace(code=_snapped(filled.code, guesses))
+            filled = filled._replace(code=_snapped(filled.code, guesses, reach))
         if doubt:
             filled = filled._replace(spread=_spread(shares, filled.code, guesses), near=guesses.near)
         if not classify:
@@ -183,10 +187,10 @@ def _assemble(
     return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0), shares
 
 
-def _snapped(code: Tensor, guesses: Candidates) -> Tensor:
+def _snapped(code: Tensor, guesses: Candidates, reach: float) -> Tensor:
     """The nearest hypothesis where one is near, so that what is flat comes out flat: mixtures of several are rough."""
     away, which = (guesses.code - code).abs().min(1, keepdim=True)
-    return torch.where(away < SNAP, guesses.code.gather(1, which), code)
+    return torch.where(away < reach, guesses.code.gather(1, which), code)
 
 
 def _shares(scores: Tensor) -> Tensor:

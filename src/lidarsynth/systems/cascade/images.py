@@ -9,10 +9,19 @@ import torch
 from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rows
 from lidarsynth.streets.hdl64e import shifts
 from lidarsynth.streets.sensor_model import range_noise
+
+# Of the kinds of noise of training, speckle, stripes, patches; chosen by street-1 and -2 (docs/training-default.md).
+GRAIN, GRAIN_REALISED = (1.0, 0.0, 0.0), (0.4, 0.4, 0.4)
+# Metres, standard deviation along the ray by class: leaves have 0.08 and grass 0.035 in streets, of which the fill's
+# own relief has a part. Chosen by street-2 (docs/training-default.md).
+ROUGH = np.zeros(len(CLASSES), np.float32)
+for _name, _metres in {"vegetation": 0.05, "trunk": 0.02, "terrain": 0.03}.items():
+    ROUGH[CLASS_NUMBER[_name]] = _metres
 
 
 def grid_of(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -49,8 +58,12 @@ def placed(
 
 
 def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
-    """The image with a sensor's range noise and each beam's own error, as streets have them."""
-    noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(image.sensor)
+    """The image with a sensor's range noise and each beam's own error, as streets have them; by its labels, if any,
+    also with the roughness of what grows."""
+    spread = range_noise(image.range)
+    if image.label is not None:
+        spread = np.hypot(spread, ROUGH[image.label])
+    noise = torch.randn(image.shape, generator=rng).numpy() * spread + shifts(image.sensor)
     return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask)
 
 

@@ -22,14 +22,24 @@ from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
-from lidarsynth.networks.fill_unet import NOISES, Filled, Known, draw_noise
+from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.images import answered, grid_of, noisy, parts, placed
+from lidarsynth.systems.cascade.holes import repainted, with_grid
+from lidarsynth.systems.cascade.images import (
+    GRAIN,
+    GRAIN_REALISED,
+    answered,
+    grid_of,
+    noisy,
+    parts,
+    placed,
+)
 from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
+from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.known_pixels import sensor_that_made, with_known
@@ -42,8 +52,6 @@ BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
 GRIDS = 8  # of the coarse stage at once: half the time of one by one
-# Of the kinds of noise of training, speckle, stripes, patches; chosen by street-1 and -2 (docs/training-default.md).
-GRAIN, GRAIN_REALISED = (1.0, 0.0, 0.0), (0.4, 0.4, 0.4)
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,6 +142,7 @@ class CascadeModel(ScanModel):
                 for _ in wanted:
                     tell()
             metres, reflectance = self.network.coarse.decode(self.network.settled(x_0, told), standing, dim)
+            metres = straightened(metres, rows, self.sensor)
             for part in wanted:
                 yield from self._filled_grids(metres[part], reflectance[part], rows, columns, rng[part])
                 tell()
@@ -175,7 +184,7 @@ class CascadeModel(ScanModel):
         noise = None if how.method == "conditional" else rng
         filled = self._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         if noise is not None:
-            filled = noisy(filled, rng[0])
+            filled = self._recorded(filled, rng[0])
         if on_step is not None:
             on_step()
         return with_known(filled, image, known, keep_reflectance=lit)
@@ -278,7 +287,12 @@ class CascadeModel(ScanModel):
             images = own._between(np.stack([a.range for a in drawn]), np.stack(shades), rows, whole, rng)
             for image, beam in zip(images, drawn, strict=True):
                 image.reflectance[rows] = beam.reflectance
-        return [noisy(replace(image, sensor=self.sensor), one) for image, one in zip(images, rng, strict=True)]
+        return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(images, rng, strict=True)]
+
+    def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
+        """A sample with its sensor's noise, without the labels that nobody asked for."""
+        image = noisy(image, rng)
+        return image if self.labelled else replace(image, label=None)
 
     def _between(
         self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: list | None
@@ -301,36 +315,15 @@ class CascadeModel(ScanModel):
         grid_of(self.sensor)
         rows, columns, cell = best_known(told)
         rays, standing = self._grid_rays(rows, columns, 1)
-        grid = np.ix_(rows, columns)
-        here = torch.from_numpy(told[grid])[None].to(self._device)
-        coarse = self.network.coarse
+        grid, coarse = np.ix_(rows, columns), self.network.coarse
         values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
+        here = torch.from_numpy(told[grid])[None, None].to(self._device)
         dim = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device)
         known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
-        x_1 = noise_like(known, rng)
-        assert how.steps is not None and how.resamples is not None
-        x_0 = x_1
-        for state in repaint.repaint(
-            self._coarse(rays, guided=False),  # what is known guides; a sector lost erred 6.1 m for 4.3 with both
-            x_1,
-            known,
-            here[:, None],
-            rng,
-            steps=how.steps,
-            resamples=how.resamples,
-            grid=even_log_snr,
-        ):
-            x_0 = state.x_s
-            if on_step is not None:
-                on_step()
-        new_metres, new_reflectance = (part[0].cpu().numpy() for part in coarse.decode(x_0, standing, dim))
-        hole = ~widened(cell)
-        metres, reflectance, told = metres.copy(), reflectance.copy(), told.copy()
-        new_metres = np.where(new_metres > self.sensor.max_range, 0, new_metres)
-        metres[grid] = np.where(hole, new_metres, metres[grid])
-        reflectance[grid] = np.where(hole, new_reflectance, reflectance[grid])
-        told[grid] |= hole
-        return metres, reflectance, told
+        # What is known guides; a sector lost erred 6.1 m for 4.3 with both.
+        x_0 = repainted(self._coarse(rays, guided=False), known, here, rng, how, on_step)
+        new = (part[0].cpu().numpy() for part in coarse.decode(x_0, standing, dim))
+        return with_grid((metres, reflectance, told), grid, ~widened(cell), *new, self.sensor)  # type: ignore[call-arg]
 
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
@@ -358,8 +351,10 @@ class CascadeModel(ScanModel):
         surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
-        grain = GRAIN if surely is None else GRAIN_REALISED
-        filled, rays = self._network(known, rng, weights is not None, self.labelled, grain)
+        drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
+        grain, reach = (GRAIN, ANYHOW) if drawn else (GRAIN_REALISED, SNAP)
+        classify = self.labelled or (drawn and bool(self.experiment.model.classes))
+        filled, rays = self._network(known, rng, weights is not None, classify, grain, reach)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
@@ -373,7 +368,13 @@ class CascadeModel(ScanModel):
 
     @torch.inference_mode()
     def _network(
-        self, known: Known, rng: list | None, doubt: bool = False, classify: bool = False, grain: tuple = GRAIN
+        self,
+        known: Known,
+        rng: list | None,
+        doubt: bool = False,
+        classify: bool = False,
+        grain: tuple = GRAIN,
+        reach: float = SNAP,
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
@@ -386,7 +387,7 @@ class CascadeModel(ScanModel):
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-            return self.network.fill(known, rays, noise.to(device), classify=classify, doubt=doubt), rays
+            return self.network.fill(known, rays, noise.to(device), classify, doubt, reach), rays
 
     @property
     def _blocked(self) -> np.ndarray:

@@ -1,0 +1,61 @@
+"""The surfaces of a generated grid, flat and upright where they nearly are: the noise that is left makes them waves."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.lidar.sensor import Sensor
+
+# Rounds; the share of the range within which a return is of its neighbours' surface, and from beam to beam, where the
+# foot of a wall is no slope; all chosen by street-2 (docs/training-default.md). A step between beams that is less than
+# GROUND of flat ground's is none of the ground.
+ROUNDS, NEAR, CORNER, GROUND = 4, 0.04, 0.03, 0.3
+
+
+def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
+    """(B, R, C) metres of these rows, 0 for no return, straight along rings, between beams, and upright on walls.
+
+    Each return goes half of the way to where its two neighbours would have it, all of this where that is near, less and
+    less up to twice as far. On a plane, 1 / range is straight along a ring, and from beam to beam against the tangent
+    of the elevation.
+    """
+    elevation = metres.new_tensor(np.radians(np.asarray(sensor.elevations)[rows]))[None, :, None]
+    height = elevation.tan()
+    above = (height[:, :-2] - height[:, 1:-1]) / (height[:, :-2] - height[:, 2:])
+    returned = metres > 0
+    inverse = returned / metres.clamp_min(0.1)
+    for _ in range(ROUNDS):
+        inverse = _nearer(inverse, inverse.roll(1, 2), inverse.roll(-1, 2), 0.5, NEAR)
+        inner = _nearer(inverse[:, 1:-1], inverse[:, :-2], inverse[:, 2:], above, CORNER)
+        inverse = torch.cat([inverse[:, :1], inner, inverse[:, -1:]], 1)
+    away = torch.where(returned, elevation.cos() / inverse.clamp_min(1e-6), 0)
+    return _upright(away, height) / elevation.cos()
+
+
+def _nearer(inverse: Tensor, one: Tensor, other: Tensor, share: Tensor | float, near: float) -> Tensor:
+    """1 / range, nearer to the line between two neighbours, of which `share` is the other's; 0 is no return."""
+    away = (one * (1 - share) + other * share - inverse) * ((inverse > 0) & (one > 0) & (other > 0))
+    return inverse + 0.5 * away * _same(away / inverse.clamp_min(1e-6), near)
+
+
+def _upright(away: Tensor, height: Tensor) -> Tensor:
+    """Horizontal distances (B, R, C), nearer to those of the beams above and below that meet the same wall."""
+    ground = (height[:, 1:] / height[:, :-1]).clamp_min(1e-6).log().abs()  # between beams that both look down
+    near = torch.where(height[:, :-1] < 0, (GROUND * ground).clamp(1e-6, NEAR), NEAR)
+    returned, log = away > 0, away.clamp_min(0.1).log()
+    both = returned[:, 1:] & returned[:, :-1]
+    none = torch.zeros_like(log[:, :1])
+    for _ in range(ROUNDS):
+        step = log[:, 1:] - log[:, :-1]
+        weight = both * _same(step, near)
+        down, up = (torch.cat(part, 1) for part in ((weight * step, none), (none, -weight * step)))
+        total = sum(torch.cat(part, 1) for part in ((weight, none), (none, weight)))
+        log = log + (down + up) / (1 + total)
+    return torch.where(returned, log.exp(), 0)
+
+
+def _same(step: Tensor, near: Tensor | float) -> Tensor:
+    """1 for steps up to `near`, less up to twice as many, 0 from there on."""
+    return (2 - step.abs() / near).clamp(0, 1)
