@@ -52,20 +52,17 @@ class _Around(NamedTuple):
     """The N pixels that are to be filled, and the known ones around each.
 
     place (N,) in the flattened batch; found, distance, source (4, N): whether there is a known pixel above, below, left
-    and right, how many pixels away, and its flat index; beyond, apart (2, N): the flat index of the known one to the
-    left of that to the left, and to the right of that to the right, and how many columns lie between; nearest (N,): the
-    flat index of the nearest known one within two rows, by those to the left and right in each, where `some` (N,) says
-    that there is one.
+    and right, how many pixels away, and its flat index; nearest (N,): the flat index of the nearest known one within
+    two rows, by those to the left and right in each, where `some` (N,) says that there is one; sides: of all pixels.
     """
 
     place: Tensor
     found: Tensor
     distance: Tensor
     source: Tensor
-    beyond: Tensor
-    apart: Tensor
     nearest: Tensor
     some: Tensor
+    sides: _Sides
 
 
 def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
@@ -92,18 +89,20 @@ def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
     sides = torch.where(found, encode_range(wall), cross)
     grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
     nearest = torch.where(around.some, encode_range(metres.flatten()[around.nearest]), sides[2])
-    flat = _one_surface(metres, around)  # there all that is taken over from the side would make steps
-    sides = torch.cat([sides[:2], torch.where(flat, beside, sides[2:])])
-    nearest = torch.where(flat, beside, nearest)
+    if torch.compiler.is_exporting() or bool((found[2] & found[3]).any()):
+        flat = _one_surface(metres, around)  # there all that is taken over from the side would make steps
+        sides = torch.cat([sides[:2], torch.where(flat, beside, sides[2:])])
+        nearest = torch.where(flat, beside, nearest)
     return torch.cat([torch.stack([cross, column, plane]), sides, grounds, nearest[None]])
 
 
 def _one_surface(metres: Tensor, around: _Around) -> Tensor:
     """(N,) bool: whether the pixels to the left and right lie on one plane, along which 1 / range is straight."""
-    left, right, before, after = (1 / metres.flatten()[torch.cat([around.source[2:], around.beyond])]).clamp(max=10)
+    beyond, apart = _beyond(around)
+    left, right, before, after = (1 / metres.flatten()[torch.cat([around.source[2:], beyond])]).clamp(max=10)
     between = (around.distance[2] + around.distance[3]).clamp_min(1)
     step = right - left
-    bends = ((left - before) / around.apart[0] * between - step, (after - right) / around.apart[1] * between - step)
+    bends = ((left - before) / apart[0] * between - step, (after - right) / apart[1] * between - step)
     bend = torch.minimum(bends[0].abs(), bends[1].abs())
     straight = (step.abs() < STEEP * left) & (bend < BEND * step.abs() + LEAST * left)
     return around.found[2] & around.found[3] & straight
@@ -150,13 +149,14 @@ def _nearest(known: Tensor) -> _Around:
     rows = torch.stack([up - row, down - row]) * width
     columns = torch.stack([_turned(left, width), _turned(right, width)]) - column
     source = place + torch.where(found, torch.cat([rows, columns]), 0)
-    beyond, apart = _beyond(source[2:], sides)
     some, nearest = _nearest_at_all(place, row, sides)
-    return _Around(place, found, distance.float(), source, beyond, apart, nearest, some)
+    return _Around(place, found, distance.float(), source, nearest, some, sides)
 
 
-def _beyond(beside: Tensor, sides: _Sides) -> tuple[Tensor, Tensor]:
-    """`beyond` and `apart` of `_Around`, of the flat indices `beside` (2, N) to the left and right."""
+def _beyond(around: _Around) -> tuple[Tensor, Tensor]:
+    """The known pixel to the left of that to the left, and to the right of that to the right, (2, N) flat indices; and
+    how many columns lie between."""
+    beside, sides = around.source[2:], around.sides
     width = sides.row.shape[2]
     column = sides.column.flatten()[beside]
     start, one = beside - column, torch.tensor([[-1], [1]], device=beside.device)
