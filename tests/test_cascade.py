@@ -135,7 +135,7 @@ def test_samples_are_rough_where_something_grows():
     label = np.repeat(np.array([[9, 15, 17, 9]]), 64, 1).repeat(24, 0)
     image = RangeImage(np.full(label.shape, 10.0), np.ones(label.shape), np.ones(label.shape, bool), SMALL, label)
     spread = noisy(image, torch.Generator().manual_seed(0)).range.reshape(24, 4, 64).std((0, 2))
-    assert spread[1] > 0.04 and 0.02 < spread[2] < 0.04 and max(spread[0], spread[3]) < 0.015
+    assert spread[1] > 0.06 and 0.02 < spread[2] < 0.04 and max(spread[0], spread[3]) < 0.015
 
 
 def test_what_beams_lose_is_added_before_and_taken_off_after():

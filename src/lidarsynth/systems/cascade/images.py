@@ -17,10 +17,11 @@ from lidarsynth.streets.sensor_model import range_noise
 
 # Of the kinds of noise of training, speckle, stripes, patches; chosen by street-1 and -2 (docs/training-default.md).
 GRAIN, GRAIN_REALISED = (1.0, 0.0, 0.0), (0.4, 0.4, 0.4)
-# Metres, standard deviation along the ray by class: leaves have 0.08 and grass 0.035 in streets, of which the fill's
-# own relief has a part. Chosen by street-2 (docs/training-default.md).
+# Metres, standard deviation along the ray by class, of the STRAYING share of rays that miss the surface the fill has
+# drawn, for a leaf, a stalk or a branch before or behind it. Chosen by street-2 (docs/training-default.md).
+STRAYING = 1 / 3
 ROUGH = np.zeros(len(CLASSES), np.float32)
-for _name, _metres in {"vegetation": 0.05, "trunk": 0.02, "terrain": 0.03}.items():
+for _name, _metres in {"vegetation": 0.14, "trunk": 0.035, "terrain": 0.05}.items():
     ROUGH[CLASS_NUMBER[_name]] = _metres
 
 
@@ -60,10 +61,10 @@ def placed(
 def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
     """The image with a sensor's range noise and each beam's own error, as streets have them; by its labels, if any,
     also with the roughness of what grows."""
-    spread = range_noise(image.range)
+    noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(image.sensor)
     if image.label is not None:
-        spread = np.hypot(spread, ROUGH[image.label])
-    noise = torch.randn(image.shape, generator=rng).numpy() * spread + shifts(image.sensor)
+        strays = torch.rand(image.shape, generator=rng).numpy() < STRAYING
+        noise = noise + torch.randn(image.shape, generator=rng).numpy() * strays * ROUGH[image.label]
     return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask)
 
 
