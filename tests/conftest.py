@@ -5,6 +5,7 @@ torch is imported by the processes that run tests, not by the one that hands the
 
 from __future__ import annotations
 
+import gc
 import lzma
 import os
 import tarfile
@@ -23,10 +24,13 @@ SHARED = Path(os.environ.get("LIDARSYNTH_SHARED", REPO_ROOT.parent / "shared"))
 
 
 def pytest_collection_finish() -> None:
-    """pytest-xdist runs one process per core."""
+    """pytest-xdist runs one process per core; what is imported by now is looked through for garbage no more."""
     import torch
 
     torch.set_num_threads(1)
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
 
 
 @pytest.fixture(scope="session")

@@ -146,7 +146,7 @@ def chamfer_table(
 
 
 def _squared_distances(cells: np.ndarray, others: np.ndarray, size: int) -> np.ndarray:
-    """(N,) float64 whole numbers: of each of the cells `others` (N,), the squared distance to the nearest of `cells`."""
+    """(N,) float64 whole numbers: from each cell of `others` (N,) the squared distance to the nearest of `cells`."""
     try:
         from scipy.ndimage import distance_transform_edt
     except ImportError as error:
