@@ -69,8 +69,10 @@ def bev(
     canvas = _rings(extent, size, background_colour(background), rings)
     column_row = (extent - scan.xyz[:, [1, 0]]) * (size / (2 * extent))
     colour, opacity = _splat(column_row, point_colours(scan, by, max_range), size)
-    blended = canvas * (1 - opacity[..., None]) + colour * opacity[..., None]
-    return _ego_marker(np.rint(blended).astype(np.uint8), size, background)
+    drawn = opacity > 0
+    picture, share = canvas.copy(), opacity[drawn][:, None]
+    picture[drawn] = np.rint(canvas[drawn] * (1 - share) + colour[drawn] * share).astype(np.uint8)
+    return _ego_marker(picture, size, background)
 
 
 def as_scan(points: Scan | RangeImage, max_range: float = 80.0) -> tuple[Scan, float]:
