@@ -22,10 +22,10 @@ demo: $(STAMP)
 	$(BIN)/lidarsynth demo --out demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n logical --dist loadfile
+	$(BIN)/python -m pytest -n logical --dist loadfile --no-loadscope-reorder
 
 quick: $(STAMP)
-	$(BIN)/python -m pytest -n logical --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n logical --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

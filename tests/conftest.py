@@ -1,21 +1,36 @@
-"""What all tests share: the folder of facts, reference tensors and real scans, and one thread per process."""
+"""What all tests share: the folder of facts, reference tensors and real scans, and one thread per process.
 
+torch is imported by the processes that run tests, not by the one that hands them out.
+"""
+
+from __future__ import annotations
+
+import gc
 import lzma
 import os
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import oracle
 import pytest
-import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
 ORACLES = Path(__file__).parent / "oracles"
 SHARED = Path(os.environ.get("LIDARSYNTH_SHARED", REPO_ROOT.parent / "shared"))
 
-torch.set_num_threads(1)  # pytest-xdist runs one process per core
+
+def pytest_collection_finish() -> None:
+    """pytest-xdist runs one process per core; what is imported by now is looked through for garbage no more."""
+    import torch
+
+    torch.set_num_threads(1)
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
 
 
 @pytest.fixture(scope="session")
@@ -44,6 +59,8 @@ def fixture_tensors() -> Callable[[str], dict[str, Tensor]]:
     """`fixture_tensors("r2dm/ops")` -> the tensors of r2dm/ops.safetensors by key, from the shared folder's
     fixtures or, of large ones a sample (`oracle.load`), from tests/oracles; skips where neither has them."""
 
+    import oracle
+
     def load(name: str) -> dict[str, Tensor]:
         return oracle.load(reference_file(f"{name}.safetensors"))
 
@@ -63,6 +80,9 @@ def reference_file(name: str) -> Path:
 def official_file(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """`official_file("r2dm/config_A.pth")` -> a file as the published program writes it, from the shared folder or
     made of the tensors in tests/oracles, where only its averaged weights may be left (both sets are the same then)."""
+    import oracle
+    import torch
+
     folder = tmp_path_factory.mktemp("official")
 
     def make(name: str) -> Path:
@@ -85,4 +105,6 @@ def scan64() -> bytes:
 @pytest.fixture(scope="session")
 def oracle_tensors() -> Callable[[str], dict[str, Tensor]]:
     """`oracle_tensors("lidm_points")` -> the tensors of tests/oracles/lidm_points.safetensors.xz, of every checkout."""
+    import oracle
+
     return lambda name: oracle.load(ORACLES / f"{name}.safetensors.xz")

@@ -18,7 +18,7 @@ from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.fill_unet import FillUNet
-from lidarsynth.networks.running import doubled_max
+from lidarsynth.networks.running import counted
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.filling import Filling
@@ -51,10 +51,12 @@ def run(path: Path, **inputs: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("dim", [0, 1, 2, -1])
-def test_doubling_is_the_doubled_maximum(dim: int):
-    x = torch.randint(-1, 50, (3, 17, 33), generator=torch.Generator().manual_seed(1), dtype=torch.int32)
-    for size in (x.shape[dim], 64):
-        assert torch.equal(doubled_max(x, dim, size, -1), x.cummax(dim).values)
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
+def test_the_last_known_place_by_counting_is_the_running_maximum(dim: int, share: float):
+    known = torch.rand(3, 17, 33, generator=torch.Generator().manual_seed(1)) < share
+    number = torch.arange(known.shape[dim], dtype=torch.int32).view([-1 if i == dim % 3 else 1 for i in range(3)])
+    place = torch.where(known, number, -1)
+    assert torch.equal(counted(place, dim), place.cummax(dim).values)
 
 
 @pytest.mark.slow

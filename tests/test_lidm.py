@@ -211,8 +211,9 @@ def test_weights_are_read_by_name_below_any_prefix_and_all_of_them(tmp_path: Pat
     for path in (folder, plain, archive):
         network = read_sparse(path, "spvcnn")
         assert not network.training
-        assert all(torch.equal(network.state_dict()[name], value) for name, value in weights.items())
-    for kind, path, found in (
+        found = network.state_dict()
+        assert all(torch.equal(found[name], value) for name, value in weights.items())
+    for kind, path, told in (
         ("minkowskinet", plain, "point branch"),
         (
             "spvcnn",
@@ -222,7 +223,7 @@ def test_weights_are_read_by_name_below_any_prefix_and_all_of_them(tmp_path: Pat
         ("spvcnn", saved(tmp_path / "list.ckpt", [1]), "found list"),
         ("spvcnn", saved(tmp_path / "other.ckpt", {"a": torch.ones(2)}), "found 0"),
     ):
-        with pytest.raises(ValueError, match=found) as error:
+        with pytest.raises(ValueError, match=told) as error:
             read_sparse(path, kind)
         assert str(path) in str(error.value) and "\n" not in str(error.value)
     (folder / "config.yaml").write_text("model_params: {cr: 0.5}")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from scipy.stats import wasserstein_distance
 
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.metrics.sensor_report import BeamCounts, compare_beams
@@ -45,6 +44,8 @@ def test_counts_depend_neither_on_batches_nor_on_who_gathered_them():
 
 
 def test_ranges_move_as_far_as_scipy_says():
+    from scipy.stats import wasserstein_distance  # here, for it takes a second to import
+
     first, second = images(4, 1), images(5, 2)
     report = compare_beams(gathered(first), gathered((second[0] * 1.3, second[1])))
     for beam in range(3):

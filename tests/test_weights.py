@@ -244,6 +244,17 @@ def test_words_and_paths_that_are_nothing_get_one_line(tmp_path):
         assert str(source) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_file_of_weights_is_read_into_a_network_that_draws_none(tmp_path):
+    experiment = preset("tiny")
+    network = build_network(experiment)
+    save(tmp_path / "saved", experiment, network)
+    state = torch.get_rng_state()
+    again = load_parts(tmp_path / "saved")[1]
+    assert torch.equal(torch.get_rng_state(), state), "random numbers for weights that the file gives"
+    for name, value in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+
+
 def test_shipped_words_come_first_and_a_path_is_still_reachable(tmp_path, monkeypatch):
     experiment = preset("tiny")
     network = build_network(experiment)

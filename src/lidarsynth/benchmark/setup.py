@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lidarsynth.benchmark.config import Generation, GenerationMethod, Upsampling, UpsamplingMethod, protocols_of
 from lidarsynth.benchmark.store import Store, open_store
@@ -39,6 +41,8 @@ class Setup:
     device: str = "cpu"
     batch_size: int = 1
     on_images: OnImages = None
+    _judges: dict[tuple[str, int], Loaded] = field(default_factory=dict)
+    _seen: dict[tuple[str, int], dict[int, np.ndarray]] = field(default_factory=dict)
 
     def model(self, word: str | None) -> ScanModel | None:
         """The model of a word, None for None."""
@@ -64,6 +68,15 @@ class Setup:
         """The networks of a protocol of pairs: the user's own RangeNet, or the official one where it is here."""
         if self.classes:
             return self.classes
+        if (protocol, width) not in self._judges:
+            self._judges[protocol, width] = self._loaded(protocol, width)
+        return self._judges[protocol, width]
+
+    def seen(self, protocol: str, width: int) -> dict[int, np.ndarray]:
+        """Where `Pairs` keeps the classes that these networks see in the truths, the same for all methods."""
+        return self._seen.setdefault((protocol, width), {})
+
+    def _loaded(self, protocol: str, width: int) -> Loaded:
         loaded = load_networks(get_protocol(protocol), width, self.device)
         return replace(loaded, missing={kind: f"no weights of {kind}: --classes names them" for kind in loaded.missing})
 

@@ -100,7 +100,7 @@ def _judged(setup: Setup, name: str, data: Corrupted, store: Store, stamps: Sequ
     protocol, judges = get_protocol(name), setup.judges(name, data.sensor.width)
 
     def judge() -> dict[str, Any]:
-        pairs, errors = Pairs(protocol, classes_of(judges.networks)), []
+        pairs, errors = Pairs(protocol, classes_of(judges.networks), setup.seen(name, data.sensor.width)), []
         for i in range(len(stamps)):
             truth, known = data[i]
             pairs.update([store.image(i)], [truth])

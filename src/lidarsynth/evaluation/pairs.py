@@ -31,12 +31,18 @@ from lidarsynth.networks.rangenet import RangeNet
 class Pairs:
     """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None.
 
+    `seen`, where given, keeps the classes of each truth by its hash, for others that are compared with the same ones.
     Of bounded size but for a few numbers per pair; `merge` adds what another process gathered, `state` and `restore`
     are for files.
     """
 
-    def __init__(self, protocol: EvaluationProtocol, classes: RangeNet | None = None):
-        self.protocol, self.classes = protocol, classes
+    def __init__(
+        self,
+        protocol: EvaluationProtocol,
+        classes: RangeNet | None = None,
+        seen: dict[int, np.ndarray] | None = None,
+    ):
+        self.protocol, self.classes, self.seen = protocol, classes, seen
         self.errors: list[Errors] = []
         self.chamfer: list[float] | None = [] if any(row.measure == "chamfer" for row in protocol.rows) else None
         self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
@@ -52,8 +58,7 @@ class Pairs:
             self.lit |= bool(result.reflectance.any())
             self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:
-            labels = [self._labels(images) for images in (truths, results)]
-            self.confusion += confusion_matrix(labels[0], labels[1])
+            self.confusion += confusion_matrix(self._labels_of_truths(truths), self._labels(results))
 
     def _add_digests(self, digests: Sequence[int]) -> None:
         self._digests = [(own + its) % (1 << 128) for own, its in zip(self._digests, digests, strict=True)]
@@ -81,8 +86,17 @@ class Pairs:
         self._add_digests([int(digest, 16) for digest in state["digests"]])
 
     def __getstate__(self) -> dict[str, Any]:
-        """For another process: all but the network."""
-        return {**vars(self), "classes": None}
+        """For another process: all but the network and what it said."""
+        return {**vars(self), "classes": None, "seen": None}
+
+    def _labels_of_truths(self, images: Sequence[RangeImage]) -> np.ndarray:
+        if self.seen is None:
+            return self._labels(images)
+        keys = [hash_of(image) for image in images]
+        for key, image in zip(keys, images, strict=True):
+            if key not in self.seen:
+                self.seen[key] = self._labels([image])[0].astype(np.uint8)
+        return np.stack([self.seen[key] for key in keys]).astype(np.int64)
 
     @torch.no_grad()
     def _labels(self, images: Sequence[RangeImage]) -> np.ndarray:

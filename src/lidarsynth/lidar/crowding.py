@@ -6,14 +6,13 @@ from itertools import product
 
 import numpy as np
 
-from lidarsynth.lidar.cones import onto_z
 from lidarsynth.lidar.ground import leaning, normal
-from lidarsynth.lidar.recognition import elevations_of
 
 FAR = 12.0  # metres, or half the points where fewer are as far: nearer ones show the carrier's motion in a turn most
 POINTS, FEW = 8_000, 3_000  # of a scan are enough; to look for a tilt
 REACH, STEP = 3.0, 0.05  # metres above and below the origin, in which steps
 BIN, AROUND = 0.05, 41  # degrees; bins around each that say how many points there were without beams
+AT_ONCE = 32  # axes: their elevations stay in a processor's cache
 BEAMS = 8  # at least, in different places: one wall or level is none
 VIEW = (-35.0, 25.0)  # degrees that spinning sensors look
 NEAR = 0.45  # metres: beams of an HDL-64E leave 0.2 m above its origin
@@ -34,9 +33,9 @@ def stand_of_beams(xyz: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float] |
     sought along z at heights within 3 m, and at the origin about axes within 4 degrees of the ground's normal.
     """
     points = _far(xyz)
-    points = points[np.random.default_rng(seed).permutation(len(points))[:POINTS]].astype(np.float64)
+    points = points[np.random.default_rng(seed).permutation(len(points))[:POINTS]].astype(np.float32)
     heights, up = np.arange(-REACH, REACH + STEP / 2, STEP), np.array([0.0, 0.0, 1.0])
-    contrast = np.array([_contrast(points - [0, 0, height]) for height in heights])
+    contrast = _contrasts(points, np.tile(up, (len(heights), 1)), heights)
     here, best = contrast[np.abs(heights) < NEAR].max(), int(contrast.argmax())
     if here >= CROWDED and contrast[best] < CLEARLY * here:
         return up, 0.0
@@ -55,26 +54,52 @@ def _leaning(points: np.ndarray, road: np.ndarray) -> tuple[np.ndarray, float]:
     """The axis about which far points crowd most, near the ground's normal `road`, and their contrast about it."""
     slopes = np.degrees(np.arctan(road[:2] / road[2]))
     side = np.arange(-TIP, TIP + TIPS[0] / 2, TIPS[0])
-    few = [(_about(points[:FEW], slopes[0] + a, slopes[1] + b, lift), lift, slopes[0] + a, slopes[1] + b)
-           for lift, a, b in product(ORIGINS, side, side)]  # fmt: skip
-    crowding, lift, x, y = max(few)
+    tips = [(lift, slopes[0] + a, slopes[1] + b) for lift, a, b in product(ORIGINS, side, side)]
+    _, (lift, x, y) = _most_crowded(points[:FEW], tips)
+    crowding = 0.0
     for step in TIPS[1:]:
-        around = [(x + i * step, y + j * step) for i, j in product(range(-2, 3), repeat=2)]
-        crowding, x, y = max((_about(points, a, b, lift), a, b) for a, b in around)
+        tips = [(lift, x + i * step, y + j * step) for i, j in product(range(-2, 3), repeat=2)]
+        crowding, (_, x, y) = _most_crowded(points, tips)
     return leaning(x, y), crowding
 
 
-def _about(points: np.ndarray, x: float, y: float, lift: float) -> float:
-    return _contrast(points @ onto_z(leaning(x, y)).T - [0, 0, lift])
+def _most_crowded(points: np.ndarray, tips: list[tuple[float, float, float]]) -> tuple[float, tuple[float, ...]]:
+    """The greatest contrast about axes that lean by x and y degrees, from `lift` metres along them, and its tip."""
+    contrast = _contrasts(points, np.array([leaning(x, y) for _, x, y in tips]), np.array([tip[0] for tip in tips]))
+    best = int(contrast.argmax())
+    return float(contrast[best]), tips[best]
 
 
-def _contrast(points: np.ndarray) -> float:
-    above = points[np.abs(points[:, 2]) > LEVEL]  # seen from its own level, flat ground crowds too
-    count = np.histogram(elevations_of(above), np.arange(VIEW[0], VIEW[1] + BIN / 2, BIN))[0].astype(np.float64)
-    if count.sum() < max(len(points) / 3, 1):
-        return 0.0
-    smooth = np.convolve(count, np.full(AROUND, 1 / AROUND), "same")
+def _contrasts(points: np.ndarray, axes: np.ndarray, lifts: np.ndarray) -> np.ndarray:
+    """(A,) contrasts of points (N, 3) about axes (A, 3) through the origin, from `lifts` (A,) metres along them."""
+    square = np.einsum("ni,ni->n", points, points)
+    return np.concatenate([_of_counts(_counts(points, square, axes[i : i + AT_ONCE], lifts[i : i + AT_ONCE]))
+                           for i in range(0, len(axes), AT_ONCE)])  # fmt: skip
+
+
+def _counts(points: np.ndarray, square: np.ndarray, axes: np.ndarray, lifts: np.ndarray) -> np.ndarray:
+    """(A, bins) how many points have the elevations about each axis, and last, how many have none that counts.
+
+    |p - l a|^2 = |p|^2 - 2 l p.a + l^2, and the sine of the elevation is (p.a - l) by its root. `square` (N,) is |p|^2.
+    """
+    lift = lifts.astype(np.float32)[:, None]
+    level = axes.astype(np.float32) @ points.T  # (A, N)
+    sine = (level - lift) / np.sqrt(np.maximum(square - lift * (2 * level - lift), 1e-6))
+    bins = round((VIEW[1] - VIEW[0]) / BIN)
+    at = np.arcsin(np.clip(sine, -1, 1)) * np.float32(np.degrees(1) / BIN) - np.float32(VIEW[0] / BIN)
+    # Seen from its own level, flat ground crowds too.
+    at = np.where((np.abs(level - lift) > LEVEL) & (at >= 0) & (at < bins), at, bins).astype(np.intp)
+    at += np.arange(len(axes))[:, None] * (bins + 1)
+    return np.bincount(at.ravel(), minlength=len(axes) * (bins + 1)).reshape(len(axes), bins + 1)
+
+
+def _of_counts(counts: np.ndarray) -> np.ndarray:
+    """(A,) contrasts of histograms (A, bins and what is in none)."""
+    count = counts[:, :-1].astype(np.float64)
+    total = np.pad(count, ((0, 0), (AROUND // 2 + 1, AROUND // 2))).cumsum(axis=1)
+    smooth = (total[:, AROUND:] - total[:, :-AROUND]) / AROUND
     crowded = (count > 1.5 * smooth) & (count >= 10)
-    if np.count_nonzero(crowded[1:] & ~crowded[:-1]) < BEAMS:
-        return 0.0
-    return float((count @ count) / (smooth @ smooth))
+    beams = np.count_nonzero(crowded[:, 1:] & ~crowded[:, :-1], axis=1)
+    contrast = (count**2).sum(axis=1) / np.maximum((smooth**2).sum(axis=1), 1e-9)
+    enough = count.sum(axis=1) >= np.maximum(counts.sum(axis=1) / 3, 1)
+    return np.where(enough & (beams >= BEAMS), contrast, 0.0)

@@ -121,17 +121,12 @@ def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:
     """Mean distance of the rings from the nearest beams, in units of the spacing there; None if two meet one beam."""
     if len(beams) >= 0.9 * sensor.height or sensor.height < 32:
         return None
-    table, spacing = np.array(sensor.elevations), _spacing(sensor)
-    offsets = sensor.offsets or (0.0,) * sensor.height
-    rows, errors = set(), []
-    for points in beams:
-        plain = float(_elevation(points, 0.0))
-        near = np.argsort(np.abs(table - plain))[:16]  # an offset of 0.2 m moves a near ring by a few beams
-        distance = {int(row): float(abs(_elevation(points, offsets[row]) - table[row])) / spacing[row] for row in near}
-        row = min(distance, key=lambda r: distance[r])
-        rows.add(row)
-        errors.append(min(distance[row], 1.0))
-    return float(np.mean(errors)) if len(rows) == len(beams) else None
+    table, plain = np.array(sensor.elevations), _elevation(beams, 0.0)[:, None]
+    near = np.argsort(np.abs(table - plain), axis=1)[:, :16]  # an offset of 0.2 m moves a near ring by a few beams
+    seen = _elevation(beams[:, None], np.array(sensor.offsets)[near]) if sensor.offsets else plain
+    distance = np.abs(seen - table[near]) / _spacing(sensor)[near]
+    rows = near[np.arange(len(near)), distance.argmin(axis=1)]
+    return float(np.minimum(distance.min(axis=1), 1.0).mean()) if len(set(rows)) == len(beams) else None
 
 
 def _elevation(points: np.ndarray, offset: np.ndarray | float) -> np.ndarray:

@@ -230,7 +230,8 @@ def jensen_shannon_distance(p: Array, q: Array) -> float:
     if p.shape != q.shape or any(not (c.sum() > 0) or c.min() < 0 for c in counts):
         found = [(tuple(v.shape), float(c.sum())) for v, c in zip((p, q), counts, strict=True)]
         raise ValueError(f"expected counts of one shape, found shapes and sums {found}")
-    left, right = (c / c.sum() for c in counts)
+    some = (counts[0] > 0) | (counts[1] > 0)  # most cells of a map are empty on both sides
+    left, right = (c[some] / c.sum() for c in counts)
     middle = (left + right) / 2
-    divergence = sum(torch.special.xlogy(c, c / middle).nan_to_num(0).sum() for c in (left, right)) / 2
+    divergence = sum(torch.special.xlogy(c, c / middle).sum() for c in (left, right)) / 2
     return math.sqrt(max(float(divergence), 0.0))

@@ -139,20 +139,21 @@ def chamfer_table(
         cells, starts = np.concatenate(others), np.cumsum([0, *map(len, others)])[:-1]
         counts = np.diff([*starts, len(cells)])
         for i, scan in enumerate(own):
-            rows[i] += np.add.reduceat(_squared_distances(scan, size)[cells], starts) / counts
+            rows[i] += np.add.reduceat(_squared_distances(scan, cells, size), starts) / counts
             if on_scan:
                 on_scan(done + i + 1, total)
     return table / (2 * size**2)
 
 
-def _squared_distances(cells: np.ndarray, size: int) -> np.ndarray:
-    """(size * size,) float64 whole numbers: of every cell, the squared distance to the nearest of `cells`, in cells."""
+def _squared_distances(cells: np.ndarray, others: np.ndarray, size: int) -> np.ndarray:
+    """(N,) float64 whole numbers: from each cell of `others` (N,) the squared distance to the nearest of `cells`."""
     try:
         from scipy.ndimage import distance_transform_edt
     except ImportError as error:
         raise ImportError("distances of cells need scipy: pip install 'lidarsynth[metrics]'") from error
     free = np.ones(size * size, bool)
     free[cells] = False
-    distances = distance_transform_edt(free.reshape(size, size))
-    assert isinstance(distances, np.ndarray)
-    return np.rint(np.square(distances, out=distances), out=distances).ravel()
+    nearest = distance_transform_edt(free.reshape(size, size), return_distances=False, return_indices=True)
+    assert isinstance(nearest, np.ndarray)
+    x, y = nearest.reshape(2, -1)[:, others].astype(np.float64)
+    return (x - others // size) ** 2 + (y - others % size) ** 2

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.networks.rays import Rays, encode_range
-from lidarsynth.networks.running import running_max, size_of
+from lidarsynth.networks.running import last_known
 
 # The mean of the four sides by nearness; between the beams above and below, linear in code or in 1 / range; the surface
 # above or below as a wall; the one to the left or right; the ground above or below as a plane; the nearest at all.
@@ -205,10 +205,10 @@ def _sides(known: Tensor) -> _Sides:
     height, width = known.shape[1:]
     rows = torch.arange(height, dtype=torch.int32, device=known.device)[:, None].expand(known.shape)
     columns = torch.arange(width, dtype=torch.int32, device=known.device).expand(known.shape)
-    above = _last(torch.where(known, rows, -1), 1)
-    below = height - 1 - _last(torch.where(known, height - 1 - rows, -1).flip(1), 1).flip(1)
-    before = _last(torch.where(known, columns, -1), 2)
-    after = width - 1 - _last(torch.where(known, width - 1 - columns, -1).flip(2), 2).flip(2)
+    above = last_known(torch.where(known, rows, -1), 1)
+    below = height - 1 - last_known(torch.where(known, height - 1 - rows, -1).flip(1), 1).flip(1)
+    before = last_known(torch.where(known, columns, -1), 2)
+    after = width - 1 - last_known(torch.where(known, width - 1 - columns, -1).flip(2), 2).flip(2)
     before = torch.where(before < 0, before[..., -1:] - width, before)
     after = torch.where(after >= width, after[..., :1] + width, after)
     return _Sides(rows, columns, above, below, before, after)
@@ -217,8 +217,3 @@ def _sides(known: Tensor) -> _Sides:
 def _turned(column: Tensor, width: int) -> Tensor:
     """Columns of -width to 2 width - 1 as those of the turn."""
     return column + width * ((column < 0).int() - (column >= width).int())
-
-
-def _last(place: Tensor, dim: int) -> Tensor:
-    """The last known place up to each, -1 for none."""
-    return running_max(place, dim, size_of(place, dim), -1)

@@ -6,7 +6,7 @@ Images are equirectangular: the width is circular, the height has ends. None of 
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.networks.running import running_max
+from lidarsynth.networks.running import last_known
 
 METHODS = ("nearest", "bilinear", "bicubic")
 
@@ -134,8 +134,8 @@ def _sides(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Along the last axis: every position, the last known one up to it (or -1), the first known from it (or size)."""
     size = mask.shape[-1]
     position = torch.arange(size, device=mask.device, dtype=torch.int32)
-    before = running_max(torch.where(mask, position, -1), -1, size, -1)
-    after = size - 1 - running_max(torch.where(mask.flip(-1), position, -1), -1, size, -1).flip(-1)
+    before = last_known(torch.where(mask, position, -1), -1)
+    after = size - 1 - last_known(torch.where(mask.flip(-1), position, -1), -1).flip(-1)
     return position, before, after
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 from lidarsynth.networks.archive import read_yaml, weight_files
 from lidarsynth.networks.rangenet import MEANS, STDS, RangeNet
-from lidarsynth.networks.tensors import load_weights, read_state
+from lidarsynth.networks.tensors import Undrawn, load_weights, read_state
 
 # File of an archive -> the most bytes it may have; RangeNet-53's encoder has 163 MB.
 FILES: dict[str, int] = {
@@ -52,7 +53,8 @@ def _filled(
     path: Path, files: Mapping[str, bytes], config: str, layers: int, means: Sequence[float], stds: Sequence[float]
 ) -> RangeNet:
     try:
-        network = RangeNet(layers, means=means, stds=stds)
+        with Undrawn() if "segmentation_head" in files else nullcontext():
+            network = RangeNet(layers, means=means, stds=stds)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {config}: {error}") from None
     parts = {"backbone": network.backbone, "segmentation_decoder": network.decoder, "segmentation_head": network.head}

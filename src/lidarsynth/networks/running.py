@@ -1,4 +1,4 @@
-"""The largest value so far along an axis; an exported network has no operator for it, and takes slices and maxima."""
+"""The last known place up to each along an axis; an exported network has no running maximum, and counts instead."""
 
 from __future__ import annotations
 
@@ -9,28 +9,17 @@ from torch.nn import functional as F
 LONGEST = 4096  # columns of an exported network whose number of columns is open
 
 
-def running_max(x: Tensor, dim: int, size: int, least: int) -> Tensor:
-    """`x.cummax(dim).values` of an integer tensor; in an export by doubling.
+def last_known(place: Tensor, dim: int) -> Tensor:
+    """The last known place up to each along an axis, -1 before the first.
 
-    size   the axis' length, or LONGEST where it is not known yet
-    least  a value below all others
+    place  integers: where a place is known, its number along `dim`, else -1
     """
-    if not torch.compiler.is_exporting():
-        return x.cummax(dim).values
-    return doubled_max(x, dim, size, least)
+    return counted(place, dim) if torch.compiler.is_exporting() else place.cummax(dim).values
 
 
-def doubled_max(x: Tensor, dim: int, size: int, least: int) -> Tensor:
-    """`running_max` by doubling: maxima with what lies 1, 2, 4, ... before."""
-    before = 2 * (x.ndim - 1 - dim % x.ndim)  # places of `pad` that belong to later axes
-    step = 1
-    while step < size:
-        shifted = F.pad(x, (*[0] * before, step, 0), value=least).narrow(dim, 0, x.shape[dim])
-        x = torch.maximum(x, shifted)
-        step *= 2
-    return x
-
-
-def size_of(x: Tensor, dim: int) -> int:
-    """The axis' length; LONGEST in an export that leaves it open."""
-    return x.shape[dim] if isinstance(x.shape[dim], int) else LONGEST
+def counted(place: Tensor, dim: int) -> Tensor:
+    """`last_known` by a table: the n-th known place stands at n, and whoever has n known ones up to it looks there."""
+    before = (*[0] * (2 * (place.ndim - 1 - dim % place.ndim)), 1, 0)  # `pad` begins with the last axis
+    count = (place >= 0).cumsum(dim, dtype=torch.int64)
+    table = F.pad(place, before, value=-1).scatter(dim, torch.where(place >= 0, count, 0), place)
+    return table.gather(dim, count)

@@ -116,7 +116,7 @@ class Level:
         For what is dropped at once: fresh memory costs about as much time as what is done in it.
         """
         kept = self._room.get(kind)
-        if kept is None or len(kept) < rows * columns or kept.dtype != like.dtype:
+        if kept is None or kept.numel() < rows * columns or kept.dtype != like.dtype:
             kept = self._room[kind] = like.new_empty(rows * columns)
         return kept[: rows * columns].view(rows, columns)
 
@@ -155,14 +155,13 @@ def convolve(features: Tensor, level: Level, kernel: Tensor, bias: Tensor | None
         return torch.addmm(bias, features, kernel)
     rows, sums = level.neighbours
     products = level.room("products", len(sums.order), kernel.shape[2], features)
-    torch.addmm(bias, features, kernel[CENTRE], out=products[: len(level)])
-    start = len(level)
-    for k, of_offset in rows:
-        end = start + len(of_offset)
-        inputs = level.room("inputs", len(of_offset), features.shape[1], features)
-        torch.index_select(features, 0, of_offset, out=inputs)
-        torch.mm(inputs, kernel[k], out=products[start:end])
-        start = end
+    counts = [of_offset.numel() for _, of_offset in rows]
+    inputs = level.room("inputs", max(counts, default=0), features.shape[1], features)
+    matrices, parts = kernel.unbind(), products.split([len(level), *counts])
+    torch.addmm(bias, features, matrices[CENTRE], out=parts[0])
+    for (k, of_offset), count, part in zip(rows, counts, parts[1:], strict=True):
+        torch.index_select(features, 0, of_offset, out=inputs[:count])
+        torch.mm(inputs[:count], matrices[k], out=part)
     return sums.of(products)
 
 

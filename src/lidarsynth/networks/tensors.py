@@ -10,10 +10,22 @@ from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from lidarsynth.networks.finite import not_finite
 
 SPREAD = 1 << 28  # bytes that a repeated number may claim
+DRAWS = {Tensor.uniform_, Tensor.normal_, nn.init.uniform_, nn.init.normal_, nn.init.kaiming_uniform_}
+
+
+class Undrawn(TorchFunctionMode):
+    """`with Undrawn():` modules are built without drawing weights: for those that a file then gives, all of them."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func in DRAWS:
+            return args[0] if args else kwargs["tensor"]
+        return func(*args, **kwargs)
 
 
 def read_pickle(file: str | Path | BinaryIO, where: str, advice: str = "") -> Any:

@@ -69,8 +69,10 @@ def bev(
     canvas = _rings(extent, size, background_colour(background), rings)
     column_row = (extent - scan.xyz[:, [1, 0]]) * (size / (2 * extent))
     colour, opacity = _splat(column_row, point_colours(scan, by, max_range), size)
-    blended = canvas * (1 - opacity[..., None]) + colour * opacity[..., None]
-    return _ego_marker(np.rint(blended).astype(np.uint8), size, background)
+    drawn = opacity > 0
+    picture, share = canvas.copy(), opacity[drawn][:, None]
+    picture[drawn] = np.rint(canvas[drawn] * (1 - share) + colour[drawn] * share).astype(np.uint8)
+    return _ego_marker(picture, size, background)
 
 
 def as_scan(points: Scan | RangeImage, max_range: float = 80.0) -> tuple[Scan, float]:
@@ -82,16 +84,14 @@ def as_scan(points: Scan | RangeImage, max_range: float = 80.0) -> tuple[Scan, f
 
 def _splat(column_row: np.ndarray, colours: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean colour (size, size, 3) and opacity (size, size) in [0, 1] of Gaussian splats of 3 x 3 pixels."""
-    centre = np.floor(column_row).astype(np.int32)
-    total = np.zeros((4, size * size))
-    for shift in np.ndindex(3, 3):
-        pixel = centre + np.array(shift) - 1
-        inside = np.all((pixel >= 0) & (pixel < size), axis=1)
-        weight = np.exp(-np.sum((pixel[inside] + 0.5 - column_row[inside]) ** 2, axis=1) / (2 * 0.6**2))
-        index = pixel[inside, 1] * size + pixel[inside, 0]
-        for channel in range(3):
-            total[channel] += np.bincount(index, weight * colours[inside, channel], size * size)
-        total[3] += np.bincount(index, weight, size * size)
+    nearest = np.floor(column_row).astype(np.int32)
+    pixel = nearest + np.arange(-1, 2)[:, None, None]  # (3, N, 2): columns and rows of the 3 x 3
+    weight = np.exp(-((pixel + 0.5 - column_row) ** 2) / (2 * 0.6**2)) * ((pixel >= 0) & (pixel < size))
+    weights = (weight[:, None, :, 0] * weight[None, :, :, 1]).reshape(9, -1)
+    pixel = pixel.clip(0, size - 1)  # those outside weigh nothing
+    index = (pixel[None, :, :, 1] * size + pixel[:, None, :, 0]).ravel()
+    parts = [(weights * colours[:, channel]).ravel() for channel in range(3)]
+    total = np.stack([np.bincount(index, part, size * size) for part in (*parts, weights.ravel())])
     mean = total[:3] / np.maximum(total[3], 1e-9)
     return mean.T.reshape(size, size, 3), 1 - np.exp(-1.6 * total[3]).reshape(size, size)
 
@@ -127,5 +127,5 @@ def save_png(path: str | Path, rgb: np.ndarray) -> Path:
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
         raise ValueError(f"rgb must be (H, W, 3) uint8 with pixels, got {rgb.shape} {rgb.dtype}")
     with whole_file(path) as scratch:
-        Image.fromarray(rgb).save(scratch, format="PNG", compress_level=6)
+        Image.fromarray(rgb).save(scratch, format="PNG", compress_level=3)  # as small as 6, in half the time
     return Path(path)

@@ -14,7 +14,7 @@ from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.finite import refuse_not_finite
-from lidarsynth.networks.tensors import load_weights
+from lidarsynth.networks.tensors import Undrawn, load_weights
 from lidarsynth.systems.cascade.family import CASCADE
 from lidarsynth.systems.diffusion.family import CONDITIONAL_UNET, EFFICIENT_UNET, REFINENET
 from lidarsynth.systems.gan.family import GAN
@@ -121,7 +121,8 @@ def official_readers() -> dict[str, Official]:
 def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
     """A saved model: its experiment and its network. Raises ValueError when either file is not as it should be."""
     experiment, path = read_experiment(folder), Path(folder) / WEIGHTS
-    network = build_network(experiment)
+    with Undrawn():
+        network = build_network(experiment)
     try:
         check_regular(path, LARGEST_WEIGHTS)
         weights = load_file(path)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
-from lidarsynth.networks.tensors import load_weights, plain
+from lidarsynth.networks.tensors import Undrawn, load_weights, plain
 from lidarsynth.systems.diffusion.official_r2dm import experiment_of
 from lidarsynth.systems.table import build_network, official_readers
 from lidarsynth.systems.upsampling.official import is_keras, read_keras
@@ -42,7 +42,8 @@ def read_official(path: str | Path, ema: bool = True) -> tuple[Experiment, nn.Mo
         _check(checkpoint)
         weights = {key.removeprefix("model."): v for key, v in checkpoint[name].items() if key != "_dummy"}
         experiment = experiment_of(checkpoint, weights.get("coords"), path.stem)
-        network = build_network(experiment)
+        with Undrawn():
+            network = build_network(experiment)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     load_weights(network, weights, f"{path}: {name}")

@@ -20,7 +20,7 @@ from lidarsynth.experiment.record import Adversarial, Card, Data, Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.networks.gan.iros21 import generator_weights
-from lidarsynth.networks.tensors import load_weights
+from lidarsynth.networks.tensors import Undrawn, load_weights
 from lidarsynth.systems.gan.build import generator
 
 
@@ -73,7 +73,8 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
     title, data = ("IROS 2021", "KITTI Odometry") if first_release else ("WACV 2023", "KITTI raw")
     history = f"official {experiment.model.network} checkpoint ({title}), step {checkpoint.get('step', 'not told')}"
     experiment = replace(experiment, name=name, card=Card(LICENCE, data, (history,)))
-    network = generator(experiment, build_sensor(experiment)).eval()
+    with Undrawn():
+        network = generator(experiment, build_sensor(experiment)).eval()
     weights = {f"generator.{key}": value for key, value in state.items()}
     if experiment.model.network == "dusty-v2":
         weights["angles"] = checkpoint["angle"]
