@@ -34,10 +34,11 @@ class Caster:
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         self.normal = normal.astype(np.float32)
         self.level = np.einsum("ij,ij->i", self.normal, corners[:, 0])
+        self._axes = np.ascontiguousarray(self.normal.T)
 
     def faces(self, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """(N,) int32: the number of the triangle that each ray first meets, -1 for none; rays as in `cast`."""
-        return self._faces(np.ascontiguousarray(origins), np.ascontiguousarray(rays))
+        return self._faces(origins, rays)
 
     def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
         """Where each ray first meets the scene.
@@ -48,9 +49,10 @@ class Caster:
         """
         face = self.faces(origins, rays)
         triangle = face.astype(np.intp)
-        normal = self.normal.take(triangle, axis=0)
-        towards = np.einsum("ij,ij->i", normal, rays)
-        gap = self.level[triangle] - np.einsum("ij,ij->i", normal, origins)
+        nx, ny, nz = (axis.take(triangle) for axis in self._axes)
+        (x, y, z), (dx, dy, dz) = origins.T, rays.T
+        towards = nx * dx + ny * dy + nz * dz
+        gap = self.level.take(triangle) - (nx * x + ny * y + nz * z)
         hit = (face >= 0) & (towards != 0)
         distance = np.divide(gap, towards, out=np.full(len(rays), np.inf, np.float32), where=hit)
         return face, distance, np.abs(towards)
@@ -63,4 +65,5 @@ def one_by_one(corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.nda
 
     scene = EmbreeScene()
     TriangleMesh(scene, corners)
-    return lambda origins, rays: scene.run(origins, rays, query="INTERSECT")
+    whole = np.ascontiguousarray
+    return lambda origins, rays: scene.run(whole(origins), whole(rays), query="INTERSECT")

@@ -148,15 +148,14 @@ def sense(
     surface = np.where(face < 0, np.float32(np.inf), distance + depth / np.maximum(cosine, 0.12))
     surface_label = np.where(face < 0, 0, label)
     steady = _steady(face, lasers.number)
-    through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
-    if through.any():
-        when = None if times is None else times[through]
-        where = np.flatnonzero(through)
-        starts, beams = origins.take(where, axis=0), rays.take(where, axis=0)
-        far = _behind(world, caster, starts, beams, distance[through], when)
+    where = np.flatnonzero((0.8 * steady + 0.2 * chance[0] < TABLE[:, 5].take(material)) & (face >= 0))
+    if len(where):
+        when = None if times is None else times[where]
+        starts, beams = origins.T.take(where, axis=1).T, rays.T.take(where, axis=1).T
+        far = _behind(world, caster, starts, beams, distance.take(where), when)
         for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
-            mine[through] = theirs
-    optics = eye.table.take(material, axis=0)
+            mine[where] = theirs
+    optics = eye.table.T.take(material, axis=1).T
     strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
@@ -205,22 +204,31 @@ def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.nda
     table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
         table[NUMBER[name]] = rough * factor
-    return np.hypot(table[material], range_noise(distance))
+    spread, roughness = range_noise(distance), table.take(material)
+    rough = np.flatnonzero(roughness)
+    spread[rough] = np.hypot(roughness.take(rough), spread.take(rough))
+    return spread
 
 
 def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
     """Material, label, tint and depth behind the face of N hits; misses get the last triangle's."""
     hit, triangle = face >= 0, face.astype(np.intp)
-    kind, material, label = world.kind[triangle], world.material[triangle], world.label[triangle]
-    tint, depth = world.tint[triangle], np.zeros(len(face), np.float32)
+    kind, material, label, tint = (of.take(triangle) for of in (world.kind, world.material, world.label, world.tint))
+    depth = np.zeros(len(face), np.float32)
     low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
-    spot = origins.take(low, axis=0) + rays.take(low, axis=0) * distance[low, None]
-    material[low], label[low], wear, depth[low] = world.ground.surface(spot[:, 0], spot[:, 1], kind[low] == SLAB)
-    tint[low] = wear / TABLE[material[low], 1]
+    x, y, _ = _spots(origins, rays, distance, low)
+    stuff, words, wear, depth[low] = world.ground.surface(x, y, kind.take(low) == SLAB)
+    material[low], label[low], tint[low] = stuff, words, wear / TABLE[:, 1].take(stuff)
     wall = np.flatnonzero(hit & (kind == FRONT))
-    spot = origins.take(wall, axis=0) + rays.take(wall, axis=0) * distance[wall, None]
-    material[wall], depth[wall] = facades.shade(spot, world.fronts.take(world.front[triangle[wall]], axis=0))
+    rows = world.fronts.T.take(world.front.take(triangle.take(wall)), axis=1)
+    material[wall], depth[wall] = facades.shade(np.stack(_spots(origins, rays, distance, wall)).T, rows.T)
     return material, label, tint, depth
+
+
+def _spots(origins: np.ndarray, rays: np.ndarray, distance: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
+    """World x, y and z, each (n,), at which the chosen rays, by number, end."""
+    far = distance.take(chosen)
+    return [start.take(chosen) + way.take(chosen) * far for start, way in zip(origins.T, rays.T, strict=True)]
 
 
 def _behind(
