@@ -169,10 +169,15 @@ def slab_mesh(ground: Ground, step: float = 2.5) -> tuple[np.ndarray, np.ndarray
         if road.walk <= 0:
             continue
         s = np.arange(road.start, road.stop, step)
-        for side in (-1, 1):
-            profile = ((road.half, 0.0), (road.half, ground.kerb), (road.half + road.walk, ground.kerb))
-            edge = [_rail(ground, road, t, side * d, up) for t in (s, s + step) for d, up in profile]
-            low_a, a, b, low_b, c, e = edge
+        profile = ((road.half, 0.0), (road.half, ground.kerb), (road.half + road.walk, ground.kerb))
+        along = np.tile(s, (2, 3, 2, 1))  # sides, profile, both ends of a piece
+        along[:, :, 1] += step
+        across = np.array([[side * d for d, _ in profile] for side in (-1, 1)])[..., None, None]
+        x, y, _ = road.at(along, np.broadcast_to(across, along.shape))
+        z = ground.height(x, y) + np.array([up for _, up in profile])[:, None, None]
+        edges = np.stack([x, y, z], axis=-1)
+        for side, edge in zip((-1, 1), edges, strict=True):
+            (low_a, low_b), (a, c), (b, e) = edge
             x, y, _ = road.at(s + step / 2, np.full(s.shape, side * (road.half + 0.2)))
             open_ = ground.carriageway(x, y, skip=i) > 0.1
             for quad, kerb in ((np.stack([a, b, e, c], 1), False), (np.stack([low_a, a, c, low_b], 1), True)):
@@ -182,8 +187,3 @@ def slab_mesh(ground: Ground, step: float = 2.5) -> tuple[np.ndarray, np.ndarray
     if not parts:
         return np.zeros((0, 3, 3), np.float32), np.zeros(0, bool)
     return np.concatenate(parts).astype(np.float32), np.concatenate(kerbs)
-
-
-def _rail(ground: Ground, road: Road, s: np.ndarray, d: float, up: float) -> np.ndarray:
-    x, y, _ = road.at(s, np.full(s.shape, d))
-    return np.stack([x, y, ground.height(x, y) + up], axis=-1)
