@@ -8,7 +8,9 @@ Names and numbers of embree.github.io/api.html, version 4.
 from __future__ import annotations
 
 import ctypes
+from collections import deque
 from functools import lru_cache
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -122,8 +124,7 @@ class PacketScene:
             mine = found[part]
             _fill(packets, origins[part], rays[part])
             full = len(mine) // PACKET
-            for place in places[:full]:
-                cast(every, scene, place, how)
+            deque(map(cast, repeat(every), repeat(scene), places[:full], repeat(how)), maxlen=0)
             if full * PACKET < len(mine):
                 cast(last, scene, places[full], how)
             mine[:] = packets[:, TRIANGLE].reshape(-1)[: len(mine)].view(np.int32)

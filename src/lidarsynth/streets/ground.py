@@ -148,8 +148,11 @@ class Ground:
             if other is not road and len(painted):
                 x, y, _ = road.at(s[painted], d[painted])
                 painted = painted[np.abs(other.coordinates(x, y)[1]) >= other.half + 1.0]
-        rails = [np.flatnonzero(np.abs(np.abs(d - np.float32(centre)) - 0.72) < 0.06) for centre in (-1.6, 1.6)]
-        return [("marking", painted), *(("rail", rail) for rail in rails if road.rails)]
+        found = [("marking", painted)]
+        if road.rails:
+            for centre in (-1.6, 1.6):
+                found.append(("rail", np.flatnonzero(np.abs(np.abs(d - np.float32(centre)) - 0.72) < 0.06)))
+        return found
 
 
 def ground_mesh(ground: Ground, reach: tuple[float, float], cell: float) -> np.ndarray:

@@ -67,9 +67,11 @@ def _whole(
     seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, without: np.ndarray | None = None, empty: int = 0
 ) -> np.ndarray:
     """(H, W) image of the values (N,) of the rays that are `seen` (H, W) bool; 0 where `without` (N,) bool says so."""
-    image = np.full(seen.shape, empty, kind)
     if without is not None:
         values[without] = 0
+    if len(values) == seen.size:
+        return values.reshape(seen.shape)
+    image = np.full(seen.shape, empty, kind)
     image[seen] = values
     return image
 

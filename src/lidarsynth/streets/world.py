@@ -109,18 +109,17 @@ def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndar
 def visible(world: World, sensor: Sensor) -> World:
     """The world without triangles that no pose can see: too far, or wholly above the highest beam. Faster to cast."""
     poses = world.poses.astype(np.float32)
-    spot = world.corners[:, 0]
-    high = np.flatnonzero((world.kind == THING) & (spot[:, 2] > poses[:, 2].min() + sensor.mount + 0.8))
+    spot = world.corners[:, 0].T.copy()
+    high = np.flatnonzero((world.kind == THING) & (spot[2] > poses[:, 2].min() + sensor.mount + 0.8))
     steep = np.float32(np.tan(np.radians(sensor.elevations[0]) + 0.06))  # 0.06 rad: pitch, roll and slope of the poses
-    seen = np.ones(len(spot), bool)
+    seen = np.ones(len(world.corners), bool)
     seen[high] = False
-    open_ = spot.take(high, axis=0)  # those that no pose so far has seen
+    open_ = spot.take(high, axis=1)  # those that no pose so far has seen
     for x, y, z, *_ in poses[np.argsort(np.arange(len(poses)) % 4, kind="stable")]:  # far apart first
-        away = np.hypot(open_[:, 0] - x, open_[:, 1] - y)
-        shown = (away < sensor.max_range + 5) & (open_[:, 2] - z - sensor.mount - 0.8 < steep * away)
-        seen[high[shown]] = True
-        high, open_ = high[~shown], open_.compress(~shown, axis=0)
-    table = {
-        key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front", "thing")
-    }
-    return replace(world, **table)
+        away = np.hypot(open_[0] - x, open_[1] - y)
+        shown = (away < sensor.max_range + 5) & (open_[2] - z - sensor.mount - 0.8 < steep * away)
+        seen[high.compress(shown)] = True
+        if 8 * np.count_nonzero(shown) > len(high):
+            high, open_ = high.compress(~shown), open_.compress(~shown, axis=1)
+    left, keys = np.flatnonzero(seen), ("corners", "kind", "material", "label", "tint", "front", "thing")
+    return replace(world, **{key: getattr(world, key).take(left, axis=0) for key in keys})
