@@ -1,6 +1,6 @@
 """Collects what is placed in a world, then makes one soup of triangles of it.
 
-Only what is drawn at random is worked out at once; heights and distances from carriageways come for everything together.
+Only what is drawn at random is worked out at once; heights and distances from carriageways come for all together.
 """
 
 from __future__ import annotations

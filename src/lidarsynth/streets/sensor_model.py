@@ -181,7 +181,7 @@ def sense(
 def _signal(
     optics: list[np.ndarray], tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers, fade: float
 ) -> np.ndarray:
-    """(N,) signal before its noise: material, incidence, distance, and the laser's own loss; optics: columns of `TABLE`, (N,)."""
+    """(N,) signal before its noise: material, incidence, distance, the laser's own loss. optics: columns of TABLE."""
     slant = np.log(np.maximum(cosine, 0.01))
     signal = optics[0] + tint * optics[1] + optics[3] * slant
     signal += GRAZING[0] * np.minimum(slant - np.float32(np.log(GRAZING[1])), 0)
