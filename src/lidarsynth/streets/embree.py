@@ -8,6 +8,7 @@ Names and numbers of embree.github.io/api.html, version 4.
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections import deque
 from functools import lru_cache
 from itertools import repeat
@@ -111,22 +112,20 @@ class PacketScene:
         Faster where x, y and z lie apart in memory: views (3, N).T.
         """
         count, found = len(rays), np.empty(len(rays), np.int32)
-        packets = _aligned(min(BLOCK, -(-count // PACKET)))
         chosen, rest = _aligned(1)[0].view(np.int32), count % PACKET
         chosen[0], chosen[1] = -1, np.where(np.arange(PACKET) < rest, -1, 0)  # all rays, and those of the last packet
         arguments, cast = _Arguments(COHERENT, NONE, None, None, None, 0), self._embree.rtcIntersect16
         every, last = (_at(row.ctypes.data) for row in chosen[:2])
         scene, how = _at(self._scene), _at(ctypes.addressof(arguments))
-        places = [_at(packets.ctypes.data + packets.strides[0] * packet) for packet in range(len(packets))]
-        _prepare(packets)
         for start in range(0, count, BLOCK * PACKET):
             part = slice(start, start + BLOCK * PACKET)
             mine = found[part]
-            _fill(packets, origins[part], rays[part])
             full = len(mine) // PACKET
-            deque(map(cast, repeat(every), repeat(scene), places[:full], repeat(how)), maxlen=0)
-            if full * PACKET < len(mine):
-                cast(last, scene, places[full], how)
+            packets = SCRATCH.packets[: -(-len(mine) // PACKET)]
+            _fill(packets, origins[part], rays[part])
+            deque(map(cast, repeat(every), repeat(scene), SCRATCH.places[:full], repeat(how)), maxlen=0)
+            if full < len(packets):
+                cast(last, scene, SCRATCH.places[full], how)
             mine[:] = packets[:, TRIANGLE].reshape(-1)[: len(mine)].view(np.int32)
         return found
 
@@ -134,13 +133,6 @@ class PacketScene:
 def _at(address: int) -> object:
     """A pointer as `ctypes` passes it on without making it anew for each call."""
     return ctypes.byref(ctypes.c_char.from_address(address))
-
-
-def _prepare(packets: np.ndarray) -> None:
-    """Writes into `packets` (P, ROWS, PACKET) what casting leaves as it is."""
-    packets[:, NEAREST], packets[:, TIME] = 0, 0
-    words = packets.view(np.uint32)
-    words[:, MASK : FLAGS + 1], words[:, FLAGS], words[:, TRIANGLE:] = NONE, 0, NONE
 
 
 def _fill(packets: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> None:
@@ -160,3 +152,18 @@ def _aligned(count: int) -> np.ndarray:
     memory = np.empty(size + PACKET, np.float32)
     first = (-memory.ctypes.data % 64) // memory.itemsize
     return memory[first : first + size].reshape(count, ROWS, PACKET)
+
+
+class _Scratch(threading.local):
+    """BLOCK packets and where each lies, of each thread, with what casting leaves as it is already written."""
+
+    def __init__(self):
+        self.packets = _aligned(BLOCK)
+        first, step = self.packets.ctypes.data, self.packets.strides[0]
+        self.places = [_at(first + step * packet) for packet in range(BLOCK)]
+        self.packets[:, NEAREST], self.packets[:, TIME] = 0, 0
+        words = self.packets.view(np.uint32)
+        words[:, MASK : FLAGS + 1], words[:, FLAGS], words[:, TRIANGLE:] = NONE, 0, NONE
+
+
+SCRATCH = _Scratch()

@@ -89,7 +89,7 @@ def world_rays(
     """Origins and directions (N, 3) float32 in the world frame of the rays (H, W, 3) that are `seen` (H, W) bool.
 
     frames  of `attitudes`, one for all columns or one for each
-    Of one frame, x, y and z lie apart in memory: what follows takes them one by one.
+    x, y and z lie apart in memory: what follows takes them one by one.
     """
     start = np.zeros((sensor.height, 3), np.float32)
     start[:, 2] = sensor.mount
@@ -102,7 +102,7 @@ def world_rays(
         apart = np.moveaxis(rays, -1, 0).reshape(3, -1)
         return origins.T, (turn @ (apart if seen.all() else apart.take(np.flatnonzero(seen), axis=1))).T
     origins = np.einsum("hj,wij->hwi", start, turns) + places
-    return origins[seen], np.einsum("hwj,wij->hwi", rays, turns)[seen]
+    return origins[seen].T.copy().T, np.einsum("hwj,wij->hwi", rays, turns)[seen].T.copy().T
 
 
 def some_rays(
