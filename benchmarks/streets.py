@@ -1,6 +1,7 @@
-"""Labelled streets: how fast they are made, and what odometry makes of a drive.
+"""Labelled streets: how fast they are made, who is in them, and what odometry makes of a drive.
 
 python benchmarks/streets.py                          frames per second of processor time, by sensor, boxes included
+python benchmarks/streets.py --shares                 road users' shares of the pixels, by --pedestrians and --cyclists
 python benchmarks/streets.py --odometry               KISS-ICP (pip install kiss-icp) on drives, against their poses
 """
 
@@ -11,9 +12,13 @@ import time
 
 import numpy as np
 
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.streets.areas import Density
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+from lidarsynth.streets.reader import SyntheticStreets, Worlds
 from lidarsynth.streets.turn import sensor_pose
+from lidarsynth.streets.world import POSES
 
 SETTLED = 5  # frames until KISS-ICP knows how fast it goes; its first cannot be deskewed
 
@@ -27,6 +32,17 @@ def speed(name: str, frames: int, count: int) -> str:
     rate = len(points) / (time.process_time() - start)
     what = f"drive of {frames}" if frames else f"{count} places"
     return f"{name}, {what}: {rate:.1f} frames per second and core, {np.mean(points):.0f} points each"
+
+
+def shares(density: Density, worlds: int) -> str:
+    """One line: per cent of the labelled pixels of one scan in each world, for each class of small road users."""
+    sensor = SENSORS["hdl-64e-kitti"]
+    reader = SyntheticStreets(0, POSES * worlds, sensor, worlds=Worlds(0, sensor, density=density))
+    labels = np.concatenate([reader.image(POSES * world + 4).label.ravel() for world in range(worlds)])
+    counts = np.bincount(labels, minlength=len(CLASS_NUMBER))
+    words = ("person", "bicyclist", "motorcyclist", "bicycle", "motorcycle", "car")
+    cells = [f"{100 * counts[CLASS_NUMBER[word]] / counts[1:].sum():.3f}" for word in words]
+    return f"| {density.pedestrians:g} | {density.cyclists:g} | " + " | ".join(cells) + " |"
 
 
 def estimated(frames: list[Frame], timed: bool) -> np.ndarray:
@@ -77,12 +93,16 @@ def odometry(seeds: int, frames: int, name: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--odometry", action="store_true")
+    parser.add_argument("--shares", type=int, nargs="?", const=120, metavar="WORLDS")
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--drives", type=int, default=2)
     parser.add_argument("--sensor", default="hdl-64e-kitti")
     args = parser.parse_args()
     if args.odometry:
         odometry(args.drives, args.frames, args.sensor)
+    elif args.shares:
+        for pedestrians, cyclists in ((1, 0), (0.1, 0), (0.08, 0), (0.05, 0), (0.08, 0.1)):
+            print(shares(Density(pedestrians=pedestrians, cyclists=cyclists), args.shares), flush=True)
     else:
         for name in ("hdl-64e-kitti", "os1-64", "vlp-16"):
             print(speed(name, 0, 16))

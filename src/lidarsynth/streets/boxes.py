@@ -72,7 +72,7 @@ def boxes_of(
     late: np.ndarray | None,
     to_world: np.ndarray,
 ) -> list[Box]:
-    """Boxes of all actors whose middle is within the sensor's range.
+    """Boxes of all actors whose middle is within the sensor's range, or that a return is labelled with.
 
     numbers   (H, W) instance of each return, 0 for none
     poses     (1 or W, 6) of the carrier by column; late (W,) s after the stamp, None where nothing moves
@@ -81,8 +81,9 @@ def boxes_of(
     actors = bodies.actors
     middles = moment.place + _about(actors.middle, moment.yaw)
     here = (middles - to_world[:3, 3]) @ to_world[:3, :3]
-    near = np.flatnonzero(moment.present & (np.linalg.norm(here, axis=1) < sensor.max_range))
     points = np.bincount(numbers.ravel(), minlength=len(actors) + 1)
+    near = np.linalg.norm(here, axis=1) < sensor.max_range
+    near = np.flatnonzero(moment.present & (near | (points[1:] > 0)))
     first = np.where(turn.first >= 0, world.thing[turn.first], -1)
     hits = np.bincount(first.ravel() + 1, minlength=len(world.things) + 1)
     found, frames = [], attitudes(sensor, poses)

@@ -12,10 +12,11 @@ import numpy as np
 
 from lidarsynth.streets.actors import Actors, actors_of
 from lidarsynth.streets.areas import TODAY, Area, Density
+from lidarsynth.streets.builder import WorldBuilder, assemble
 from lidarsynth.streets.ground import Ground, Road
 from lidarsynth.streets.layout import draw_area, fill
 from lidarsynth.streets.traffic import STEP, follow
-from lidarsynth.streets.world import REACH, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground
+from lidarsynth.streets.world import REACH, TRAFFIC, WALK, World, draw_ground
 
 MARGIN = 120.0  # m of street behind the start and beyond the end
 LONGEST = 4000.0  # m of street in one world

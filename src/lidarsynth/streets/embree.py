@@ -8,7 +8,10 @@ Names and numbers of embree.github.io/api.html, version 4.
 from __future__ import annotations
 
 import ctypes
+import threading
+from collections import deque
 from functools import lru_cache
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +20,7 @@ PACKET = 16  # rays
 BLOCK = 512  # packets filled at a time: what lies in the processor's cache
 # 64-byte rows of RTCRayHit16: origin 0-2, nearest 3, direction 4-6, time 7, farthest 8, mask 9, id 10, flags 11,
 # normal 12-14, u 15, v 16, triangle 17, geometry 18, instance 19 and 20.
-NEAREST, DIRECTION, TIME, FARTHEST, MASK, FLAGS, TRIANGLE, ROWS = 3, 4, 7, 8, 9, 11, 17, 21
+NEAREST, DIRECTION, TIME, FARTHEST, MASK, FLAGS, TRIANGLE, GEOMETRY, ROWS = 3, 4, 7, 8, 9, 11, 17, 18, 21
 NONE = np.uint32(0xFFFFFFFF)
 TRIANGLES, INDICES, VERTICES, THREE_INTEGERS, THREE_FLOATS = 0, 0, 1, 0x5003, 0x9003
 COHERENT = 1 << 16
@@ -104,40 +107,43 @@ class PacketScene:
             self._embree.rtcReleaseScene(scene)
 
     def faces(self, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """(N,) int32: the triangle that each ray first meets, -1 for none. origins, rays (N, 3) float32."""
+        """(N,) int32: the triangle that each ray first meets, -1 for none. origins, rays (N, 3) float32.
+
+        Faster where x, y and z lie apart in memory: views (3, N).T.
+        """
         count, found = len(rays), np.empty(len(rays), np.int32)
-        packets = _aligned(min(BLOCK, -(-count // PACKET)))
         chosen, rest = _aligned(1)[0].view(np.int32), count % PACKET
         chosen[0], chosen[1] = -1, np.where(np.arange(PACKET) < rest, -1, 0)  # all rays, and those of the last packet
-        every, last = (ctypes.c_void_p(row.ctypes.data) for row in chosen[:2])
-        scene, arguments = ctypes.c_void_p(self._scene), _Arguments(COHERENT, NONE, None, None, None, 0)
-        address, cast = ctypes.c_void_p(ctypes.addressof(arguments)), self._embree.rtcIntersect16
-        first, step = packets.ctypes.data, packets.strides[0]
-        places = [ctypes.c_void_p(first + step * packet) for packet in range(len(packets))]
+        arguments, cast = _Arguments(COHERENT, NONE, None, None, None, 0), self._embree.rtcIntersect16
+        every, last = (_at(row.ctypes.data) for row in chosen[:2])
+        scene, how = _at(self._scene), _at(ctypes.addressof(arguments))
         for start in range(0, count, BLOCK * PACKET):
             part = slice(start, start + BLOCK * PACKET)
             mine = found[part]
-            _fill(packets, origins[part], rays[part])
             full = len(mine) // PACKET
-            for place in places[:full]:
-                cast(every, scene, place, address)
-            if full * PACKET < len(mine):
-                cast(last, scene, places[full], address)
+            packets = SCRATCH.packets[: -(-len(mine) // PACKET)]
+            _fill(packets, origins[part], rays[part])
+            deque(map(cast, repeat(every), repeat(scene), SCRATCH.places[:full], repeat(how)), maxlen=0)
+            if full < len(packets):
+                cast(last, scene, SCRATCH.places[full], how)
             mine[:] = packets[:, TRIANGLE].reshape(-1)[: len(mine)].view(np.int32)
         return found
+
+
+def _at(address: int) -> object:
+    """A pointer as `ctypes` passes it on without making it anew for each call."""
+    return ctypes.byref(ctypes.c_char.from_address(address))
 
 
 def _fill(packets: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> None:
     """Writes (N, 3) rays into `packets` (P, ROWS, PACKET), as many as there is place for or fewer."""
     full, rest = divmod(len(rays), PACKET)
-    for first, values in ((0, origins), (DIRECTION, rays)):
+    for first, values in ((0, origins.T), (DIRECTION, rays.T)):
         rows = packets[:, first : first + 3]
-        rows[:full] = values[: full * PACKET].reshape(full, PACKET, 3).transpose(0, 2, 1)
+        rows[:full] = values[:, : full * PACKET].reshape(3, full, PACKET).transpose(1, 0, 2)
         if rest:
-            rows[full, :, :rest], rows[full, :, rest:] = values[full * PACKET :].T, 0
-    packets[:, NEAREST], packets[:, TIME], packets[:, FARTHEST] = 0, 0, np.inf
-    words = packets.view(np.uint32)
-    words[:, MASK : FLAGS + 1], words[:, FLAGS], words[:, TRIANGLE:] = NONE, 0, NONE
+            rows[full, :, :rest], rows[full, :, rest:] = values[:, full * PACKET :], 0
+    packets[:, FARTHEST], packets.view(np.uint32)[:, TRIANGLE : GEOMETRY + 1] = np.inf, NONE
 
 
 def _aligned(count: int) -> np.ndarray:
@@ -146,3 +152,18 @@ def _aligned(count: int) -> np.ndarray:
     memory = np.empty(size + PACKET, np.float32)
     first = (-memory.ctypes.data % 64) // memory.itemsize
     return memory[first : first + size].reshape(count, ROWS, PACKET)
+
+
+class _Scratch(threading.local):
+    """BLOCK packets and where each lies, of each thread, with what casting leaves as it is already written."""
+
+    def __init__(self):
+        self.packets = _aligned(BLOCK)
+        first, step = self.packets.ctypes.data, self.packets.strides[0]
+        self.places = [_at(first + step * packet) for packet in range(BLOCK)]
+        self.packets[:, NEAREST], self.packets[:, TIME] = 0, 0
+        words = self.packets.view(np.uint32)
+        words[:, MASK : FLAGS + 1], words[:, FLAGS], words[:, TRIANGLE:] = NONE, 0, NONE
+
+
+SCRATCH = _Scratch()

@@ -9,6 +9,7 @@ from lidarsynth.streets.materials import NUMBER
 # Columns of a facade row: corner x, y; direction ux, uy of the wall; ground z; period, window share, sill, head,
 # recess (m); seed of its doors; tint.
 STOREY = 2.9  # metres
+PANES = np.array([NUMBER[k] for k in (*("window",) * 4, *("room",) * 3, "void")], np.uint8)  # what windows are
 
 
 def shade(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,14 +27,10 @@ def shade(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     framed = np.abs(u - 0.5) < share / 2
     window = framed & (storey > sill) & (storey < head) & (chance > 0.12)
     door = (np.abs(u - 0.5) * period < 0.6 + 0.9 * (chance > 0.78)) & (up < 2.3) & (chance > 0.62)
-    material = np.full(len(points), NUMBER["plaster"], np.uint8)
     plinth = up < _fraction(seed / 7) * 1.05
-    material[plinth] = NUMBER["stone"]
-    pane = np.array(
-        [NUMBER[k] for k in ("window", "window", "window", "window", "room", "room", "room", "void")], np.uint8
-    )
-    kind = np.floor(_fraction(chance * 37.7) * len(pane)).astype(int)
-    material[window] = pane[kind][window]
+    material = np.where(plinth, np.uint8(NUMBER["stone"]), np.uint8(NUMBER["plaster"]))
+    glazed = np.flatnonzero(window)
+    material[glazed] = PANES.take(np.floor(_fraction(chance.take(glazed) * 37.7) * len(PANES)).astype(int))
     frame = window & ((np.abs(np.abs(u - 0.5) - share / 2) * period < 0.07) | (np.abs(u - 0.5) * period < 0.04))
     material[frame] = NUMBER["door"]
     material[door] = NUMBER["door"]

@@ -52,6 +52,9 @@ class Options:
                              f"{self.rate}")  # fmt: skip
         if self.perfect and self.weather != CLEAR:
             raise ValueError("expected clear weather of a perfect sensor, found rain or fog")
+        if self.frames == 0 and (self.speed is not None or self.deskewed):
+            raise ValueError("expected the frames of a drive with a speed or deskewed points, found none: scans of "
+                             "places stand still")  # fmt: skip
         if self.speed is not None and not 0.1 <= self.speed <= 60:
             raise ValueError(f"expected a speed of 0.1 to 60 m/s, found {self.speed}")
 

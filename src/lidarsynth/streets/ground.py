@@ -12,6 +12,7 @@ from lidarsynth.streets.materials import NUMBER
 KERB = 0.12  # metres from carriageway to sidewalk, unless said otherwise
 CROWN = 0.018  # fall of a carriageway from its middle to its edges
 BUMPS = (0.006, 0.014)  # metres, unevenness of paved and of other ground
+BESIDE = 0.06  # metres beyond the carriageway's edge that its markings may reach
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Road:
         """Sideways shift (m) and slope of the centre line at s."""
         size, length, phase = self.wave
         k = 2 * np.pi / length
-        return size * (np.sin(k * s + phase) - float(np.sin(phase))), size * k * np.cos(k * s + phase)
+        angle = k * s + phase
+        return size * (np.sin(angle) - float(np.sin(phase))), size * k * np.cos(angle)
 
     def at(self, s: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """World x, y and direction (radians) of the point at (s, d)."""
@@ -101,31 +103,35 @@ class Ground:
         """
         material = np.full(x.shape, NUMBER[self.verge], np.uint8)
         label = np.full(x.shape, CLASS_NUMBER["sidewalk" if self.verge == "sidewalk" else "terrain"], np.uint8)
-        sag = np.zeros(x.shape, np.float32)
-        tracks, roadway = np.zeros(x.shape, np.float32), np.zeros(x.shape, bool)
+        sag, tracks = np.zeros(x.shape, np.float32), np.zeros(x.shape, np.float32)
+        roadway = np.zeros(x.shape, bool)
         for road in self.roads:
             s, d = road.coordinates(x, y)
-            inside = np.abs(d) < road.half
-            roadway |= inside
-            sag[inside] = CROWN * np.abs(d[inside])
-            tracks[inside] = 1.6 * np.cos(4 * np.pi * d[inside] / road.half + self.phase)  # two wheels a lane
+            near = np.flatnonzero(np.abs(d) < road.half + BESIDE)
+            s, d = s.take(near), d.take(near)
+            on = np.abs(d) < road.half
+            inside, across = near.compress(on), d.compress(on)
+            roadway[inside] = True
+            sag[inside] = CROWN * np.abs(across)
+            tracks[inside] = 1.6 * np.cos(4 * np.pi * across / road.half + self.phase)  # two wheels a lane
             material[inside] = NUMBER["road" if road.paved else "gravel"]
             label[inside] = CLASS_NUMBER["road"]
-            park = inside & ((d < road.parking[0] - road.half) | (d > road.half - road.parking[1]))
-            material[park], label[park] = NUMBER["parking"], CLASS_NUMBER["parking"]
-            self._paint(road, s, d, material)
+            if max(road.parking) > 0:
+                park = inside.compress((across < road.parking[0] - road.half) | (across > road.half - road.parking[1]))
+                material[park], label[park] = NUMBER["parking"], CLASS_NUMBER["parking"]
+            for name, spots in self._paint(road, s, d):
+                material[near.take(spots)] = NUMBER[name]
         material[raised], label[raised] = NUMBER["sidewalk"], CLASS_NUMBER["sidewalk"]
-        wear = np.zeros(x.shape, np.float32)
-        wear[roadway] = tracks[roadway]
+        wear = tracks.copy()
         for kx, ky, phase in self.patches:
-            wear += np.sin(kx * x + ky * y + phase).astype(np.float32)
+            wear += np.sin(kx * x + ky * y + phase)
         uneven = BUMPS[0] if self.verge == "sidewalk" else BUMPS[1]
         sag[raised] = 0
         bumps = np.where(roadway | raised, np.float32(BUMPS[0]), np.float32(uneven)) * (wear - tracks)
         return material, label, np.float32(0.012) * wear, sag + bumps
 
-    def _paint(self, road: Road, s: np.ndarray, d: np.ndarray, material: np.ndarray) -> None:
-        """Lane markings, stop lines and rails, written into `material`."""
+    def _paint(self, road: Road, s: np.ndarray, d: np.ndarray) -> list[tuple[str, np.ndarray]]:
+        """Lane markings, stop lines and rails: the material's word and which of the points (s, d) it covers."""
         width = np.float32(0.075)
         right, left = road.half - road.parking[0], road.half - road.parking[1]
         middle = np.float32((left - right) / 2)
@@ -142,11 +148,11 @@ class Ground:
             if other is not road and len(painted):
                 x, y, _ = road.at(s[painted], d[painted])
                 painted = painted[np.abs(other.coordinates(x, y)[1]) >= other.half + 1.0]
-        material[painted] = NUMBER["marking"]
+        found = [("marking", painted)]
         if road.rails:
             for centre in (-1.6, 1.6):
-                rail = np.abs(np.abs(d - np.float32(centre)) - 0.72) < 0.06
-                material[rail] = NUMBER["rail"]
+                found.append(("rail", np.flatnonzero(np.abs(np.abs(d - np.float32(centre)) - 0.72) < 0.06)))
+        return found
 
 
 def ground_mesh(ground: Ground, reach: tuple[float, float], cell: float) -> np.ndarray:
@@ -166,10 +172,15 @@ def slab_mesh(ground: Ground, step: float = 2.5) -> tuple[np.ndarray, np.ndarray
         if road.walk <= 0:
             continue
         s = np.arange(road.start, road.stop, step)
-        for side in (-1, 1):
-            profile = ((road.half, 0.0), (road.half, ground.kerb), (road.half + road.walk, ground.kerb))
-            edge = [_rail(ground, road, t, side * d, up) for t in (s, s + step) for d, up in profile]
-            low_a, a, b, low_b, c, e = edge
+        profile = ((road.half, 0.0), (road.half, ground.kerb), (road.half + road.walk, ground.kerb))
+        along = np.tile(s, (2, 3, 2, 1))  # sides, profile, both ends of a piece
+        along[:, :, 1] += step
+        across = np.array([[side * d for d, _ in profile] for side in (-1, 1)])[..., None, None]
+        x, y, _ = road.at(along, np.broadcast_to(across, along.shape))
+        z = ground.height(x, y) + np.array([up for _, up in profile])[:, None, None]
+        edges = np.stack([x, y, z], axis=-1)
+        for side, edge in zip((-1, 1), edges, strict=True):
+            (low_a, low_b), (a, c), (b, e) = edge
             x, y, _ = road.at(s + step / 2, np.full(s.shape, side * (road.half + 0.2)))
             open_ = ground.carriageway(x, y, skip=i) > 0.1
             for quad, kerb in ((np.stack([a, b, e, c], 1), False), (np.stack([low_a, a, c, low_b], 1), True)):
@@ -179,8 +190,3 @@ def slab_mesh(ground: Ground, step: float = 2.5) -> tuple[np.ndarray, np.ndarray
     if not parts:
         return np.zeros((0, 3, 3), np.float32), np.zeros(0, bool)
     return np.concatenate(parts).astype(np.float32), np.concatenate(kerbs)
-
-
-def _rail(ground: Ground, road: Road, s: np.ndarray, d: float, up: float) -> np.ndarray:
-    x, y, _ = road.at(s, np.full(s.shape, d))
-    return np.stack([x, y, ground.height(x, y) + up], axis=-1)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.streets.areas import AREAS, TODAY, Area, Density
+from lidarsynth.streets.builder import Houses, WorldBuilder, assemble
 from lidarsynth.streets.ground import Road
 from lidarsynth.streets.more import more
-from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, World, WorldBuilder, assemble, draw_ground, draw_poses
+from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, World, draw_ground, draw_poses
 
 Array = np.ndarray
 
@@ -103,30 +104,8 @@ def _houses(
     u, v = sd[..., 0] - middle[:, None], side * (sd[..., 1] - near[:, None])
     c, sn = np.cos(heading)[:, None], np.sin(heading)[:, None]
     x, y = x0[:, None] + c * u - sn * v, y0[:, None] + sn * u + c * v
-    fine = (0, 1, 2, 3, 4)
-    edge_x = np.concatenate([x + (np.roll(x, -1, 1) - x) * k / 5 for k in fine], axis=1)
-    edge_y = np.concatenate([y + (np.roll(y, -1, 1) - y) * k / 5 for k in fine], axis=1)
-    keep = across | (builder.ground.carriageway(edge_x, edge_y) > 0.7).all(axis=1)
     tall = rng.uniform(5, 14, count)
-    rows = facade_rows(rng, builder.area.shops, count)
-    x, y, tall, rows = x[keep], y[keep], tall[keep], rows[keep]
-    if len(x):
-        base = builder.ground.height(x.mean(axis=1), y.mean(axis=1))
-        _walls(builder, x, y, base, tall, rows)
-
-
-def _walls(builder: WorldBuilder, x: Array, y: Array, base: Array, tall: Array, rows: Array) -> None:
-    """Walls around footprints x, y (N, 4); base, tall (N,) metres; rows (N, 12) facade parameters."""
-    nx, ny = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    low, high = np.broadcast_to((base - 2.5)[:, None], x.shape), np.broadcast_to((base + tall)[:, None], x.shape)
-    quad = np.stack([np.stack([x, y, low], -1), np.stack([nx, ny, low], -1), np.stack([nx, ny, high], -1),
-                     np.stack([x, y, high], -1)], axis=2)  # fmt: skip
-    corners = quad[:, :, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3).astype(np.float32)
-    size = np.maximum(np.hypot(nx - x, ny - y), 1e-6)
-    table = np.repeat(rows[:, None], 4, axis=1)
-    table[..., 0], table[..., 1], table[..., 4] = x, y, base[:, None]
-    table[..., 2], table[..., 3] = (nx - x) / size, (ny - y) / size
-    builder.walls.append((corners, table.reshape(-1, 12).astype(np.float32), "plaster", "building"))
+    builder.houses.append(Houses(x, y, tall, facade_rows(rng, builder.area.shops, count), across))
 
 
 def facade_rows(rng: np.random.Generator, shops: float, count: int) -> Array:
@@ -147,16 +126,22 @@ def _borders(builder: WorldBuilder, road: Road, side: int, start: Array, length:
     """Wall, hedge or fence between the sidewalk and each lot, in pieces of two metres, with gates left open."""
     rng = builder.rng
     kind = rng.choice(4, p=np.array(builder.area.borders) / sum(builder.area.borders), size=len(start))
+    words, along, out, firsts = [], [], [], []
     for code, name in ((0, "garden wall"), (1, "hedge"), (2, "fence")):
-        for s0, far in zip(start[kind == code], length[kind == code], strict=True):
+        for s0, far in zip(start[kind == code].tolist(), length[kind == code].tolist(), strict=True):
             s = np.arange(s0, s0 + far - 1, 2.0)
             gate = rng.integers(0, max(len(s), 1), 2)
-            s = np.delete(s, gate[gate < len(s)]) + 1.0
-            d = np.full(s.shape, side * (_edge(road) + 0.35 + (0.6 if code == 1 else 0)))
-            x, y, yaw = road.at(s, d)
-            first = (int(rng.integers(0, 64)), rng.uniform(0.9, 1.1), rng.normal())
-            wild = code == 1 and rng.random() < 0.45
-            builder.put_row("wild hedge" if wild else name, x, y, yaw, first)
+            left = np.ones(len(s), bool)
+            left[gate[: len(s)]] = False
+            along.append(s[left] + 1.0)
+            out.append(_edge(road) + 0.35 + (0.6 if code == 1 else 0))
+            firsts.append((int(rng.integers(0, 64)), rng.uniform(0.9, 1.1), rng.normal()))
+            words.append("wild hedge" if code == 1 and rng.random() < 0.45 else name)
+    sizes = [len(s) for s in along]
+    if words:
+        x, y, yaw = road.at(np.concatenate(along), side * np.repeat(out, sizes))
+        for word, first, n, end in zip(words, firsts, sizes, np.cumsum(sizes).tolist(), strict=True):
+            builder.put_row(word, x[end - n : end], y[end - n : end], yaw[end - n : end], first)
 
 
 def gardens(builder: WorldBuilder, road: Road, side: int) -> None:

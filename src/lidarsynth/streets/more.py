@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.streets.builder import WorldBuilder
 from lidarsynth.streets.ground import Road
-from lidarsynth.streets.world import WALK, WorldBuilder
+from lidarsynth.streets.world import WALK
 
 
 def more(builder: WorldBuilder) -> None:

@@ -58,6 +58,7 @@ class MovingCaster:
     def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
         """As `Caster.cast`; times (N,) seconds on the drive's clock, None = all at the turn's stamp."""
         face, distance, cosine = self.fixed.cast(origins, rays)
+        origins, rays = np.ascontiguousarray(origins), np.ascontiguousarray(rays)  # ray by ray from here on
         late = np.zeros(len(rays)) if times is None else times - self.stamp
         now, bundles = self.moment, Bundles(origins, rays)
         for actor in self.movers.tolist():

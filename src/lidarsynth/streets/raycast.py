@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -30,14 +30,11 @@ class Caster:
             raise ImportError("synthetic streets need embreex: pip install 'lidarsynth[synthetic]'") from error
         corners = np.ascontiguousarray(corners, np.float32)
         self._faces = PacketScene(corners).faces if packets else one_by_one(corners)
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        self.normal = normal.astype(np.float32)
-        self.level = np.einsum("ij,ij->i", self.normal, corners[:, 0])
+        self._axes, self.level = _planes(corners)
 
     def faces(self, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """(N,) int32: the number of the triangle that each ray first meets, -1 for none; rays as in `cast`."""
-        return self._faces(np.ascontiguousarray(origins), np.ascontiguousarray(rays))
+        return self._faces(origins, rays)
 
     def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
         """Where each ray first meets the scene.
@@ -48,12 +45,28 @@ class Caster:
         """
         face = self.faces(origins, rays)
         triangle = face.astype(np.intp)
-        normal = self.normal.take(triangle, axis=0)
-        towards = np.einsum("ij,ij->i", normal, rays)
-        gap = self.level[triangle] - np.einsum("ij,ij->i", normal, origins)
-        hit = (face >= 0) & (towards != 0)
-        distance = np.divide(gap, towards, out=np.full(len(rays), np.inf, np.float32), where=hit)
+        normal = [axis.take(triangle) for axis in self._axes]
+        towards = _dot(normal, tuple(rays.T))
+        gap = self.level.take(triangle) - _dot(normal, tuple(origins.T))
+        missed = (face < 0) | (towards == 0)
+        towards[missed] = 1
+        distance = gap / towards
+        distance[missed] = np.inf
         return face, distance, np.abs(towards)
+
+
+def _planes(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals (3, T) float32 of triangles (T, 3, 3) float32, and how far along its normal each lies, (T,)."""
+    first = corners[:, 0].T.copy()
+    (ax, ay, az), (bx, by, bz) = (corners[:, k].T - first for k in (1, 2))
+    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    normal /= np.maximum(np.sqrt(_dot(tuple(normal), tuple(normal))), 1e-12)
+    return normal, _dot(tuple(normal), tuple(first))
+
+
+def _dot(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> np.ndarray:
+    """(N,) of three (N,) and three (N,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def one_by_one(corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -63,4 +76,5 @@ def one_by_one(corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.nda
 
     scene = EmbreeScene()
     TriangleMesh(scene, corners)
-    return lambda origins, rays: scene.run(origins, rays, query="INTERSECT")
+    whole = np.ascontiguousarray
+    return lambda origins, rays: scene.run(whole(origins), whole(rays), query="INTERSECT")

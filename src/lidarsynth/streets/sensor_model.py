@@ -60,6 +60,7 @@ FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) w
 DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
 VANISH = -0.14  # signal at which half of the returns vanish
 VANISH_WIDTH = 0.014
+DOUBT = 0.2  # more than VANISH_WIDTH * ln(1e6)
 NOISE = (0.0012, 0.004, 0.014)  # metres: standard deviation per metre, least, most
 ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.08, "stone": 0.02, "bark": 0.02}  # metres along the beam
 
@@ -145,48 +146,54 @@ def sense(
     face, distance, cosine = caster.cast(origins, rays, times)
     first = face.copy()
     material, label, tint, depth = _surface(world, face, origins, rays, distance)
-    surface = np.where(face < 0, np.float32(np.inf), distance + depth / np.maximum(cosine, 0.12))
-    surface_label = np.where(face < 0, 0, label)
+    missed, made_of = face < 0, material.astype(np.intp)
+    deeper = depth / np.maximum(cosine, 0.12)
+    surface, surface_label = distance + deeper, label.copy()
+    surface[missed], surface_label[missed] = np.inf, 0
     steady = _steady(face, lasers.number)
-    through = (0.8 * steady + 0.2 * chance[0] < TABLE[material, 5]) & (face >= 0)
-    if through.any():
-        when = None if times is None else times[through]
-        where = np.flatnonzero(through)
-        starts, beams = origins.take(where, axis=0), rays.take(where, axis=0)
-        far = _behind(world, caster, starts, beams, distance[through], when)
-        for mine, theirs in zip((face, distance, cosine, material, label, tint, depth), far, strict=True):
-            mine[through] = theirs
-    optics = eye.table.take(material, axis=0)
+    where = np.flatnonzero((0.8 * steady + 0.2 * chance[0] < TABLE[:, 5].take(made_of)) & ~missed)
+    if len(where):
+        when = None if times is None else times[where]
+        starts, beams = origins.T.take(where, axis=1).T, rays.T.take(where, axis=1).T
+        far = _behind(world, caster, starts, beams, distance.take(where), when)
+        for mine, theirs in zip((face, distance, cosine, made_of, label, tint, depth), far, strict=True):
+            mine[where] = theirs
+        deeper[where] = far[-1] / np.maximum(far[2], 0.12)
+    optics = [column.take(made_of) for column in eye.table.T[:5]]
     strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
-    doubt = VANISH_WIDTH * np.log(np.maximum(chance[1], 1e-6) / np.maximum(1 - chance[1], 1e-6))
-    gone = (strength + doubt < VANISH - eye.strength) | (0.7 * steady + 0.3 * chance[0] > 1 - optics[:, 4]) | (face < 0)
+    gone = (0.7 * steady + 0.3 * chance[0] > 1 - optics[4]) | (face < 0)
+    faint = np.flatnonzero(strength < VANISH - eye.strength + DOUBT)  # the others return for sure
+    gone[faint] |= strength.take(faint) + _doubt(chance[1].take(faint)) < VANISH - eye.strength
     distance = (
-        distance
-        + depth / np.maximum(cosine, 0.12)
-        + noise[0] * np.float32(eye.noise) * _spread(material, distance, eye.rough)
-        + lasers.shift
+        distance + deeper + noise[0] * np.float32(eye.noise) * _spread(made_of, distance, eye.rough) + lasers.shift
     )
     gone |= ~(distance < max_range)
     # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
-    grain = optics[:, 2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
-    reflectance = REPORTED[np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.int32)]
+    grain = optics[2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
+    reflectance = REPORTED.take(np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp))
     reflectance = eye.reported(reflectance)
     distance[gone], reflectance[gone], label[gone] = 0, 0, 0
     return Returns(distance, reflectance, label, face, first, surface, surface_label)
 
 
 def _signal(
-    optics: np.ndarray, tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers, fade: float
+    optics: list[np.ndarray], tint: np.ndarray, cosine: np.ndarray, distance: np.ndarray, lasers: Lasers, fade: float
 ) -> np.ndarray:
-    """(N,) signal before its noise: material, incidence, distance, and the laser's own loss."""
-    cosine = np.maximum(cosine, 0.01)
-    slant = np.log(cosine)
-    far = np.log(np.maximum(np.minimum(distance, 999) / FADE[2], 1))
-    signal = optics[:, 0] + tint * optics[:, 1] + optics[:, 3] * slant
-    signal = signal + GRAZING[0] * np.minimum(slant - np.float32(np.log(GRAZING[1])), 0)
-    return signal - np.float32(fade) * far * (FADE[0] + FADE[1] * far) - lasers.loss
+    """(N,) signal before its noise: material, incidence, distance, the laser's own loss. optics: columns of TABLE."""
+    slant = np.log(np.maximum(cosine, 0.01))
+    signal = optics[0] + tint * optics[1] + optics[3] * slant
+    signal += GRAZING[0] * np.minimum(slant - np.float32(np.log(GRAZING[1])), 0)
+    dimmed = np.flatnonzero(distance > FADE[2])
+    far = np.log(np.maximum(np.minimum(distance.take(dimmed), 999) / FADE[2], 1))
+    signal[dimmed] -= np.float32(fade) * far * (FADE[0] + FADE[1] * far)
+    return signal - lasers.loss
+
+
+def _doubt(chance: np.ndarray) -> np.ndarray:
+    """(N,) signal by which the limit at which a return vanishes is missed, DOUBT at most: logistic in the chance."""
+    return VANISH_WIDTH * np.log(np.maximum(chance, 1e-6) / np.maximum(1 - chance, 1e-6))
 
 
 def _steady(face: np.ndarray, number: np.ndarray) -> np.ndarray:
@@ -205,22 +212,28 @@ def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.nda
     table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
         table[NUMBER[name]] = rough * factor
-    return np.hypot(table[material], range_noise(distance))
+    return np.hypot(table.take(material), range_noise(distance))
 
 
 def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
     """Material, label, tint and depth behind the face of N hits; misses get the last triangle's."""
     hit, triangle = face >= 0, face.astype(np.intp)
-    kind, material, label = world.kind[triangle], world.material[triangle], world.label[triangle]
-    tint, depth = world.tint[triangle], np.zeros(len(face), np.float32)
+    kind, material, label, tint = (of.take(triangle) for of in (world.kind, world.material, world.label, world.tint))
+    depth = np.zeros(len(face), np.float32)
     low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
-    spot = origins.take(low, axis=0) + rays.take(low, axis=0) * distance[low, None]
-    material[low], label[low], wear, depth[low] = world.ground.surface(spot[:, 0], spot[:, 1], kind[low] == SLAB)
-    tint[low] = wear / TABLE[material[low], 1]
+    x, y, _ = _spots(origins, rays, distance, low)
+    stuff, words, wear, depth[low] = world.ground.surface(x, y, kind.take(low) == SLAB)
+    material[low], label[low], tint[low] = stuff, words, wear / TABLE[:, 1].take(stuff)
     wall = np.flatnonzero(hit & (kind == FRONT))
-    spot = origins.take(wall, axis=0) + rays.take(wall, axis=0) * distance[wall, None]
-    material[wall], depth[wall] = facades.shade(spot, world.fronts.take(world.front[triangle[wall]], axis=0))
+    rows = world.fronts.T.take(world.front.take(triangle.take(wall)), axis=1)
+    material[wall], depth[wall] = facades.shade(np.stack(_spots(origins, rays, distance, wall)).T, rows.T)
     return material, label, tint, depth
+
+
+def _spots(origins: np.ndarray, rays: np.ndarray, distance: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
+    """World x, y and z, each (n,), at which the chosen rays, by number, end."""
+    far = distance.take(chosen)
+    return [start.take(chosen) + way.take(chosen) * far for start, way in zip(origins.T, rays.T, strict=True)]
 
 
 def _behind(

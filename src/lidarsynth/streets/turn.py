@@ -67,9 +67,11 @@ def _whole(
     seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, without: np.ndarray | None = None, empty: int = 0
 ) -> np.ndarray:
     """(H, W) image of the values (N,) of the rays that are `seen` (H, W) bool; 0 where `without` (N,) bool says so."""
-    image = np.full(seen.shape, empty, kind)
     if without is not None:
         values[without] = 0
+    if len(values) == seen.size:
+        return values.reshape(seen.shape)
+    image = np.full(seen.shape, empty, kind)
     image[seen] = values
     return image
 
@@ -87,6 +89,7 @@ def world_rays(
     """Origins and directions (N, 3) float32 in the world frame of the rays (H, W, 3) that are `seen` (H, W) bool.
 
     frames  of `attitudes`, one for all columns or one for each
+    x, y and z lie apart in memory: what follows takes them one by one.
     """
     start = np.zeros((sensor.height, 3), np.float32)
     start[:, 2] = sensor.mount
@@ -95,10 +98,11 @@ def world_rays(
     turns, places = frames
     if len(turns) == 1:
         turn, place = turns[0], places[0]
-        origins = np.repeat(start @ turn.T + place, seen.sum(axis=1), axis=0)
-        return origins, rays.reshape(-1, 3).take(np.flatnonzero(seen), axis=0) @ turn.T
+        origins = np.repeat((start @ turn.T + place).T, seen.sum(axis=1), axis=1)
+        apart = np.moveaxis(rays, -1, 0).reshape(3, -1)
+        return origins.T, (turn @ (apart if seen.all() else apart.take(np.flatnonzero(seen), axis=1))).T
     origins = np.einsum("hj,wij->hwi", start, turns) + places
-    return origins[seen], np.einsum("hwj,wij->hwi", rays, turns)[seen]
+    return origins[seen].T.copy().T, np.einsum("hwj,wij->hwi", rays, turns)[seen].T.copy().T
 
 
 def some_rays(
@@ -123,18 +127,19 @@ def local_points(rays: np.ndarray, distance: np.ndarray, sensor: Sensor) -> np.n
 
 @lru_cache(maxsize=4)
 def _directions(sensor: Sensor) -> np.ndarray:
-    return sensor.directions()
+    """(3, H, W) float32: x, y and z of the sensor's rays."""
+    return np.ascontiguousarray(np.moveaxis(sensor.directions(), -1, 0))
 
 
 def _jittered(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
-    """(H, W, 3) float32 rays: the sensor's, turned by a third of a column at most, each ring with its own phase."""
+    """(H, W, 3) float32 rays, a view of (3, H, W): the sensor's, turned by a third of a column at most, each ring with
+    its own phase."""
     phase = rng.random((sensor.height, 1), np.float32) / 2 - 0.25
     shake = rng.random((sensor.height, sensor.width), np.float32)
     angle = (phase + 0.16 * shake - 0.08) * np.float32(2 * np.pi / sensor.width)
-    rays = _directions(sensor)
-    x = rays[..., 0] - angle * rays[..., 1]
-    y = rays[..., 1] + angle * rays[..., 0]
-    return np.stack([x, y, rays[..., 2]], axis=-1)  # small angles: the length stays 1 within 1e-6
+    x, y, z = _directions(sensor)
+    rays = np.stack([x - angle * y, y + angle * x, z])  # small angles: the length stays 1 within 1e-6
+    return np.moveaxis(rays, 0, -1)
 
 
 def attitudes(sensor: Sensor, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.areas import Area
-from lidarsynth.streets.ground import Ground, Road, ground_mesh, slab_mesh
-from lidarsynth.streets.materials import NUMBER
-from lidarsynth.streets.objects import library
+from lidarsynth.streets.ground import Ground, Road
 
 GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
 REACH = (150.0, 90.0)  # half size of the world in metres, x and y
 POSES = 16  # scans taken in one world
 STILL, TRAFFIC, WALK = 0, 1, 2  # how a thing moves once time passes
-THINGS = np.dtype([("kind", "U16"), ("variant", "i2"), ("row", "f8", 8), ("pace", "u1")])  # row as in `WorldBuilder`
+THINGS = np.dtype([("kind", "U16"), ("variant", "i2"), ("row", "f8", 8), ("pace", "u1")])  # row as `builder.ROW`
 
 
 @dataclass(frozen=True)
@@ -41,54 +38,6 @@ class World:
     poses: np.ndarray
     thing: np.ndarray
     things: np.ndarray
-
-
-@dataclass
-class WorldBuilder:
-    """Collects what is placed: rows of (x, y, z, yaw, length, width, height scales, tint, pace) per kind and
-    variant."""
-
-    rng: np.random.Generator
-    ground: Ground
-    area: Area
-    things: dict[tuple[str, int], list[np.ndarray]] = field(default_factory=dict)
-    walls: list[tuple[np.ndarray, np.ndarray, str, str]] = field(default_factory=list)  # corners, front rows, material
-
-    def put(
-        self,
-        kind: str,
-        x: np.ndarray,
-        y: np.ndarray,
-        yaw: np.ndarray,
-        up: float = 0.0,
-        clear: float | None = 0.3,
-        size: tuple[float, float] = (0.9, 1.1),
-        pace: int = STILL,
-    ) -> None:
-        """Things of one kind at (N,) places, variants drawn at random; dropped within `clear` m of a carriageway."""
-        count = len(x)
-        variants = library()[kind]
-        pick = self.rng.integers(0, len(variants), count)
-        scale = self.rng.uniform(*size, (count, 3))
-        tint = np.clip(self.rng.normal(size=count), -1.5, 2.2)
-        rows = np.column_stack([x, y, self.ground.height(x, y) + up, yaw, scale, tint, np.full(count, pace)])
-        if clear is not None:
-            keep = self.ground.carriageway(x, y) > clear
-            rows, pick = rows[keep], pick[keep]
-        for variant in np.unique(pick):
-            self.things.setdefault((kind, int(variant)), []).append(rows[pick == variant])
-
-    def put_row(
-        self, kind: str, x: np.ndarray, y: np.ndarray, yaw: np.ndarray, first: tuple[int, float, float]
-    ) -> None:
-        """Pieces of one hedge or fence: all of the same variant, height scale and tint, given by `first`."""
-        keep = self.ground.carriageway(x, y) > 0.4
-        variant = first[0] % len(library()[kind])
-        ones = np.ones(int(keep.sum()))
-        x, y, yaw = x[keep], y[keep], yaw[keep]
-        rows = np.column_stack([x, y, self.ground.height(x, y), yaw, ones, ones, ones * first[1], ones * first[2],
-                                0 * ones])  # fmt: skip
-        self.things.setdefault((kind, variant), []).append(rows)
 
 
 def draw_ground(rng: np.random.Generator, area: Area, length: float = 2 * REACH[0]) -> Ground:
@@ -157,74 +106,20 @@ def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndar
     return np.column_stack([x, y, ground.height(x, y), yaw, pitch, roll])
 
 
-def assemble(builder: WorldBuilder, poses: np.ndarray) -> World:
-    """One soup of the ground, the sidewalks, the walls and the things."""
-    bare = ground_mesh(builder.ground, (builder.ground.roads[0].stop, REACH[1]), 4.0)
-    slab, kerb = slab_mesh(builder.ground)
-    columns = [_soup(bare, GROUND, "road", "road"), _soup(slab, SLAB, "sidewalk", "sidewalk")]
-    columns[1]["material"][kerb] = NUMBER["kerb"]
-    fronts = np.zeros((0, 12), np.float32)
-    for corners, rows, material, label in builder.walls:
-        soup = _soup(corners, FRONT, material, label)
-        soup["front"] = (np.repeat(np.arange(len(rows)), len(corners) // len(rows)) + len(fronts)).astype(np.int16)
-        soup["tint"] = np.repeat(rows[:, 11], len(corners) // len(rows)).astype(np.float32)
-        fronts = np.concatenate([fronts, rows])
-        columns.append(soup)
-    placed = {key: np.concatenate(rows) for key, rows in builder.things.items()}
-    first = np.cumsum([0, *map(len, placed.values())])
-    columns += [_instances(*key, rows, start) for (key, rows), start in zip(placed.items(), first, strict=False)]
-    joined = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
-    things = [(kind, variant, row[:8], row[8]) for (kind, variant), rows in placed.items() for row in rows]
-    return World(**joined, fronts=fronts, ground=builder.ground, poses=poses, things=np.array(things, THINGS))
-
-
 def visible(world: World, sensor: Sensor) -> World:
     """The world without triangles that no pose can see: too far, or wholly above the highest beam. Faster to cast."""
     poses = world.poses.astype(np.float32)
-    spot = world.corners[:, 0]
-    high = np.flatnonzero((world.kind == THING) & (spot[:, 2] > poses[:, 2].min() + sensor.mount + 0.8))
+    spot = world.corners[:, 0].T.copy()
+    high = np.flatnonzero((world.kind == THING) & (spot[2] > poses[:, 2].min() + sensor.mount + 0.8))
     steep = np.float32(np.tan(np.radians(sensor.elevations[0]) + 0.06))  # 0.06 rad: pitch, roll and slope of the poses
-    seen = np.ones(len(spot), bool)
+    seen = np.ones(len(world.corners), bool)
     seen[high] = False
-    open_ = spot.take(high, axis=0)  # those that no pose so far has seen
+    open_ = spot.take(high, axis=1)  # those that no pose so far has seen
     for x, y, z, *_ in poses[np.argsort(np.arange(len(poses)) % 4, kind="stable")]:  # far apart first
-        away = np.hypot(open_[:, 0] - x, open_[:, 1] - y)
-        shown = (away < sensor.max_range + 5) & (open_[:, 2] - z - sensor.mount - 0.8 < steep * away)
-        seen[high[shown]] = True
-        high, open_ = high[~shown], open_.compress(~shown, axis=0)
-    table = {
-        key: getattr(world, key)[seen] for key in ("corners", "kind", "material", "label", "tint", "front", "thing")
-    }
-    return replace(world, **table)
-
-
-def _soup(corners: np.ndarray, kind: int, material: str, label: str) -> dict[str, np.ndarray]:
-    count = len(corners)
-    return {
-        "corners": np.asarray(corners, np.float32),
-        "kind": np.full(count, kind, np.uint8),
-        "material": np.full(count, NUMBER[material], np.uint8),
-        "label": np.full(count, CLASS_NUMBER[label], np.uint8),
-        "tint": np.zeros(count, np.float32),
-        "front": np.full(count, -1, np.int16),
-        "thing": np.full(count, -1, np.int32),
-    }
-
-
-def _instances(kind: str, variant: int, rows: np.ndarray, first: int) -> dict[str, np.ndarray]:
-    """Copies of one library mesh, scaled, turned and shifted by rows (N, 9), which are things `first` and on."""
-    shape = library()[kind][variant]
-    rows = rows.astype(np.float32)
-    c, s, zero = np.cos(rows[:, 3]), np.sin(rows[:, 3]), np.zeros(len(rows), np.float32)
-    turn = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1], axis=-1).reshape(-1, 3, 3) * rows[:, 4:7, None]
-    corners = shape.corners.reshape(-1, 3) @ turn + rows[:, None, :3]
-    count = len(rows)
-    return {
-        "corners": corners.reshape(-1, 3, 3),
-        "kind": np.full(count * len(shape), THING, np.uint8),
-        "material": np.tile(shape.material, count),
-        "label": np.tile(shape.label, count),
-        "tint": np.repeat(rows[:, 7], len(shape)),
-        "front": np.full(count * len(shape), -1, np.int16),
-        "thing": np.repeat(np.arange(first, first + count, dtype=np.int32), len(shape)),
-    }
+        away = np.hypot(open_[0] - x, open_[1] - y)
+        shown = (away < sensor.max_range + 5) & (open_[2] - z - sensor.mount - 0.8 < steep * away)
+        seen[high.compress(shown)] = True
+        if 8 * np.count_nonzero(shown) > len(high):
+            high, open_ = high.compress(~shown), open_.compress(~shown, axis=1)
+    left, keys = np.flatnonzero(seen), ("corners", "kind", "material", "label", "tint", "front", "thing")
+    return replace(world, **{key: getattr(world, key).take(left, axis=0) for key in keys})
