@@ -151,7 +151,7 @@ def test_files_of_another_kind_get_one_line(tmp_path):
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "folder.toml").mkdir()
     for name, message in {
-        "list.json": r"list: expected .*, found \[1, 2\]",
+        "list.json": r"list.json: expected .*, found \[1, 2\]",
         "bad.json": "bad.json: expected JSON, found",
         "binary.json": "binary.json: expected text in UTF-8, found invalid start byte",
         "folder.toml": "folder.toml: expected a file, found a folder",

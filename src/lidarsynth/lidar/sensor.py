@@ -162,7 +162,9 @@ class Sensor:
 def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> Sensor:
     """A sensor from a plain table; `elevations` in degrees, or `beams`, `top` and `bottom` for even spacing.
 
-    `name` is that of a table without one; None = `source`, which begins messages. Raises ValueError that names the unknown or missing field.
+    source  begins every message
+    name    of a table without one; None = `source`
+    Raises ValueError that names the unknown or missing field.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected a table of a sensor's fields, found {values!r:.60}")
