@@ -25,7 +25,10 @@ PICTURES, NAMED = 10, 5  # scans that get a picture unasked; failures that are n
 class Many:
     """Of bags, frames, and many scans."""
 
-    topic: Annotated[str | None, arg(metavar="NAME", help="of a bag; its only one of points if not given.")] = None
+    topic: Annotated[
+        str | None,
+        arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
+    ] = None
     keep_topics: Annotated[bool, arg(help="copy all other topics of a bag into the new bag.")] = False
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None
     transform: Annotated[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag
 from lidarsynth.data.capture import datagrams, is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.index import INDEX, read_index, report
+from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.verbs.inputs import capture_turns, has_scans, is_stream
+from lidarsynth.verbs.inputs import has_scans, is_stream
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 
@@ -106,17 +108,16 @@ def _scale(cloud: Cloud) -> str:
 
 
 def _capture(path: Path) -> Lines:
-    sizes: dict[tuple[int, int], int] = {}
-    for number, packet in enumerate(datagrams(path)):
-        if number >= LOOKED_AT:
-            break
-        key = packet.port, len(packet.payload)
-        sizes[key] = sizes.get(key, 0) + 1
-    listed = ", ".join(f"{count} of {size} bytes to port {port}" for (port, size), count in sizes.items())
+    sizes = Counter((p.sender, len(p.payload)) for p in islice(datagrams(path), LOOKED_AT))
+    listed = ", ".join(f"{count} of {size} bytes as {sender}" for (sender, size), count in sizes.most_common(6))
+    listed += ", ..." if len(sizes) > 6 else ""
     lines = {"kind": "network capture", "packets": f"{listed or 'none'} (of the first {LOOKED_AT})"}
-    turns = capture_turns(path)
-    fields = next(turns)
-    return lines | {f"first turn: {key}": text for key, text in scan_lines(*scan_from_fields(fields)).items()}
+    found = senders(path)
+    for sender in found:
+        scan, dropped = scan_from_fields(next(capture_turns(path, None, sender)))
+        title = "first turn" if len(found) == 1 else f"--topic {sender}"
+        lines |= {f"{title}: {key}": text for key, text in scan_lines(scan, dropped).items()}
+    return lines
 
 
 def _cache(path: Path) -> Lines:
