@@ -127,6 +127,10 @@ def test_two_sensors_of_a_capture_are_told_apart(tmp_path: Path):
         next(capture_turns(path))
     with pytest.raises(FileError, match=r"as 10.0.0.3:1, found"):
         next(capture_turns(path, None, "10.0.0.3:1"))
+    later, after = inputs_of([path, path.with_name("two.pcap")], Reading()).stream()
+    assert {later.name, after.name} == {"two"}, "one broken capture is named, and the others go on"
+    with pytest.raises(FileError, match="one LiDAR"):
+        later.read()
     for host, metres in ((1, 10), (2, 4)):
         turn = next(capture_turns(path, None, f"10.0.0.{host}:2368"))
         flat = np.hypot(turn["x"], turn["y"])

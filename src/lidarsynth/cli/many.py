@@ -73,6 +73,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
     if out.suffix.lower() in FORMATS:
+        if many.format is not None:
+            raise ValueError(f"{out}: expected a folder with --format {many.format}, found a bag")
         return _into_bag(job, inputs, paths, out, many)
     if many.keep_topics:
         raise ValueError(f"{out}: expected a .mcap or .bag to keep topics in, found another kind of output")

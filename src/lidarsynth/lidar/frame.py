@@ -155,7 +155,7 @@ def _from_sensor(scan: Scan, rotation: np.ndarray) -> Scan:
 
 def _known(scan: Scan, up: str, lift: float) -> bool:
     """Whether the beams are a known sensor's, were `up` the upper side and they left its origin `lift` metres above."""
-    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T + np.float32([0, 0, lift])
+    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T + np.array([0, 0, lift], np.float32)
     ring = rings_of(scan, xyz)
     return recognise(Scan(xyz, scan.reflectance, ring=ring))[0] is not None
 

@@ -17,7 +17,7 @@ LOWEST = 0.002  # of the points are left out to find the lowest
 def misfit(xyz: np.ndarray, sensor: Sensor) -> str | None:
     """What points (N, 3) beyond 3 m have that the sensor's could not, in words, or None."""
     lift = float(np.mean(sensor.offsets)) if sensor.offsets else 0.0
-    far = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR] - np.float32([0, 0, lift])
+    far = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR] - np.array([0, 0, lift], np.float32)
     if len(far) < 100:
         return None
     elevation, (top, bottom) = elevations_of(far), (sensor.elevations[0], sensor.elevations[-1])

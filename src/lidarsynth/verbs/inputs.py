@@ -124,6 +124,19 @@ class TurnInput:
 
 
 @dataclass(frozen=True)
+class BrokenInput:
+    """What is left of a bag or capture from where it is broken."""
+
+    name: str
+    path: Path
+    error: str
+
+    def read(self) -> Loaded:
+        """Raises FileError."""
+        raise FileError(self.error)
+
+
+@dataclass(frozen=True)
 class Inputs:
     """Scans to come, in order.
 
@@ -154,7 +167,12 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     def stream() -> Iterator[Input]:
         yield from files
         for path in streams:
-            yield from _bag_inputs(path, reading) if is_bag(path) else _capture_inputs(path, reading)
+            try:
+                yield from _bag_inputs(path, reading) if is_bag(path) else _capture_inputs(path, reading)
+            except FileError as error:
+                if len(expanded) == 1:
+                    raise
+                yield BrokenInput(path.stem, path, str(error))  # the others go on
 
     return Inputs(single, count, stream)
 
@@ -174,6 +192,8 @@ def _expanded(path: Path) -> list[Path]:
     if path.is_dir() and not is_bag(path) and not _is_scan(path):
         bags = sorted(p for p in path.iterdir() if is_stream(p))
         return bags if bags and not has_scans(path) else scan_files(path)
+    if not (path.exists() or _is_scan(path) or is_stream(path)):
+        raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
     return [path]
 
 
