@@ -39,6 +39,7 @@ from lidarsynth.data.bags import Cloud, naming, open_bag
 from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.data.ouster import read_metadata, sensor_of
 from lidarsynth.data.street_sets import _claim, _settings
+from lidarsynth.data.turns import capture_turns
 from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.protocols import BEV_1
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
@@ -54,7 +55,6 @@ from lidarsynth.networks.sparse_weights import read_sparse
 from lidarsynth.streets.frame import LabelledStreets
 from lidarsynth.systems.table import build_network, load_folder
 from lidarsynth.verbs.generation import claim
-from lidarsynth.verbs.inputs import capture_turns
 from lidarsynth.weights.official import read_official
 
 SECONDS = 10  # of the processor that one file may take

@@ -148,6 +148,10 @@ def test_points_of_another_frame_come_back_where_they_were(tmp_path: Path, capsy
     assert "m above the origin" in (error := capsys.readouterr().err) and "--transform 0:0:-1." in error
     main([*words, str(tmp_path / "a.ply")])
     assert "above the origin" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):  # the beams are no known sensor's, as the frame is another
+        main(["project", *words[1:2], "--no-picture", "--out", str(tmp_path / "a.npz")])
+    error = capsys.readouterr().err
+    assert error.index("above the origin") < error.index("as they are: ") < error.index("--sensor")
     main([*words, str(tmp_path / "b.ply"), "--mount", "1.73", "--strict"])
     assert capsys.readouterr().err == ""
     filled = read(tmp_path / "b.ply")

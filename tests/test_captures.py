@@ -8,6 +8,7 @@ import pytest
 
 from lidarsynth.data import ouster, velodyne
 from lidarsynth.data.capture import Datagram, datagrams
+from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.verbs.inputs import Reading, inputs_of
@@ -110,6 +111,30 @@ def test_velodyne_turns_are_cut_at_azimuth_0():
         velodyne.decode(velodyne_packet(0xA1, 0, 40, 5000))
     both = velodyne.decode(velodyne_packet(0x22, 0, 40, 5000, dual=True))[0]
     assert len(both["x"]) == 6 * 32, "of two returns the last one"
+
+
+def test_two_sensors_of_a_capture_are_told_apart(tmp_path: Path):
+    def frames(distance: int, host: int, tag: bytes = b"") -> list[bytes]:
+        packets = [udp(velodyne_packet(0x22, i * 480, 40, distance), 2368) for i in range(160)]
+        packets = [p[:26] + bytes([10, 0, 0, host]) + p[30:] for p in packets]  # whose they are
+        return [p[:12] + tag + p[12:] for p in packets]
+
+    path = tmp_path / "two.pcap"
+    both = zip(frames(5000, 1, b"\x88\xa8\0\5\x81\0\0\6"), frames(2000, 2), strict=True)
+    path.write_bytes(pcap([frame for pair in both for frame in pair]))
+    assert senders(path) == ["10.0.0.1:2368", "10.0.0.2:2368"]
+    with pytest.raises(FileError, match=r"one LiDAR, or --topic .* found 10.0.0.1:2368, 10.0.0.2:2368"):
+        next(capture_turns(path))
+    with pytest.raises(FileError, match=r"as 10.0.0.3:1, found"):
+        next(capture_turns(path, None, "10.0.0.3:1"))
+    later, after = inputs_of([path, path.with_name("two.pcap")], Reading()).stream()
+    assert {later.name, after.name} == {"two"}, "one broken capture is named, and the others go on"
+    with pytest.raises(FileError, match="one LiDAR"):
+        later.read()
+    for host, metres in ((1, 10), (2, 4)):
+        turn = next(capture_turns(path, None, f"10.0.0.{host}:2368"))
+        flat = np.hypot(turn["x"], turn["y"])
+        assert len(flat) == 900 * 32 and flat.max() == pytest.approx(metres, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ouster.PROFILES)

@@ -13,6 +13,7 @@ from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.view import misfit
 from lidarsynth.verbs.inputs import read_transform
 
 MOVES = {
@@ -72,6 +73,16 @@ def test_height_and_tilt_show_without_rings_and_in_any_order(name: str):
     frame = check_frame(moved(scan, tilt))
     assert "tilted by 6.4 degrees" in str(frame.warning())
     np.testing.assert_allclose((frame.transform @ tilt)[:3, 2], [0, 0, 1], atol=2e-3)
+
+
+def test_points_that_a_named_sensor_could_not_see():
+    scan = street("hdl-32e", rings=False)
+    assert misfit(scan.xyz, SENSORS["hdl-32e"]) is None
+    assert "outside its view of -15.0" in str(misfit(scan.xyz, SENSORS["vlp-16"]))
+    raised = transformed(scan.xyz, parse_transform("0:0:1.73:0:0:0"))
+    assert "outside its view of -30.7 to +10.7" in str(misfit(raised, SENSORS["hdl-32e"]))
+    level = scan.xyz[np.abs(scan.xyz[:, 2]) < 0.1 * np.hypot(scan.xyz[:, 0], scan.xyz[:, 1])]
+    assert "lowest beams of 32" in str(misfit(level, SENSORS["hdl-32e"]))
 
 
 def test_points_on_no_beams_have_no_stand():

@@ -1,5 +1,6 @@
 """The texts of `info` and the tables of errors hold the numbers they should."""
 
+import gzip
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 from networks import trained
 
+import lidarsynth as ls
+from lidarsynth.data.folder import scan_files
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Card
@@ -16,6 +19,8 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.systems.table import build_network
 from lidarsynth.verbs.description import describe, describe_sensor, errors_table, mean_table
+from lidarsynth.viewer.packing import Shown
+from lidarsynth.viewer.page import Entry, write_page
 
 
 def table(text: str) -> dict[str, str]:
@@ -78,6 +83,59 @@ def test_sensor_of_one_beam(tmp_path: Path):
 def test_unknown_words_are_refused():
     with pytest.raises(ValueError, match=r"^nothing: expected .* found no file or folder"):
         describe("nothing")
+
+
+PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
+OTHERS = {
+    "a.png": (PNG, "picture, PNG of 640 x 480"),
+    "a.tar.gz": (gzip.compress(b"scans"), "archive, gzip"),
+    "page.html": (b"<!DOCTYPE html><title>mine</title>", "web page, not one of lidarsynth's"),
+    "a.yaml": (b"lidar: 1\n", "text, no scan"),
+    "a.label": (np.uint32([40, 40, (7 << 16) | 10]).tobytes(), "SemanticKITTI labels of 3 points"),
+    "a.new": (b"\0\1\1", "marks of a completed scan of 3 points"),
+    "a.confidence": (np.float32([0.25, 1]).tobytes(), "confidences of a completed scan of 2 points"),
+    "own.toml": (b"beams = 4\ntop = 2\nbottom = -2", "sensor"),
+    "report.json": (b'{"settings": 0, "done": 2, "skipped": 0, "failed": 1, "seconds": 1, "scans": []}', "report of"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_no_scan_is_named(tmp_path: Path, name: str):
+    content, kind = OTHERS[name]
+    (tmp_path / name).write_bytes(content)
+    assert table(describe(str(tmp_path / name)))["kind"].startswith(kind)
+
+
+def test_a_page_of_ours_says_its_scans(tmp_path: Path):
+    scan = Scan(np.float32([[5, 4, 0], [3, 0, 1]]), np.float32([0, 1]))
+    write_page(tmp_path / "v.html", "t", [Entry(f"it's {i} <b>", {"s": Shown(scan)}) for i in range(4)])
+    said = table(describe(str(tmp_path / "v.html")))
+    assert said["kind"].startswith("page of lidarsynth view")
+    assert said["scans"] == "4: it's 0 <b>, it's 1 <b>, it's 2 <b>, ..."
+
+
+def test_a_folder_says_what_it_holds_and_passes_over(tmp_path: Path):
+    scan = Scan(np.float32([[5, 4, 0], [3, 0, 1]]), np.float32([0, 1]))
+    for name in ("a.ply", "b.bin", "rings/b.ply", "RADAR_FRONT/b.pcd"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write(tmp_path / name, scan)
+    (tmp_path / "notes.md").write_text("no scan")
+    assert [p.name for p in scan_files(tmp_path)] == ["a.ply", "b.bin"]
+    assert [p.name for p in scan_files(tmp_path / "rings")] == ["b.ply"], "named by itself, it is meant"
+    said = table(describe(str(tmp_path)))
+    assert said["kind"] == "folder of scans" and said["scans"] == "1 .bin, 1 .ply"
+    assert said["passed"] == "over         1 .md, 1 .pcd, 1 .ply"
+
+
+def test_a_folder_without_scans_is_refused_by_what_it_holds(tmp_path: Path):
+    (tmp_path / "notes.md").write_text("no scan")
+    with pytest.raises(ValueError, match=r"expected scans.* found 1 \.md"):
+        describe(str(tmp_path))
+
+
+def test_a_range_image_says_its_sensor(tmp_path: Path):
+    ls.write(tmp_path / "i.npz", ls.project(Scan(np.float32([[9, 0, 0]]), np.float32([1])), "vlp-16", "spherical"))
+    assert table(describe(str(tmp_path / "i.npz")))["kind"].startswith("range image of vlp-16, 16 x 1024")
 
 
 def test_tables_of_errors():

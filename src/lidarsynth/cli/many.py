@@ -25,7 +25,10 @@ PICTURES, NAMED = 10, 5  # scans that get a picture unasked; failures that are n
 class Many:
     """Of bags, frames, and many scans."""
 
-    topic: Annotated[str | None, arg(metavar="NAME", help="of a bag; its only one of points if not given.")] = None
+    topic: Annotated[
+        str | None,
+        arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
+    ] = None
     keep_topics: Annotated[bool, arg(help="copy all other topics of a bag into the new bag.")] = False
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None
     transform: Annotated[
@@ -70,6 +73,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
     if out.suffix.lower() in FORMATS:
+        if many.format is not None:
+            raise ValueError(f"{out}: expected a folder with --format {many.format}, found a bag")
         return _into_bag(job, inputs, paths, out, many)
     if many.keep_topics:
         raise ValueError(f"{out}: expected a .mcap or .bag to keep topics in, found another kind of output")

@@ -18,7 +18,9 @@ def sensor(
         ),
     ],
     out: Annotated[Path, arg(help=".toml to write, which every --sensor takes.")] = Path("sensor.toml"),
-    topic: Annotated[str | None, arg(metavar="NAME", help="of a bag.")] = None,
+    topic: Annotated[
+        str | None, arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture.")
+    ] = None,
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None,
     seed: NoSeed = 0,
     intensity: Intensity = "none",

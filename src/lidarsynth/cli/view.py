@@ -26,7 +26,10 @@ def view(
     browser: Annotated[bool, arg(help="open the page, where there is a screen.")] = True,
     seed: NoSeed = 0,
     intensity: Intensity = "auto",
-    topic: Annotated[str | None, arg(metavar="NAME", help="of a bag; its only one of points if not given.")] = None,
+    topic: Annotated[
+        str | None,
+        arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
+    ] = None,
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None,
     transform: Annotated[
         str | None,

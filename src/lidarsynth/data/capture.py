@@ -16,14 +16,21 @@ NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 18
 ETHERNET, RAW_IP, LOOPBACK, LINUX = 1, (12, 101, 228), 0, 113  # link types (the tcpdump group's list)
 IPV4, UDP = 0x0800, 17
+VLAN = (b"\x81\x00", b"\x88\xa8", b"\x91\x00")  # IEEE 802.1Q, 802.1ad, and what came before it
 
 
 class Datagram(NamedTuple):
-    """One UDP packet: nanoseconds of its capture, its destination port, its payload."""
+    """One UDP packet: nanoseconds of its capture, its destination port, its payload, the IPv4 address of its sender."""
 
     time: int
     port: int
     payload: bytes
+    address: str = ""
+
+    @property
+    def sender(self) -> str:
+        """ADDRESS:PORT: several sensors differ in where they are, or in the port that they send to."""
+        return f"{self.address}:{self.port}"
 
 
 def is_capture(path: str | Path) -> bool:
@@ -102,13 +109,13 @@ def _ip(frame: bytes, link: int) -> bytes:
         return frame[4:]
     at = 16 if link == LINUX else 14
     kind = frame[at - 2 : at]
-    while kind == b"\x81\x00" and link == ETHERNET:  # a VLAN's tag
+    while kind in VLAN and link == ETHERNET:  # a tag each
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if kind == IPV4.to_bytes(2, "big") else b""
 
 
-def _udp(packet: bytes, fragments: dict[bytes, dict[int, bytes]]) -> tuple[int, bytes] | None:
-    """(destination port, payload) once a UDP packet is whole, else None; `fragments` keeps what waits."""
+def _udp(packet: bytes, fragments: dict[bytes, dict[int, bytes]]) -> tuple[int, bytes, str] | None:
+    """(destination port, payload, sender's address) once a UDP packet is whole; `fragments` keeps what waits."""
     if len(packet) < 20 or packet[0] >> 4 != 4 or packet[9] != UDP:
         return None
     head, total = (packet[0] & 15) * 4, int.from_bytes(packet[2:4], "big")
@@ -119,7 +126,7 @@ def _udp(packet: bytes, fragments: dict[bytes, dict[int, bytes]]) -> tuple[int, 
         body = _joined(packet[4:6] + packet[12:20], offset, more, body, fragments)
     if len(body) < 8:
         return None
-    return int.from_bytes(body[2:4], "big"), body[8:]
+    return int.from_bytes(body[2:4], "big"), body[8:], ".".join(map(str, packet[12:16]))
 
 
 def _joined(key: bytes, offset: int, more: bool, body: bytes, fragments: dict[bytes, dict[int, bytes]]) -> bytes:

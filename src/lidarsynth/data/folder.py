@@ -7,6 +7,10 @@ from pathlib import Path
 from lidarsynth.data.frames import Frame, Frames
 from lidarsynth.files.formats import NAMED_ONLY, READERS
 
+# Folders of published data sets, and of ours, whose .bin and .pcd hold a value a point, or a radar's points: no scans.
+BESIDE = ("labels", "rings", "point_times", "lidarseg", "panoptic", "predictions")
+RADAR = "radar_"
+
 
 def folder(root: str | Path, intensity: str = "auto") -> Frames:
     """Every scan under `root`, sorted by path; sequence = the folder below `root`, frame = the file's name.
@@ -25,12 +29,18 @@ def _frame(path: Path, root: Path) -> Frame:
 
 
 def scan_files(root: str | Path) -> list[Path]:
-    """The scan files under a folder, sorted. Raises ValueError when there is none."""
+    """The scan files under a folder, sorted, but those of BESIDE and of radars. Raises ValueError without any."""
     root = Path(root)
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
     endings = tuple(suffix for suffix in READERS if suffix not in NAMED_ONLY)
-    paths = sorted(p for p in root.rglob("*") if p.is_file() and p.name.lower().endswith(endings))
+    named = (path for path in root.rglob("*") if path.name.lower().endswith(endings))
+    paths = sorted(path for path in named if not _beside(path.relative_to(root)) and path.is_file())
     if not paths:
         raise ValueError(f"{root}: expected scans ({', '.join(READERS)}), found none")
     return paths
+
+
+def _beside(path: Path) -> bool:
+    """Whether a path below the folder leads through one that holds something else of each point."""
+    return any(part in BESIDE or part.startswith(RADAR) for part in map(str.lower, path.parts[:-1]))

@@ -133,17 +133,27 @@ def sensor_of(metadata: Metadata, name: str | None = None) -> Sensor:
     return Sensor(name or metadata.name, tuple(pairs), metadata.columns, 0.3, 240.0, (lift,) * len(pairs))
 
 
+def packet_size(metadata: Metadata) -> int:
+    """Bytes of a lidar packet. Raises FileError for a profile that is not in PROFILES."""
+    if metadata.profile not in PROFILES:
+        raise FileError(f"expected packets of {', '.join(PROFILES)}, found {metadata.profile}")
+    profile = PROFILES[metadata.profile]
+    return profile.header + metadata.packet_columns * _column_size(metadata) + profile.footer
+
+
+def _column_size(metadata: Metadata) -> int:
+    profile = PROFILES[metadata.profile]
+    return sum(profile.column) + len(metadata.altitudes) * profile.pixel
+
+
 def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
     """Turns: x y z intensity (signal) reflectivity ambient ring time (seconds) of each return, row by row.
 
     Sensor frame: x forward, y left, z up; ring = row, 0 the highest beam. A turn ends where the frame's number
     changes; packets of other sizes are passed over. Raises FileError for a profile that is not in PROFILES.
     """
-    if metadata.profile not in PROFILES:
-        raise FileError(f"expected packets of {', '.join(PROFILES)}, found {metadata.profile}")
-    profile, height = PROFILES[metadata.profile], len(metadata.altitudes)
-    column = sum(profile.column) + height * profile.pixel
-    size = profile.header + metadata.packet_columns * column + profile.footer
+    size, column = packet_size(metadata), _column_size(metadata)
+    profile = PROFILES[metadata.profile]
     turn, number = _Turn(metadata, profile), None
     for packet in packets:
         if len(packet.payload) != size:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarsynth.lidar.cones import fit_cones, onto_z
-from lidarsynth.lidar.crowding import stand_of_beams
+from lidarsynth.lidar.crowding import ORIGINS, stand_of_beams
 from lidarsynth.lidar.ground import levels, road_axis
 from lidarsynth.lidar.recognition import recognise, rings_by_elevation, rings_in_order
 from lidarsynth.lidar.scan import Scan
@@ -136,7 +136,7 @@ def _side(scan: Scan, axis: str) -> str:
     upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > 0.6 and upper > UPSIDE * lower:
         return "+" + axis
-    up, down = (_known(seen, sign + axis) for sign in "+-")
+    up, down = (any(_known(seen, sign + axis, lift) for lift in ORIGINS) for sign in "+-")
     if up != down:
         return ("+" if up else "-") + axis
     return ("-" if lower > UPSIDE * upper and lower > 1 / 3 else "+") + axis
@@ -153,9 +153,9 @@ def _from_sensor(scan: Scan, rotation: np.ndarray) -> Scan:
     return replace(scan, xyz=(scan.xyz - height * rotation[2]).astype(np.float32))
 
 
-def _known(scan: Scan, up: str) -> bool:
-    """Whether the beams are a known sensor's, were `up` the upper side."""
-    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T
+def _known(scan: Scan, up: str, lift: float) -> bool:
+    """Whether the beams are a known sensor's, were `up` the upper side and they left its origin `lift` metres above."""
+    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T + np.array([0, 0, lift], np.float32)
     ring = rings_of(scan, xyz)
     return recognise(Scan(xyz, scan.reflectance, ring=ring))[0] is not None
 

@@ -159,9 +159,11 @@ class Sensor:
         return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self).items()}
 
 
-def from_dict(values: dict, source: str = "sensor") -> Sensor:
+def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> Sensor:
     """A sensor from a plain table; `elevations` in degrees, or `beams`, `top` and `bottom` for even spacing.
 
+    source  begins every message
+    name    of a table without one; None = `source`
     Raises ValueError that names the unknown or missing field.
     """
     if not isinstance(values, dict):
@@ -188,7 +190,7 @@ def from_dict(values: dict, source: str = "sensor") -> Sensor:
         values[key] = tuple(numbers[i] for i in order) if len(numbers) == len(order) else tuple(numbers)
     values |= {"tilt": tuple(_numbers(values.get("tilt", (0.0, 0.0)), source)), "blocked": _runs(values, source)}
     try:
-        return Sensor(**{"name": source, **values})
+        return Sensor(**{"name": name or source, **values})
     except TypeError as error:
         raise ValueError(f"{source}: expected numbers in the sensor's fields, found {error}") from None
 
@@ -215,9 +217,9 @@ def read_sensor(path: str | Path) -> Sensor:
     path = Path(path)
     try:
         if path.suffix == ".toml":
-            return from_dict(read_toml(path), path.stem)
+            return from_dict(read_toml(path), str(path), path.stem)
         if path.suffix == ".json":
-            return from_dict(read_json(path), path.stem)
+            return from_dict(read_json(path), str(path), path.stem)
     except OSError as error:
         raise ValueError(f"{path}: expected a readable sensor file, found {error.strerror}") from None
     raise ValueError(f"{path}: expected a .toml or .json sensor file, found {path.suffix or 'no suffix'}")

@@ -20,6 +20,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
@@ -129,7 +130,7 @@ def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> C
 
 
 def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Result:
-    begun = time.perf_counter()
+    begun, warning = time.perf_counter(), None
     try:
         loaded = work.item.read()
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
@@ -144,7 +145,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     except (ValueError, FloatingPointError) as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT):
             raise  # that is no fault of the scan, and the next ones would not fit either
-        return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, str(error))
+        text = str(error) if warning is None or warning == str(error) else f"{warning}; as they are: {error}"
+        return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, text)
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
     whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
@@ -155,10 +157,21 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
     if not (work.check or job.strict):
         return None
     frame = check_frame(loaded.scan)
-    warning = frame.warning()
-    if warning is not None and frame.faults and job.strict:
+    alien = None if frame.faults else _misfit(loaded.scan, job)
+    warning = alien or frame.warning()
+    if warning is not None and (frame.faults or alien) and job.strict:
         raise ValueError(f"{work.item.path}: {warning}")
     return None if warning is None else f"{work.item.path}: {warning}"
+
+
+def _misfit(scan: Scan, job: Job) -> str | None:
+    """That the points cannot be of the sensor that was named as theirs, in one line."""
+    if job.sensor is None or job.verb not in ("complete", "upsample"):
+        return None
+    sensor = get_sensor(job.sensor)
+    found = misfit(scan.xyz, sensor)
+    return found and f"expected points of {sensor.name}, found {found}: is it another sensor, or another frame " \
+                     "(--transform, --mount)?"  # fmt: skip
 
 
 def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:

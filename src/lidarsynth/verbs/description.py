@@ -36,6 +36,7 @@ def describe_sensor(sensor: Sensor) -> str:
     steps = -np.diff(sensor.elevations)
     spacing = f", {steps.min():.2f} to {steps.max():.2f} degrees apart" if len(steps) else ""
     lines = {
+        "kind": "sensor",
         "beams": f"{sensor.height} from {sensor.elevations[0]:+.2f} to {sensor.elevations[-1]:+.2f} degrees{spacing}",
         "columns": f"{sensor.width}, {360 / sensor.width:.3f} degrees apart",
         "range": f"{sensor.min_range:g} to {sensor.max_range:g} m",

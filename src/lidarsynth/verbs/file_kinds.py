@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from lidarsynth.data import ouster
 from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag
 from lidarsynth.data.capture import datagrams, is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.index import INDEX, read_index, report
+from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
-from lidarsynth.files.formats import READERS, read_with_report
+from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
-from lidarsynth.verbs.inputs import capture_turns, has_scans
+from lidarsynth.verbs.inputs import has_scans, is_stream
+from lidarsynth.verbs.json_kinds import json_lines
+from lidarsynth.verbs.other_files import other_lines
 
 Lines = dict[str, str]
 LOOKED_AT = 400  # packets of a capture that are counted
@@ -41,21 +43,32 @@ def file_lines(path: Path) -> Lines | None:
     if path.is_dir():
         if not any(path.iterdir()):
             raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
-        if not (is_bag(path) or (path / INDEX).exists() or has_scans(path)):
-            return None
         return _bag(path) if is_bag(path) else _cache(path) if (path / INDEX).exists() else _folder(path)
     if path.name.lower().endswith(tuple(READERS)):
-        return scan_lines(*read_with_report(path))
+        return _image(path) | scan_lines(*read_with_report(path))
     if is_bag(path):
         return _bag(path)
     if is_capture(path):
         return _capture(path)
     if path.suffix.lower() in KINDS:
         return KINDS[path.suffix.lower()](path)
+    if lines := other_lines(path):
+        return lines
     with open(path, "rb") as file:
         start = file.read(12)
-    raise FileError(f"{path}: expected a scan ({', '.join(READERS)}), bag, capture, sensor, cache or model, "
-                    f"found {path.stat().st_size} bytes that begin with {start!r}")  # fmt: skip
+    content = f"{path.stat().st_size} bytes that begin with {start!r}" if start else "an empty file"
+    raise FileError(
+        f"{path}: expected a scan ({', '.join(READERS)}), bag, capture, sensor, cache or model, found {content}"
+    )
+
+
+def _image(path: Path) -> Lines:
+    """Of a range image in `.npz`."""
+    if path.suffix.lower() != ".npz" or not holds_image(path):
+        return {}
+    image = read_image(path)
+    return {"kind": f"range image of {image.sensor.name}, {image.shape[0]} x {image.shape[1]}, "
+                    f"{image.mask.mean():.1%} of its pixels filled"}  # fmt: skip
 
 
 def scan_lines(scan: Scan, dropped: int = 0) -> Lines:
@@ -95,17 +108,16 @@ def _scale(cloud: Cloud) -> str:
 
 
 def _capture(path: Path) -> Lines:
-    sizes: dict[tuple[int, int], int] = {}
-    for number, packet in enumerate(datagrams(path)):
-        if number >= LOOKED_AT:
-            break
-        key = packet.port, len(packet.payload)
-        sizes[key] = sizes.get(key, 0) + 1
-    listed = ", ".join(f"{count} of {size} bytes to port {port}" for (port, size), count in sizes.items())
+    sizes = Counter((p.sender, len(p.payload)) for p in islice(datagrams(path), LOOKED_AT))
+    listed = ", ".join(f"{count} of {size} bytes as {sender}" for (sender, size), count in sizes.most_common(6))
+    listed += ", ..." if len(sizes) > 6 else ""
     lines = {"kind": "network capture", "packets": f"{listed or 'none'} (of the first {LOOKED_AT})"}
-    turns = capture_turns(path)
-    fields = next(turns)
-    return lines | {f"first turn: {key}": text for key, text in scan_lines(*scan_from_fields(fields)).items()}
+    found = senders(path)
+    for sender in found:
+        scan, dropped = scan_from_fields(next(capture_turns(path, None, sender)))
+        title = "first turn" if len(found) == 1 else f"--topic {sender}"
+        lines |= {f"{title}: {key}": text for key, text in scan_lines(scan, dropped).items()}
+    return lines
 
 
 def _cache(path: Path) -> Lines:
@@ -116,16 +128,36 @@ def _cache(path: Path) -> Lines:
 
 
 def _folder(path: Path) -> Lines:
-    files = scan_files(path)
-    kinds: dict[str, int] = {}
-    for file in files:
-        kinds[file.suffix] = kinds.get(file.suffix, 0) + 1
-    return {"kind": "folder of scans", "scans": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
-            "first": str(files[0].relative_to(path))} | _first(files[0])  # fmt: skip
+    """A folder of scans, or of bags and captures: what it holds, what else, and the first scan."""
+    files, streams = scan_files(path) if has_scans(path) else [], sorted(p for p in path.iterdir() if is_stream(p))
+    if not files and not streams:
+        raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
+    if not files:
+        listed = ", ".join(p.name for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
+        return {"kind": f"folder of {len(streams)} bags and captures", "files": listed}
+    lines = {"kind": "folder of scans", "scans": _counted(None, files)}
+    if rest := _counted(path, files):
+        lines["passed over"] = rest
+    try:
+        first = {f"first: {key}": text for key, text in scan_lines(*read_with_report(files[0])).items()}
+    except FileError as error:
+        first = {"first: broken": str(error)}
+    return lines | {"first": str(files[0].relative_to(path))} | first
 
 
-def _first(path: Path) -> Lines:
-    return {f"first: {key}": text for key, text in scan_lines(*read_with_report(path)).items()}
+def _counted(folder: Path | None, scans: list[Path]) -> str:
+    """Files by ending, the most first: the scans, or what else is below `folder`."""
+    beside = set(scans)
+    files = scans if folder is None else [p for p in folder.rglob("*") if p.is_file() and p not in beside]
+    kinds = Counter(sorted(ending(file.name) for file in files))
+    listed = [f"{count} {kind}" for kind, count in kinds.most_common(8)]
+    return ", ".join(listed) + (", ..." if len(kinds) > 8 else "")
+
+
+def ending(name: str) -> str:
+    """What tells the kind of a file: .pcd.bin of a.pcd.bin, or the name of one without an ending."""
+    known = [suffix for suffix in READERS if name.lower().endswith(suffix)]
+    return max(known, key=len, default=Path(name).suffix.lower() or name)
 
 
 def _tensors(path: Path) -> Lines:
@@ -143,24 +175,6 @@ def _tensors(path: Path) -> Lines:
     return lines | {key: text[:200] for key, text in list(told.items())[:8]}
 
 
-def _json(path: Path) -> Lines:
-    if ouster.is_metadata(path):
-        found = ouster.read_metadata(path)
-        beams = f"{len(found.altitudes)} from {max(found.altitudes):+.2f} to {min(found.altitudes):+.2f} degrees"
-        return {"kind": "metadata of an Ouster sensor", "beams": beams, "columns": str(found.columns),
-                "packets": found.profile}  # fmt: skip
-    try:
-        values: Any = read_json(path, LARGEST_INDEX)
-    except OSError as error:
-        raise FileError(f"{path}: expected JSON, found: {error.strerror}") from None
-    if isinstance(values, Mapping) and {"settings", "done", "scans"} <= values.keys():
-        return {"kind": "report of many scans"} | {k: str(values[k]) for k in ("done", "skipped", "failed", "seconds")}
-    if isinstance(values, Mapping) and ("elevations" in values or "beams" in values):
-        return {}
-    keys = ", ".join(list(values)[:6]) if isinstance(values, Mapping) else type(values).__name__
-    raise FileError(f"{path}: expected a sensor, Ouster metadata or a report in JSON, found {keys}")
-
-
 MODELS = (".pth", ".pt", ".h5", ".toml")  # `load_parts` and `get_sensor` know them
 STREAMS = (".bag", ".mcap", ".db3", ".pcap", ".pcapng")
-KINDS: dict[str, Callable[[Path], Lines]] = {".safetensors": _tensors, ".json": _json}
+KINDS: dict[str, Callable[[Path], Lines | None]] = {".safetensors": _tensors, ".json": json_lines}

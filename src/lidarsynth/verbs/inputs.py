@@ -11,10 +11,10 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarsynth.data import ouster, velodyne
 from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
-from lidarsynth.data.capture import datagrams, is_capture
+from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import scan_files
+from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import Fields, FileError, find, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.files.labels import label_path
@@ -28,7 +28,7 @@ class Reading:
     """How scans are read.
 
     intensity  scale, as in `files.formats.read_with_report`
-    topic      of a bag; None = the only one of points
+    topic      of a bag, or ADDRESS:PORT of a sensor in a capture; None = the only one
     metadata   `.json` of an Ouster capture; None = the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
@@ -124,6 +124,19 @@ class TurnInput:
 
 
 @dataclass(frozen=True)
+class BrokenInput:
+    """What is left of a bag or capture from where it is broken."""
+
+    name: str
+    path: Path
+    error: str
+
+    def read(self) -> Loaded:
+        """Raises FileError."""
+        raise FileError(self.error)
+
+
+@dataclass(frozen=True)
 class Inputs:
     """Scans to come, in order.
 
@@ -154,7 +167,12 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     def stream() -> Iterator[Input]:
         yield from files
         for path in streams:
-            yield from _bag_inputs(path, reading) if is_bag(path) else _capture_inputs(path, reading)
+            try:
+                yield from _bag_inputs(path, reading) if is_bag(path) else _capture_inputs(path, reading)
+            except FileError as error:
+                if len(expanded) == 1:
+                    raise
+                yield BrokenInput(path.stem, path, str(error))  # the others go on
 
     return Inputs(single, count, stream)
 
@@ -174,6 +192,8 @@ def _expanded(path: Path) -> list[Path]:
     if path.is_dir() and not is_bag(path) and not _is_scan(path):
         bags = sorted(p for p in path.iterdir() if is_stream(p))
         return bags if bags and not has_scans(path) else scan_files(path)
+    if not (path.exists() or _is_scan(path) or is_stream(path)):
+        raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
     return [path]
 
 
@@ -224,35 +244,8 @@ def _bag_inputs(path: Path, reading: Reading) -> Iterator[Input]:
 
 
 def _capture_inputs(path: Path, reading: Reading) -> Iterator[Input]:
-    for number, fields in enumerate(capture_turns(path, reading.metadata)):
+    for number, fields in enumerate(capture_turns(path, reading.metadata, reading.topic)):
         yield TurnInput(f"{path.stem}/{number:06d}", path, reading, fields)
-
-
-def capture_turns(path: Path, metadata: Path | None = None) -> Iterator[Fields]:
-    """The turns of a capture: Velodyne's by its packets, Ouster's with its metadata. Raises FileError for others."""
-    first = next((p for p in datagrams(path) if len(p.payload) > 1000), None)
-    if first is None:
-        raise FileError(f"{path}: expected packets of a LiDAR, found none")
-    if velodyne.is_velodyne(first.payload):
-        turns = velodyne.turns(datagrams(path))
-    else:
-        turns = ouster.turns(datagrams(path), ouster.read_metadata(metadata or _metadata_beside(path)))
-    found = 0
-    for found, fields in enumerate(turns, 1):  # noqa: B007, counted
-        yield fields
-    if not found:
-        raise FileError(f"{path}: expected whole turns of a Velodyne or of the Ouster that the metadata describes, "
-                        f"found none; the first large packet has {len(first.payload)} bytes")  # fmt: skip
-
-
-def _metadata_beside(path: Path) -> Path:
-    """The only Ouster metadata file in a capture's folder. Raises FileError that asks for it."""
-    found = sorted(p for p in path.parent.glob("*.json") if ouster.is_metadata(p))
-    named = [p for p in found if p.stem.startswith(path.stem) or path.stem.startswith(p.stem)]
-    if len(named or found) == 1:
-        return (named or found)[0]
-    listed = ", ".join(p.name for p in found) or "none"
-    raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one beside the capture, found {listed}")
 
 
 def read_transform(text: str | None, mount: float | None = None, axes: str = "flu") -> np.ndarray | None:

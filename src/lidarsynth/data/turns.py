@@ -1,0 +1,86 @@
+"""The turns in a capture: of its one LiDAR, or of the one named; Velodyne's by the packets, Ouster's with metadata."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+
+from lidarsynth.data import ouster, velodyne
+from lidarsynth.data.capture import Datagram, datagrams
+from lidarsynth.files.fields import Fields, FileError
+
+LOOKED_AT = 2000  # packets from the first of a LiDAR on: 0.2 s of the fastest sensor, so that every other one shows
+LARGE = 1000  # bytes: smaller packets are positions and inertial measurements
+Test = Callable[[Datagram], bool]
+Turns = Callable[[Iterator[Datagram]], Iterator[Fields]]
+
+
+def capture_turns(path: Path, metadata: Path | None = None, sender: str | None = None) -> Iterator[Fields]:
+    """The turns of a LiDAR in a capture. Raises FileError where there is none, or several and none is named.
+
+    metadata  `.json` of an Ouster; None = the only one beside the capture
+    sender    ADDRESS:PORT, of the sensor and to which its packets go; None = the only one
+    """
+    belongs, turns = _kind(path, metadata, sender)
+    listed = _listed(path, belongs)
+    if sender is None and len(listed) > 1:
+        raise FileError(f"{path}: expected packets of one LiDAR, or --topic ADDRESS:PORT, found {', '.join(listed)}")
+    if sender is not None and sender not in listed:
+        raise FileError(f"{path}: expected packets of a LiDAR as {sender}, found {', '.join(listed)}")
+    own = (packet for packet in datagrams(path) if packet.sender == (sender or listed[0]) and belongs(packet))
+    found, streamed = 0, turns(own)
+    while (fields := _next(path, streamed)) is not None:
+        found += 1
+        yield fields
+    if not found:
+        raise FileError(f"{path}: expected a turn of the LiDAR, found less than half of one")
+
+
+def _next(path: Path, turns: Iterator[Fields]) -> Fields | None:
+    """The next turn; what is wrong with a packet is said with the capture's name."""
+    try:
+        return next(turns, None)
+    except FileError as error:
+        text = str(error)
+        raise FileError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def senders(path: Path, metadata: Path | None = None) -> list[str]:
+    """ADDRESS:PORT of each LiDAR of one kind in a capture. Raises FileError where there is none."""
+    return _listed(path, _kind(path, metadata, None)[0])
+
+
+def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, Turns]:
+    """How the packets of a LiDAR are told, and what makes turns of them: a Velodyne where one sends, else an Ouster."""
+    large = [p for p in islice(datagrams(path), 2 * LOOKED_AT) if len(p.payload) > LARGE]
+    large = [p for p in large if sender in (None, p.sender)] or large
+    if not large:
+        large = list(islice((p for p in datagrams(path) if len(p.payload) > LARGE), 1))
+    if not large:
+        raise FileError(f"{path}: expected packets of a LiDAR, found none")
+    if any(velodyne.is_velodyne(packet.payload) for packet in large):
+        return lambda packet: velodyne.is_velodyne(packet.payload), velodyne.turns
+    described = ouster.read_metadata(metadata or _metadata_beside(path))
+    size = ouster.packet_size(described)
+    return lambda packet: len(packet.payload) == size, lambda packets: ouster.turns(packets, described)
+
+
+def _listed(path: Path, belongs: Test) -> list[str]:
+    """ADDRESS:PORT of those whose packets belong."""
+    found = list(dict.fromkeys(p.sender for p in islice(filter(belongs, datagrams(path)), LOOKED_AT)))
+    if not found:
+        first = next(len(p.payload) for p in datagrams(path) if len(p.payload) > LARGE)
+        raise FileError(f"{path}: expected packets of a Velodyne or of the Ouster that the metadata describes, found "
+                        f"none; the first large packet has {first} bytes")  # fmt: skip
+    return sorted(found)
+
+
+def _metadata_beside(path: Path) -> Path:
+    """The only Ouster metadata file in a capture's folder. Raises FileError that asks for it."""
+    found = sorted(p for p in path.parent.glob("*.json") if ouster.is_metadata(p))
+    named = [p for p in found if p.stem.startswith(path.stem) or path.stem.startswith(p.stem)]
+    if len(named or found) == 1:
+        return (named or found)[0]
+    listed = ", ".join(p.name for p in found) or "none"
+    raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one beside the capture, found {listed}")
