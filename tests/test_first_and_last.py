@@ -200,7 +200,7 @@ def test_blocked_columns_of_another_kind_are_named(blocked):
 
 def test_numbers_too_large_for_a_float_are_named(tmp_path: Path):
     (tmp_path / "a.toml").write_text(f"beams = 8\ntop = 1{'0' * 400}\nbottom = -25\n")
-    with pytest.raises(ValueError, match="a: expected numbers in the sensor's fields, found"):
+    with pytest.raises(ValueError, match=r"a\.toml: expected numbers in the sensor's fields, found"):
         read_sensor(tmp_path / "a.toml")
     beams = '"beam_altitude_angles": [4, 3, 2, 1], "beam_azimuth_angles": [0, 0, 0, 0]'
     (tmp_path / "a.json").write_text(f'{{{beams}, "columns_per_frame": 1e999}}')
