@@ -131,6 +131,14 @@ def test_generated_grids_get_flat_ground_and_upright_walls_and_keep_their_edges(
     np.testing.assert_allclose(again, truth, rtol=0.03)
 
 
+def test_grids_of_a_dome_keep_their_ranges_where_beams_look_straight_up():
+    dome = Sensor("dome", tuple(np.linspace(90, -90, 16).tolist()), 128, 0.5, 50.0)
+    metres = torch.full((1, 16, 128), 5.0)
+    found = straightened(metres, np.arange(16), dome)
+    assert_close(found[:, [0, -1]], metres[:, [0, -1]], rtol=1e-4, atol=0)
+    assert torch.isfinite(found).all()
+
+
 def test_samples_are_rough_where_something_grows():
     label = np.repeat(np.array([[9, 15, 17, 9]]), 64, 1).repeat(24, 0)
     image = RangeImage(np.full(label.shape, 10.0), np.ones(label.shape), np.ones(label.shape, bool), SMALL, label)

@@ -30,8 +30,9 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
         inverse = _nearer(inverse, inverse.roll(1, 2), inverse.roll(-1, 2), 0.5, NEAR)
         inner = _nearer(inverse[:, 1:-1], inverse[:, :-2], inverse[:, 2:], above, CORNER)
         inverse = torch.cat([inverse[:, :1], inner, inverse[:, -1:]], 1)
-    away = torch.where(returned, elevation.cos() / inverse.clamp_min(1e-6), 0)
-    return _upright(away, height) / elevation.cos()
+    cosine = elevation.cos().clamp_min(1e-3)  # a beam may look straight up
+    away = torch.where(returned, cosine / inverse.clamp_min(1e-6), 0)
+    return _upright(away, height) / cosine
 
 
 def _nearer(inverse: Tensor, one: Tensor, other: Tensor, share: Tensor | float, near: float) -> Tensor:
@@ -44,7 +45,7 @@ def _upright(away: Tensor, height: Tensor) -> Tensor:
     """Horizontal distances (B, R, C), nearer to those of the beams above and below that meet the same wall."""
     ground = (height[:, 1:] / height[:, :-1]).clamp_min(1e-6).log().abs()  # between beams that both look down
     near = torch.where(height[:, :-1] < 0, (GROUND * ground).clamp(1e-6, NEAR), NEAR)
-    returned, log = away > 0, away.clamp_min(0.1).log()
+    returned, log = away > 0, away.clamp_min(1e-6).log()
     both = returned[:, 1:] & returned[:, :-1]
     none = torch.zeros_like(log[:, :1])
     for _ in range(ROUNDS):
