@@ -22,6 +22,7 @@ FIT = 2.0  # degrees: cones that fit worse are none
 SURE = 6.0  # standard errors
 CLEAR = 0.7  # degrees: cones that fit better leave no doubt of the axis
 UPSIDE = 1.5  # times more level ground above than below
+TURN = 64  # parts of a turn, whose directions tell which way it goes
 ACROSS = -0.2  # `road_axis` of a road that runs along y; of 133 real scans the lowest is -0.11
 
 # Which axis of the file is up -> rotation into x forward, y left, z up, and the words for it.
@@ -131,7 +132,7 @@ def _upright(scan: Scan) -> tuple[str, bool]:
 
 def _side(scan: Scan, axis: str) -> str:
     """+axis or -axis: where the ground is below the sensor, wherever the origin; where both sides look alike, where the
-    beams are a known sensor's."""
+    beams are a known sensor's; and of beams that are so either way, as an OS1's, from where they turn to the right."""
     seen = _from_sensor(scan, np.array(AXES["+" + axis][0]))
     upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > 0.6 and upper > UPSIDE * lower:
@@ -139,7 +140,24 @@ def _side(scan: Scan, axis: str) -> str:
     up, down = (any(_known(seen, sign + axis, lift) for lift in ORIGINS) for sign in "+-")
     if up != down:
         return ("+" if up else "-") + axis
-    return ("-" if lower > UPSIDE * upper and lower > 1 / 3 else "+") + axis
+    if lower > UPSIDE * upper and lower > 1 / 3:
+        return "-" + axis
+    return ("-" if up and turns_left(seen.xyz @ np.array(AXES["+" + axis][0], np.float32).T, scan.time) else "+") + axis
+
+
+def turns_left(xyz: np.ndarray, time: np.ndarray | None) -> bool:
+    """Whether a sensor saw the points (N, 3) counter-clockwise about z, by their times (N,).
+
+    Ouster's, Hesai's and Velodyne's turn clockwise, seen from above. False where times do not tell: a tenth of their
+    steps goes the other way, or they are of less than half a turn.
+    """
+    if time is None or len(time) < 10 * TURN:
+        return False
+    order = np.argsort(time, kind="stable")
+    way = np.exp(1j * np.arctan2(xyz[order, 1], xyz[order, 0]))
+    middle = np.array([part.mean() for part in np.array_split(way, TURN)])
+    step = np.angle(middle[1:] / middle[:-1])
+    return bool((step > 0).mean() > 0.9 and step.sum() > np.pi)
 
 
 def _from_sensor(scan: Scan, rotation: np.ndarray) -> Scan:

@@ -45,7 +45,8 @@ def occupied(scan: Scan, sensor: Sensor, pixels: Pixels) -> np.ndarray:
     x, y, z = scan.xyz.T
     inside = (row >= 0) & ((x != 0) | (y != 0) | (z != 0))
     hit = np.zeros((sensor.height, sensor.width), bool)
-    hit[row[inside], column[inside]] = True
+    pixel = row * sensor.width + column
+    hit.reshape(-1)[pixel if inside.all() else pixel[inside]] = True
     return hit
 
 
@@ -193,15 +194,18 @@ def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray, insi
     valid = (depth[point] >= sensor.min_range) & (depth[point] <= sensor.max_range)
     hit, point = hit[valid], point[valid]
 
+    filled = np.zeros(shape[0] * shape[1], bool)
+    filled[hit] = True
+
     def image(values: np.ndarray, dtype: type) -> np.ndarray:
         canvas = np.zeros((shape[0] * shape[1], *values.shape[1:]), dtype)
-        canvas[hit] = values[point]
+        canvas[hit] = values.take(point, axis=0)
         return canvas.reshape(*shape, *values.shape[1:])
 
     return RangeImage(
         range=image(depth, np.float32),
         reflectance=image(scan.reflectance, np.float32),
-        mask=image(np.ones(len(depth), bool), np.bool_),
+        mask=filled.reshape(shape),
         sensor=sensor,
         label=None if scan.label is None else image(scan.label, np.int64),
         xyz=image(scan.xyz, np.float32),

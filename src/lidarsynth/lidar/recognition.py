@@ -54,7 +54,7 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
     """
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     best: np.ndarray | None = None
-    for angle in (azimuth, np.mod(azimuth, 2 * np.pi)):
+    for angle in (azimuth, np.where(azimuth < 0, azimuth + azimuth.dtype.type(2 * np.pi), azimuth)):
         step = np.diff(angle)
         up, down = step > np.pi, step < -np.pi
         jumps, others = (up, down) if up.sum() > down.sum() else (down, up)
@@ -72,7 +72,7 @@ def _by_rings(xyz: np.ndarray, ring: np.ndarray, whole: bool = False) -> tuple[s
     order = np.argsort(-middle, kind="stable")
     beams, middle = beams[order], middle[order]
     found = f"{len(beams)} rings from {middle[0]:+.1f} to {middle[-1]:+.1f} degrees"
-    errors = {name: e for name, s in SENSORS.items() if (e := _whole_error(beams, s)) is not None and e < UNIT}
+    errors = {n: e for n, s in SENSORS.items() if (e := _whole_error(beams, middle, s)) is not None and e < UNIT}
     if errors:
         name = min(errors, key=lambda n: errors[n])
         return name, f"{found}, {errors[name]:.2f} from the {SENSORS[name].height} beams of {name}"
@@ -107,14 +107,18 @@ def _far(points: np.ndarray) -> np.ndarray:
     return far if len(far) >= 5 else points
 
 
-def _whole_error(beams: np.ndarray, sensor: Sensor) -> float | None:
-    """Median distance in degrees of the rings from the sensor's beams, taken in order; the sky may hide a few beams."""
+def _whole_error(beams: np.ndarray, middle: np.ndarray, sensor: Sensor) -> float | None:
+    """Median distance in degrees of the rings from the sensor's beams, taken in order; the sky may hide a few beams.
+
+    middle  (rings,) their elevations from the sensor's origin, for beams that leave there
+    """
     spare = sensor.height - len(beams)
     if not 0 <= spare <= 0.1 * sensor.height:
         return None
-    offsets, table = np.array(sensor.offsets or (0.0,) * sensor.height), np.array(sensor.elevations)
+    offsets, table = np.array(sensor.offsets), np.array(sensor.elevations)
     places = [slice(first, first + len(beams)) for first in range(spare + 1)]
-    return min(float(np.median(np.abs(_elevation(beams, offsets[rows]) - table[rows]))) for rows in places)
+    seen = (_elevation(beams, offsets[rows]) if sensor.offsets else middle for rows in places)
+    return min(float(np.median(np.abs(e - table[rows]))) for e, rows in zip(seen, places, strict=True))
 
 
 def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:

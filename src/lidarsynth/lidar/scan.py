@@ -50,8 +50,17 @@ class Scan:
     def __getitem__(self, index: np.ndarray | slice) -> Scan:
         """The scan of the chosen points: a boolean mask (N,), integer indices or a slice."""
         own = (self.xyz, self.reflectance, self.ring, self.time, self.label)
-        chosen = [None if values is None else values[index] for values in own]
-        return Scan(*chosen, {name: values[index] for name, values in self.extra.items()})  # type: ignore[arg-type]
+        chosen = [None if values is None else _chosen(values, index) for values in own]
+        return Scan(*chosen, {name: _chosen(values, index) for name, values in self.extra.items()})  # type: ignore[arg-type]
+
+
+def _chosen(values: np.ndarray, index: np.ndarray | slice) -> np.ndarray:
+    """values[index], by `take`, which is several times as fast."""
+    if isinstance(index, slice):
+        return values[index]
+    if index.dtype != np.bool_:
+        return values.take(index, axis=0)
+    return values.take(np.flatnonzero(index), axis=0) if len(index) == len(values) else values[index]
 
 
 def scan_of(points: np.ndarray) -> Scan:
@@ -127,10 +136,23 @@ class RangeImage:
         """The measured pixels as points, row by row from the top, `ring` the row; of a completed scan, `completed`."""
         if self.completed is not None:
             return self.completed
-        rows = np.broadcast_to(np.arange(self.shape[0])[:, None], self.shape)
-        label = None if self.label is None else self.label[self.mask]
-        extra = {} if self.confidence is None else {"confidence": self.confidence[self.mask]}
-        return Scan(self.points()[self.mask], self.reflectance[self.mask], rows[self.mask], None, label, extra)
+        chosen = np.flatnonzero(self.mask)
+        kept = (self.reflectance, self.label, self.confidence)
+        shade, label, sure = (None if values is None else values.reshape(-1).take(chosen) for values in kept)
+        extra = {} if sure is None else {"confidence": sure}
+        assert shade is not None
+        return Scan(self._points_of(chosen), shade, chosen // self.sensor.width, None, label, extra)
+
+    def _points_of(self, chosen: np.ndarray) -> np.ndarray:
+        """`points()` of pixels (N,) of the flattened image, without the work for all others."""
+        rays = self.sensor.points(self.range, chosen)
+        if self.xyz is None:
+            return rays
+        own = self.xyz.reshape(-1, 3).take(chosen, axis=0)
+        x, y, z = own.T
+        measured = np.flatnonzero((x != 0) | (y != 0) | (z != 0))
+        rays[measured] = own[measured]
+        return rays
 
     def surer_than(self, least: float) -> RangeImage:
         """The same image without the filled pixels, and `completed` without the new points, below a confidence.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -81,21 +82,28 @@ class Sensor:
         azimuth = np.pi - (np.arange(self.width) + shift) * 2 * np.pi / self.width
         return np.stack(np.broadcast_arrays(elevation[:, None], azimuth[None, :])).astype(np.float32)
 
+    @lru_cache(maxsize=4)  # noqa: B019, a few small ones; every scan of a folder asks for the same
     def directions(self) -> np.ndarray:
-        """(H, W, 3) float32 unit vectors along `ray_angles`: (cos e cos a, cos e sin a, sin e)."""
+        """(H, W, 3) float32 unit vectors along `ray_angles`: (cos e cos a, cos e sin a, sin e). Read only."""
         elevation, azimuth = self.ray_angles()
         flat = np.cos(elevation)
-        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        rays.flags.writeable = False
+        return rays
 
-    def points(self, distance: np.ndarray) -> np.ndarray:
+    def points(self, distance: np.ndarray, chosen: np.ndarray | None = None) -> np.ndarray:
         """(H, W, 3) float32 metres: where each ray is `distance` (H, W) metres from the sensor's origin.
 
         A beam that leaves at height h above the origin meets that sphere at t = -h sin e + sqrt(d^2 - h^2 cos^2 e).
+
+        chosen  (N,) places in the flattened image: of these rays only, (N, 3)
         """
-        rays = self.directions()
+        rays, height = self.directions(), np.asarray(self.offsets or [0.0] * self.height, np.float32)[:, None]
+        if chosen is not None:
+            rays, distance = rays.reshape(-1, 3).take(chosen, axis=0), distance.reshape(-1).take(chosen)
+            height = height[:, 0].take(chosen // self.width)
         if not self.offsets:
             return rays * distance[..., None]
-        height = np.asarray(self.offsets, np.float32)[:, None]
         sine = rays[..., 2]
         travel = -height * sine + np.sqrt(np.maximum(distance**2 - height**2 * (1 - sine**2), 0))
         points = rays * travel[..., None]

@@ -103,9 +103,12 @@ def lasers(sensor: Sensor, loss: Table = (), dip: Table = (), shift: Table = ())
     return Lasers(*spread, number=np.repeat(np.arange(sensor.height, dtype=np.uint32), sensor.width)[seen])
 
 
+@lru_cache(maxsize=4)
 def hidden(sensor: Sensor) -> np.ndarray:
-    """(H, W) bool: rays that end on the carrier: those blocked by name, and those of KITTI's own car."""
-    return own_car(sensor) | sensor.blocked_rays()
+    """(H, W) bool: rays that end on the carrier: those blocked by name, and those of KITTI's own car. Read only."""
+    rays = own_car(sensor) | sensor.blocked_rays()
+    rays.flags.writeable = False
+    return rays
 
 
 @lru_cache(maxsize=4)

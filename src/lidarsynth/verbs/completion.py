@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,13 +28,18 @@ class Filled:
     """A scan made dense.
 
     image   in the model's sensor, measured pixels exactly as they were
-    shown   the images of the picture by caption: before, after and, where known, the truth
+    drawn   gives the images of the picture by caption: before, after and, where known, the truth
     errors  of the hidden pixels by method, where the truth is known
     """
 
     image: RangeImage
-    shown: Mapping[str, RangeImage]
+    drawn: Callable[[], Mapping[str, RangeImage]]
     errors: Mapping[str, Errors]
+
+    @property
+    def shown(self) -> Mapping[str, RangeImage]:
+        """The images of the picture by caption, made anew."""
+        return self.drawn()
 
     @property
     def points(self) -> Scan:
@@ -43,8 +48,9 @@ class Filled:
 
     def figure(self) -> np.ndarray:
         """(H', W', 3) uint8: strips, 3-D and bird's eye views of before, after and, where known, the truth."""
-        after = next(name for name, image in self.shown.items() if image is self.image)
-        return before_and_after(self.shown, {after: self.points})
+        shown = self.shown
+        after = next(name for name, image in shown.items() if image is self.image)
+        return before_and_after(shown, {after: self.points})
 
 
 def complete_scan(
@@ -66,7 +72,7 @@ def complete_scan(
     model = model.suited_to(scan, sensor)
     if recipe is None:
         filled = _sure(model.filled(scan, how, on_step=on_step), least)
-        return Filled(filled, {"measured": _measured(model, scan, filled), "completed": filled}, {})
+        return Filled(filled, lambda: {"measured": _measured(model, scan, filled), "completed": filled}, {})
     truth = model.image_of(scan)
     if not truth.mask.any():
         raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
@@ -76,7 +82,7 @@ def complete_scan(
     before = truth.keep(known)
     filled = _sure(model.filled(before, how, known, on_step), least)
     shown = {f"input, {recipe}": before, "completed": filled, "truth": truth}
-    return Filled(filled, shown, judged(filled, before, known, truth))
+    return Filled(filled, lambda: shown, judged(filled, before, known, truth))
 
 
 def check_confident(model: ScanModel, how: Filling, least: float | None) -> None:
@@ -128,8 +134,12 @@ def upsample_scan(
     Raises ValueError when no point is in the model's view, or `least` meets a model without confidences.
     """
     filled = _sure(model.upsampled(scan, how, sensor_in, on_step, times), least)
-    measured = project(replace(scan, ring=None), filled.sensor, "spherical")
-    return Filled(filled, {f"measured, {sensor_in.name}": measured, "upsampled": filled}, {})
+
+    def drawn() -> dict[str, RangeImage]:
+        measured = project(replace(scan, ring=None), filled.sensor, "spherical")
+        return {f"measured, {sensor_in.name}": measured, "upsampled": filled}
+
+    return Filled(filled, drawn, {})
 
 
 def named_sensor(scan: Scan, path: Path, flag: str, given: str | None) -> Sensor:

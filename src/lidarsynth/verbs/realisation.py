@@ -15,7 +15,7 @@ from lidarsynth.verbs.completion import Filled
 def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) -> Filled:
     """A perfect scan as `sensor` would have reported it. Raises ValueError as `ScanModel.realise` does."""
     real = model.realised(scan, sensor, seed)
-    return Filled(real, {"simulated": project(scan, real.sensor), f"as {sensor.name} sees it": real}, {})
+    return Filled(real, lambda: {"simulated": project(scan, real.sensor), f"as {sensor.name} sees it": real}, {})
 
 
 def realised_fields(real: Scan, given: Fields) -> Fields:

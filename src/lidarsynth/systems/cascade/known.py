@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +13,8 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
 from lidarsynth.networks.fill_unet import Known
+from lidarsynth.networks.rays import Rays, rays_of
+from lidarsynth.streets.hdl64e import dimness, hidden
 
 ANSWERS = 0.02  # of the rays of a beam
 
@@ -21,13 +24,20 @@ def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit:
     extra, columns = size[0] - told.shape[1], np.arange(size[1]) % told.shape[2]
 
     def part(values: np.ndarray, below: float) -> Tensor:
-        values = np.pad(values[:, :, columns], ((0, 0), (0, extra), (0, 0)), constant_values=below)
+        if size != told.shape[1:]:
+            values = np.pad(values[:, :, columns], ((0, 0), (0, extra), (0, 0)), constant_values=below)
         return torch.from_numpy(np.ascontiguousarray(values))[:, None]
 
     returned = told & (metres > 0)
     ranges = part(np.where(returned, metres, 0).astype(np.float32), 0)
     shades = part(np.where(returned & lit, reflectance, 0).astype(np.float32), 0)
     return Known(ranges, shades, part(told, True), part(returned, False), part(returned & lit, False))
+
+
+@lru_cache(maxsize=2)  # every scan of a folder asks for the same
+def rays_told(sensor: Sensor) -> Rays:
+    """The rays of a sensor's padded image, with those that its carrier blocks and what is known of its beams."""
+    return rays_of(sensor, hidden(sensor), dimness=dimness(sensor))
 
 
 def unanswered(image: RangeImage, size: tuple[int, int]) -> Known:

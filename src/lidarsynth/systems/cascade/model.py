@@ -23,8 +23,8 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
 from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_noise
-from lidarsynth.networks.rays import Rays, decode_range, padded, rays_of
-from lidarsynth.streets.hdl64e import dimness, hidden, unevenness, written_out
+from lidarsynth.networks.rays import Rays, decode_range, padded
+from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
@@ -37,7 +37,7 @@ from lidarsynth.systems.cascade.images import (
     parts,
     placed,
 )
-from lidarsynth.systems.cascade.known import best_known, known_of, spread, unanswered, widened
+from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.description import Description
@@ -379,7 +379,7 @@ class CascadeModel(ScanModel):
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
-        rays = rays_of(self.sensor, self._blocked, dimness=dimness(self.sensor))
+        rays = rays_told(self.sensor)
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
             kinds = torch.tensor(grain)[:, None, None]
