@@ -26,7 +26,7 @@ from lidarsynth.systems.table import assemble, build_network, graph_of
 from lidarsynth.verbs.export import Exported, export_onnx
 
 ROOT = Path(__file__).resolve().parents[1]
-SENSOR = ls.Sensor("small", tuple(np.linspace(5, -25, 20).tolist()), 64, 0.5, 120.0, mount=1.8)
+SENSOR = ls.Sensor("small", tuple(np.linspace(5, -25, 20).tolist()), 64, 0.5, 120.0, mount=1.8, dimness=(0.0,) * 20)
 WEIGHTS = Confidence(-1.0, -0.5, 0.3, -0.2, -0.1, -0.4, 0.7)
 MATES = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 

@@ -40,7 +40,7 @@ class Filled(NamedTuple):
 
     classes: logits of what the ray meets, (B, classes, H, W), where asked for.
     spread: how far the candidates lie from the chosen range, in metres, each by its share in the choice (B, 1, H, W);
-    and `near` of the candidates (B, 4, H, W), where asked for.
+    and `near` of the candidates (B, 4, H, W), where asked for. plain: the mean reflectance of what is known around.
     """
 
     code: Tensor
@@ -49,6 +49,7 @@ class Filled(NamedTuple):
     classes: Tensor | None = None
     spread: Tensor | None = None
     near: Tensor | None = None
+    plain: Tensor | None = None
 
 
 class Block(nn.Module):
@@ -184,7 +185,8 @@ def _assemble(
         code = code + 0.02 * grain * noise[:, :1]
     reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
     reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True) - dimness
-    return Filled(code, reflectance, 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0), shares
+    logit = 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0
+    return Filled(code, reflectance, logit, plain=guesses.reflectance[:, :1] - dimness), shares
 
 
 def _snapped(code: Tensor, guesses: Candidates, reach: float) -> Tensor:

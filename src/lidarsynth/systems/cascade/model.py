@@ -28,17 +28,10 @@ from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
-from lidarsynth.systems.cascade.images import (
-    GRAIN,
-    GRAIN_REALISED,
-    answered,
-    grid_of,
-    noisy,
-    parts,
-    placed,
-)
+from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, answered, grid_of, noisy, parts, placed
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
+from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -63,6 +56,7 @@ class CascadeModel(ScanModel):
     own              whether scans are completed, and made denser, in the sensor that made them: until `into`
     labelled         whether its images have classes: after `with_labels`
     precision        of the fill's matrix products: fp32 | bf16
+    response         how the sensor reports what it sees, as found out from the scan at hand
     """
 
     network: Cascade
@@ -71,6 +65,7 @@ class CascadeModel(ScanModel):
     own: bool = True
     labelled: bool = False
     precision: str = "fp32"
+    response: Response = AS_STREETS
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     any_sensor: ClassVar[bool] = True
@@ -177,12 +172,16 @@ class CascadeModel(ScanModel):
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
         rng, lit = generators(how.seed, 1), bool(image.reflectance[known].any())
-        known = known | (self._blocked & ~image.mask)
-        metres, reflectance, told = image.range, image.reflectance, known
+        own, known = replace(self, response=response_of(image, known)), known | (self._blocked & ~image.mask)
+        metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
-            metres, reflectance, told = self._holes(metres, reflectance, told, rng, how, on_step)
+            metres, reflectance, told = own._holes(metres, reflectance, told, rng, how, on_step)
         noise = None if how.method == "conditional" else rng
-        filled = self._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
+        if noise is None:
+            response = tried(own.response, self.network.fill, image, known, own.response.told(rays_told(self.sensor)))
+            own = replace(own, response=response)
+        filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
+        filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
         if noise is not None:
             filled = self._recorded(filled, rng[0])
         if on_step is not None:
@@ -318,7 +317,7 @@ class CascadeModel(ScanModel):
         grid, coarse = np.ix_(rows, columns), self.network.coarse
         values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
         here = torch.from_numpy(told[grid])[None, None].to(self._device)
-        dim = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device)
+        dim = torch.from_numpy(self.response.unevenness(self.sensor)[rows]).to(self._device)
         known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
         # What is known guides; a sector lost erred 6.1 m for 4.3 with both.
         x_0 = repainted(self._coarse(rays, guided=False), known, here, rng, how, on_step)
@@ -328,9 +327,10 @@ class CascadeModel(ScanModel):
 
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
-        told = known | (self._blocked & ~image.mask)
-        pixels = known_of(image.range[None], image.reflectance[None], told[None], True, padded(self.sensor))
-        filled, rays = self._network(pixels, None, doubt=True)
+        own, told = replace(self, response=response_of(image, known)), known | (self._blocked & ~image.mask)
+        shades = own.response.even(image.reflectance)
+        pixels = known_of(image.range[None], shades[None], told[None], True, padded(self.sensor))
+        filled, rays = own._network(pixels, None, doubt=True)
         return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
 
     def _fill(
@@ -360,7 +360,7 @@ class CascadeModel(ScanModel):
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
         sure = None if weights is None else confidence(filled, rays, weights)
-        parts = (filled.reflectance, logit, filled.classes, sure)
+        parts = (self.response.mixed(filled), logit, filled.classes, sure)
         cut = [[None] * len(metres) if part is None else part[..., :height, :width].cpu() for part in parts]
         return [
             answered(self.sensor, self._blocked, *of_one)
@@ -379,7 +379,7 @@ class CascadeModel(ScanModel):
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
-        rays = rays_told(self.sensor)
+        rays = self.response.told(rays_told(self.sensor))
         noise = torch.zeros(count, NOISES, height, width)
         if rng is not None:
             kinds = torch.tensor(grain)[:, None, None]

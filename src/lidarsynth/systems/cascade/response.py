@@ -1,0 +1,153 @@
+"""How a sensor reports reflectance, where nobody has measured it: found out from the scan itself.
+
+Virtual sensors of training report scale * reflectance ** gamma, and some beams less than others (`streets.Optics`). Of
+a recorded scan both are estimated from its known pixels, so that a network sees it as the streets it has learned, and
+what it answers is said in the sensor's own terms. Measured in docs/training-default.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known
+from lidarsynth.networks.rays import Rays, padded
+from lidarsynth.streets import hdl64e
+from lidarsynth.systems.cascade.known import known_of
+
+STREETS = (0.200, 0.290, 0.349)  # quartiles of what streets reflect, zeros aside, as `hdl-64e-kitti` reports it
+GAMMAS = (0.4, 2.5)
+LEAST, NARROWEST = 0.002, 0.05  # reflectance; natural logarithm between the quartiles
+ENOUGH = 50  # returns
+SECTORS, FEW = 12, 12  # of a turn, in which beams are compared; returns of both beams in one
+SHARES, PART = (0.0, 0.25, 0.5, 0.75, 1.0), 128  # of the mean of what is known around; columns in which it is tried
+ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
+
+
+class Response(NamedTuple):
+    """even = scale * reported ** gamma + dimness, by beam; the fields' defaults change nothing.
+
+    plain: the share that the mean of what is known around has in the most likely reflectance, beside the network's.
+    """
+
+    scale: float = 1.0
+    gamma: float = 1.0
+    dimness: tuple[float, ...] = ()
+    plain: float = 0.0
+
+    def even(self, reported: np.ndarray) -> np.ndarray:
+        """(H, W) reflectance as the sensor of the streets would report it, but for the beams' dimness."""
+        if (self.scale, self.gamma) == (1, 1):
+            return reported
+        return np.minimum(np.float32(self.scale) * reported ** np.float32(self.gamma), np.float32(1))
+
+    def reported(self, even: np.ndarray) -> np.ndarray:
+        """The inverse of `even`, at most 1."""
+        if (self.scale, self.gamma) == (1, 1):
+            return even
+        return np.minimum((even / np.float32(self.scale)) ** np.float32(1 / self.gamma), np.float32(1))
+
+    def mixed(self, filled: Filled) -> Tensor:
+        """(B, 1, H, W) the most likely reflectance, as the streets' sensor would report it."""
+        if not self.plain:
+            return filled.reflectance
+        assert filled.plain is not None
+        return torch.lerp(filled.reflectance, filled.plain, self.plain)
+
+    def told(self, rays: Rays) -> Rays:
+        """The rays (B, 1, H', W'), with the beams' dimness."""
+        if not self.dimness:
+            return rays
+        dim = torch.zeros_like(rays.dimness)
+        dim[:, :, : len(self.dimness), 0] = torch.tensor(self.dimness)
+        return rays._replace(dimness=dim)
+
+    def unevenness(self, sensor: Sensor) -> np.ndarray:
+        """(H, 1) float32: how much less than the mean beam each one reads."""
+        return np.array(self.dimness, np.float32)[:, None] if self.dimness else hdl64e.unevenness(sensor)
+
+
+AS_STREETS = Response()
+
+
+def response_of(image: RangeImage, known: np.ndarray) -> Response:
+    """By the known returns of an image, known (H, W) bool; nothing is changed for a sensor whose beams are measured,
+    and for fewer than 50 returns of any reflectance."""
+    lit = known & image.mask & (image.reflectance > 0)
+    if hdl64e.dimness(image.sensor) or lit.sum() < ENOUGH:
+        return AS_STREETS
+    low, middle, high = np.log(np.maximum(np.quantile(image.reflectance[lit], (0.25, 0.5, 0.75)), LEAST))
+    gamma = float(np.clip(np.log(STREETS[2] / STREETS[0]) / max(high - low, NARROWEST), *GAMMAS))
+    response = Response(float(STREETS[1] / np.exp(gamma * middle)), gamma)
+    dim = dimness_of(response.even(image.reflectance), image.range, known & image.mask)
+    return response._replace(dimness=tuple(dim.tolist()))
+
+
+def tried(response: Response, fill: FillUNet, image: RangeImage, told: np.ndarray, rays: Rays) -> Response:
+    """The response with that share of the mean which suits the scan: every second known beam of a part of the turn,
+    ahead, is hidden and filled, and the share with the least absolute error of reflectance taken.
+
+    told (H, W) bool; rays of the padded image. Nothing is changed where fewer than four beams return enough.
+    """
+    rows = np.flatnonzero((told & image.mask).sum(1) >= ENOUGH)
+    if response == AS_STREETS or len(rows) < 4:
+        return response
+    hidden = np.zeros_like(told)
+    hidden[rows[1::2]] = True
+    size, width = padded(image.sensor), min(PART, padded(image.sensor)[1])
+    ahead = slice((size[1] - width) // 2, (size[1] + width) // 2)
+    shades = response.even(image.reflectance)
+    known = known_of(image.range[None], shades[None], (told & ~hidden)[None], True, size)
+    device = next(fill.parameters()).device
+    known = Known(*(part[..., ahead].contiguous().to(device) for part in known))
+    rays = Rays(*(part if part.shape[3] == 1 else part[..., ahead].contiguous() for part in rays))
+    with torch.inference_mode():
+        filled = fill(
+            known, Rays(*(part.to(device) for part in rays)), known.metres.new_zeros(1, NOISES, size[0], width)
+        )
+    judged, height = (told & image.mask & hidden)[:, ahead], image.shape[0]
+    if judged.sum() < ENOUGH:
+        return response
+
+    def error(share: float) -> float:
+        mixed = response._replace(plain=share).mixed(filled)[0, 0, :height, : judged.shape[1]].clamp(0, 1).cpu().numpy()
+        return float(np.abs(response.reported(mixed) - image.reflectance[:, ahead])[judged].mean())
+
+    return response._replace(plain=min(SHARES, key=error))
+
+
+def dimness_of(reflectance: np.ndarray, metres: np.ndarray, returned: np.ndarray) -> np.ndarray:
+    """(H,) how much less each beam reads than it and its known neighbours above and below on average; all (H, W).
+
+    In each sector of the turn by the median half of the differences where both beams meet something equally far; less
+    of it, the less the sectors agree. 0 where less than three sectors say anything.
+    """
+    dim, rows = np.zeros(len(reflectance), np.float32), np.flatnonzero(returned.sum(1) >= ENOUGH)
+    if len(rows) < 3:
+        return dim
+    steps = _steps(reflectance[rows], np.log(np.maximum(metres[rows], 0.1)), returned[rows])
+    bend = (steps[1:] - steps[:-1]) / 3
+    count = np.isfinite(bend).sum(1)
+    total = np.maximum(count, 1)
+    mean = np.nansum(bend, 1) / total
+    doubt = np.nansum((bend - mean[:, None]) ** 2, 1) / (np.maximum(count - 1, 1) * total)
+    dim[rows[1:-1]] = np.where(count >= 3, mean**3 / (mean**2 + doubt + 1e-9), 0)
+    return dim
+
+
+def _steps(reflectance: np.ndarray, height: np.ndarray, returned: np.ndarray) -> np.ndarray:
+    """(R - 1, SECTORS) by how much each row is brighter than the one above it; nan where too few pixels tell."""
+    whole = reflectance.shape[1] // SECTORS * SECTORS
+    both = returned[1:] & returned[:-1] & (np.abs(height[1:] - height[:-1]) < ALIKE)
+    step = np.where(both, reflectance[1:] - reflectance[:-1], np.nan)[:, :whole].reshape(len(both), SECTORS, -1)
+    step = np.sort(step, axis=2)  # nan is last
+    count = np.isfinite(step).sum(2, keepdims=True)
+    rank = np.arange(step.shape[2])
+    middle = (rank >= count // 4) & (rank < count - count // 4)
+    mean = np.where(middle, step, 0).sum(2) / np.maximum(middle.sum(2), 1)
+    return np.where(count[..., 0] >= FEW, mean, np.nan)

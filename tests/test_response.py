@@ -1,0 +1,97 @@
+"""How a sensor reports reflectance: found out from its scan, undone for the network, said in its own terms again."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import lidarsynth as ls
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.networks.rays import padded, rays_of
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.response import AS_STREETS, SHARES, Response, dimness_of, response_of, tried
+
+
+@pytest.fixture(scope="module")
+def street() -> RangeImage:
+    """32 beams that all read alike."""
+    return SyntheticStreets(4, 16, replace(SENSORS["hdl-32e"], width=512)).image(2)
+
+
+def every(image: RangeImage, step: int) -> np.ndarray:
+    known = np.zeros(image.shape, bool)
+    known[::step] = True
+    return known
+
+
+def reported_as(image: RangeImage, values: np.ndarray) -> RangeImage:
+    return replace(image, reflectance=np.clip(values * image.mask, 0, 1).astype(np.float32))
+
+
+@pytest.mark.parametrize(("scale", "gamma"), [(0.2, 1.0), (0.6, 1.6), (0.5, 1.3)])
+def test_scale_and_gamma_are_undone(street: RangeImage, scale: float, gamma: float):
+    other = reported_as(street, scale * street.reflectance**gamma)
+    known = every(street, 2)
+    even = [response_of(image, known).even(image.reflectance)[street.mask] for image in (street, other)]
+    np.testing.assert_allclose(even[1], even[0], atol=2e-3)
+    back = response_of(other, known)
+    even = back.even(other.reflectance)
+    assert (even < 1).mean() > 0.9
+    np.testing.assert_allclose(back.reported(even)[even < 1], other.reflectance[even < 1], atol=1e-5)
+
+
+def test_a_darker_reading_sensor_gets_the_same_surfaces_and_darker_points(street: RangeImage):
+    model, known = ls.load("default").into(street.sensor), every(street, 4)
+    dark = reported_as(street, 0.2 * street.reflectance)
+    a, b = (model.complete(image.keep(known), known) for image in (street, dark))
+    both = a.mask & b.mask & ~known
+    assert both.sum() > 0.99 * (a.mask & ~known).sum()
+    assert np.median(np.abs(a.range - b.range)[both]) < 1e-3
+    assert np.abs(0.2 * a.reflectance - b.reflectance)[both].mean() < 2e-3
+
+
+def test_beams_that_read_less_are_found_where_they_have_neighbours(street: RangeImage):
+    dim = np.random.default_rng(0).normal(0, 0.05, street.shape[0]).astype(np.float32)
+    uneven = np.where(street.mask & (street.reflectance > 0.1), street.reflectance - dim[:, None], 0)
+    found = dimness_of(uneven, street.range, street.mask & (uneven > 0))
+    true = dim - np.convolve(np.pad(dim, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+    said = found != 0
+    assert said.sum() > 12
+    assert np.corrcoef(found[said], true[said])[0, 1] > 0.9
+    assert np.abs(found[said] - true[said]).mean() < 0.4 * np.abs(true[said]).mean()
+    assert not dimness_of(uneven, street.range, street.mask & every(street, 31)).any()
+
+
+def test_a_sensor_whose_beams_are_measured_is_left_as_it_is(street: RangeImage):
+    known = every(street, 2)
+    assert response_of(replace(street, sensor=replace(street.sensor, dimness=(0.0,) * 32)), known) == AS_STREETS
+    assert response_of(reported_as(street, 0 * street.reflectance), known) == AS_STREETS
+    kitti = RangeImage(
+        np.ones((64, 1024)), np.full((64, 1024), 0.5), np.ones((64, 1024), bool), SENSORS["hdl-64e-kitti"]
+    )
+    assert response_of(kitti, kitti.mask) == AS_STREETS
+
+
+@pytest.mark.parametrize(("offset", "share"), [(0.0, 0.0), (0.3, 1.0)])
+def test_the_share_of_the_mean_is_what_suits_the_scan(street: RangeImage, offset: float, share: float):
+    """Told by a network that answers the truth, or something else, beside a mean that is 0.1 too bright."""
+    size, told = padded(street.sensor), np.ones(street.shape, bool)
+    response = Response(1.0, 1.000001)
+    ahead = slice((size[1] - 128) // 2, (size[1] + 128) // 2)
+    truth = torch.zeros(1, 1, size[0], 128)
+    truth[0, 0, : street.shape[0]] = torch.from_numpy(street.reflectance[:, ahead])
+    answer = SimpleNamespace(reflectance=truth + offset, plain=truth + 0.1)
+
+    class Fill(torch.nn.Linear):
+        def forward(self, known, rays, noise):
+            assert not known.told[0, 0, 1::2][: street.shape[0] // 2 - 2].all()
+            return answer
+
+    rays = rays_of(street.sensor, street.sensor.blocked_rays())
+    found = tried(response, Fill(1, 1), street, told, rays)  # type: ignore[arg-type]
+    assert found.plain == share
+    assert share in SHARES
+    assert tried(AS_STREETS, Fill(1, 1), street, told, rays) == AS_STREETS  # type: ignore[arg-type]
