@@ -60,7 +60,7 @@ def test_broken_file_is_refused_in_one_line(name: str, tmp_path: Path):
         "bin beyond 10 km": ("10000", "2e+04"),
         "npy pickled objects": ("never loaded",),
         "npy an image": ("(64, 1024)",),
-        "npy without intensity": ("intensity", "only x, y, z", "intensity='none'"),
+        "npy without intensity": ("intensity", "only x, y, z", "--intensity none"),
         "npy lying shape": ("16000000000000 bytes", "found 160"),
         "npz lying shape": ("points", "16000000000 bytes"),
         "npz bomb": ("160 bytes", "found 134217728"),
