@@ -55,6 +55,7 @@ def test_broken_file_is_refused_in_one_line(name: str, tmp_path: Path):
         "bin empty": ("found 0",),
         "bin truncated": ("16 bytes", "found 797 bytes"),
         "bin text": ("found text", "1.0 2.0"),
+        "bin with three floats": ("three floats a point", ".npy"),
         "bin with five floats": (".pcd.bin",),
         "bin all NaN": ("none in 50",),
         "bin beyond 10 km": ("10000", "2e+04"),
