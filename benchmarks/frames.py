@@ -26,6 +26,7 @@ MOVES = {
     "lowered 1 m": "0:0:-1:0:0:0",
     "pitched 5": "0:0:0:0:5:0",
     "rolled 5": "0:0:0:5:0:0",
+    "raised, pitched and rolled": "0:0:1.73:-3:4:0",
     "upside down": "0:0:0:180:0:0",
     "camera axes": "-y",
     "turned 90": "0:0:0:0:0:90",

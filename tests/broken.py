@@ -180,6 +180,7 @@ BROKEN: dict[str, Maker] = {
     "bin empty": _bytes("empty.bin", b""),
     "bin truncated": _bytes("cut.bin", BODY[:-3]),
     "bin text": _bytes("text.bin", b"1.0 2.0 3.0 0.5\n" * 50),
+    "bin with three floats": _bytes("three.bin", (points(48, 3) - 50).astype(np.float32).tobytes()),
     "bin with five floats": _bytes("five.bin", (points(48, 5) * [1, 1, 1, 255, 31]).astype(np.float32).tobytes()),
     "bin all NaN": _bytes("nan.bin", _with(None, 0, np.nan)),
     "bin all infinite": _bytes("inf.bin", _with(None, 0, np.inf)),

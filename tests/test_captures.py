@@ -9,6 +9,7 @@ import pytest
 from lidarsynth.data import ouster, velodyne
 from lidarsynth.data.capture import Datagram, datagrams
 from lidarsynth.data.turns import capture_turns, senders
+from lidarsynth.data.whole_turns import whole_turns
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.verbs.inputs import Reading, inputs_of
@@ -111,6 +112,16 @@ def test_velodyne_turns_are_cut_at_azimuth_0():
         velodyne.decode(velodyne_packet(0xA1, 0, 40, 5000))
     both = velodyne.decode(velodyne_packet(0x22, 0, 40, 5000, dual=True))[0]
     assert len(both["x"]) == 6 * 32, "of two returns the last one"
+
+
+def test_what_a_capture_cuts_at_its_ends_is_no_turn():
+    def left(*shares: float) -> list[float]:
+        return [turn["x"].tolist()[0] for turn in whole_turns((s, {"x": np.array([s])}) for s in shares)]
+
+    assert left(0.6, 1, 0.98, 0.7, 1, 0.55) == [1, 0.98, 0.7, 1], "packets that were lost in the midst are no end"
+    assert left(0.95, 1) == [0.95, 1] and left(0.4, 0.7) == [0.7]
+    assert left(0.1, 0.25, 0.25, 0.2) == [0.25, 0.25], "of a sensor that is set to a sector"
+    assert left(0.6) == [0.6] and left(0.4) == [] and left() == []
 
 
 def test_two_sensors_of_a_capture_are_told_apart(tmp_path: Path):

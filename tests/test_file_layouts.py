@@ -205,11 +205,12 @@ def test_las(suffix: str, scan: Scan, tmp_path: Path):
     las.ring = (9 - scan.ring).astype(np.uint8)
     las.add_extra_dims([laspy.ExtraBytesParams("echo_width", "float32"), laspy.ExtraBytesParams("normal", "3f4")])
     las.echo_width = np.arange(len(scan), dtype=np.float32)
+    las.classification = np.arange(len(scan)) % 3
     las.write(str(tmp_path / f"scan{suffix}"))
     found = read(tmp_path / f"scan{suffix}")
     check(found, scan, exact=False)
     np.testing.assert_array_equal(np.sort(found.extra["echo_width"]), np.arange(len(scan)))
-    assert list(found.extra) == ["echo_width"], "three numbers a point are no field of a scan"
+    assert list(found.extra) == ["echo_width", "classification"], "three numbers a point are no field of a scan"
     whole = (tmp_path / f"scan{suffix}").read_bytes()
     (tmp_path / f"cut{suffix}").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"^\S*: expected .* found"):

@@ -8,7 +8,7 @@ import pytest
 from lidarsynth.files.formats import read
 from lidarsynth.lidar.cones import fit_cones, fit_ring
 from lidarsynth.lidar.crowding import stand_of_beams
-from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed
+from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed, turns_left
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.scan import Scan
@@ -73,6 +73,25 @@ def test_height_and_tilt_show_without_rings_and_in_any_order(name: str):
     frame = check_frame(moved(scan, tilt))
     assert "tilted by 6.4 degrees" in str(frame.warning())
     np.testing.assert_allclose((frame.transform @ tilt)[:3, 2], [0, 0, 1], atol=2e-3)
+    both = parse_transform("0:0:1.73:-4:5:0")
+    frame = check_frame(moved(scan, both))
+    assert len(frame.faults) == 2, "height and tilt at once"
+    np.testing.assert_allclose((frame.transform @ both)[:3, 2], [0, 0, 1], atol=5e-3)
+    assert (frame.transform @ both)[2, 3] == pytest.approx(0, abs=0.25)
+
+
+def test_beams_that_look_alike_either_way_up_are_told_by_their_times():
+    """An OS1 in a room: as much above as below, and mirrored beams; it turns clockwise, seen from above."""
+    sensor = SENSORS["os1-64"].resized(width=256)
+    rays = sensor.directions()
+    near = np.random.default_rng(0).uniform(1.5, 3, 16).repeat(16) / np.hypot(rays[..., 0], rays[..., 1])
+    rows, columns = (index.reshape(-1) for index in np.indices(near.shape))
+    scan = Scan(sensor.points(near.astype(np.float32)).reshape(-1, 3), ring=rows, time=columns / 2560)
+    assert check_frame(scan).warning() is None
+    over = Scan(scan.xyz * np.float32([1, -1, -1]), ring=rows, time=scan.time)
+    assert check_frame(over).faults == ("upside down",)
+    np.testing.assert_allclose(check_frame(over).transform, np.diag([1, -1, -1, 1]), atol=1e-6)
+    assert not turns_left(over.xyz, None) and not turns_left(over.xyz, np.random.default_rng(0).random(len(over)))
 
 
 def test_points_that_a_named_sensor_could_not_see():

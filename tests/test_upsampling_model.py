@@ -259,7 +259,7 @@ def test_another_sensor_is_for_models_of_any_sensor():
     assert model_of("liif").into("vlp-32c").sensor == SENSORS["vlp-32c"]
     with pytest.raises(ValueError, match=r"divisible by 16, found 64 x 1800"):
         model_of("lidar-sr").into("pandar64")
-    with pytest.raises(ValueError, match=r"tiny: expected a model of any sensor, .* for --to os1-64, found one of hdl"):
+    with pytest.raises(ValueError, match=r"tiny: expected a model of any sensor, .* for os1-64, found one of hdl"):
         assemble(preset("tiny"), build_network(preset("tiny"))).into("os1-64")
 
 

@@ -178,7 +178,7 @@ def test_a_bag_by_number_in_any_order(suffix: str, tmp_path: Path):
         with ThreadPoolExecutor(1) as thread:
             scan = thread.submit(series.__getitem__, number).result().scan
         np.testing.assert_allclose(np.linalg.norm(scan.xyz, axis=1), 10 + number, rtol=1e-4)
-    assert list(series.names) == [f"drive/{i:06d}" for i in range(6)]
+    assert list(series.names) == [f"/points {10**9 + t / 10:.3f} s" for t in (0, 1, 2, 2, 3, 4)]
     with pytest.raises(IndexError):
         series[6]
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
+from lidarsynth.data.whole_turns import whole_turns
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import read_json, read_text
@@ -147,11 +148,16 @@ def _column_size(metadata: Metadata) -> int:
 
 
 def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
-    """Turns: x y z intensity (signal) reflectivity ambient ring time (seconds) of each return, row by row.
+    """Turns (`whole_turns`): x y z intensity (signal) reflectivity ambient ring time (seconds) of each return.
 
-    Sensor frame: x forward, y left, z up; ring = row, 0 the highest beam. A turn ends where the frame's number
-    changes; packets of other sizes are passed over. Raises FileError for a profile that is not in PROFILES.
+    Row by row, in the sensor frame: x forward, y left, z up; ring = row, 0 the highest beam. A turn ends where the
+    frame's number changes; packets of other sizes are passed over. Raises FileError for a profile not in PROFILES.
     """
+    return whole_turns(_parts(packets, metadata))
+
+
+def _parts(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[tuple[float, Fields]]:
+    """Share of a turn and points of each."""
     size, column = packet_size(metadata), _column_size(metadata)
     profile = PROFILES[metadata.profile]
     turn, number = _Turn(metadata, profile), None
@@ -160,11 +166,11 @@ def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
             continue
         if (frame := _frame_number(packet.payload, profile)) != number:
             if turn.columns:
-                yield turn.fields()
+                yield turn.columns / metadata.columns, turn.fields()
             turn, number = _Turn(metadata, profile), frame
         turn.add(packet.payload, column)
     if turn.columns:
-        yield turn.fields()
+        yield turn.columns / metadata.columns, turn.fields()
 
 
 def _frame_number(payload: bytes, profile: Profile) -> int:

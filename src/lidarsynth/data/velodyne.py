@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
+from lidarsynth.data.whole_turns import whole_turns
 from lidarsynth.files.fields import Fields, FileError
 
 SIZE = 1206  # bytes of a packet's payload
@@ -78,12 +79,16 @@ def is_velodyne(payload: bytes) -> bool:
 
 
 def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
-    """Whole turns: x y z intensity (0-255) ring time (seconds) of each return, in the order of firing.
+    """Turns (`whole_turns`): x y z intensity (0-255) ring time (seconds) of each return, in the order of firing.
 
-    A turn ends where the azimuth passes 0. The first and the last, which a capture cuts, come too if they are longer
-    than half a turn. x forward (azimuth 0), y left, z up; ring 0 is the highest beam. Of two returns the last is
-    taken. Raises FileError for a model that is not in MODELS.
+    A turn ends where the azimuth passes 0. x forward (azimuth 0), y left, z up; ring 0 is the highest beam. Of two
+    returns the last is taken. Raises FileError for a model that is not in MODELS.
     """
+    return whole_turns(_parts(packets))
+
+
+def _parts(packets: Iterable[Datagram]) -> Iterator[tuple[float, Fields]]:
+    """Share of a turn and points of each."""
     parts: list[Fields] = []
     last: int | None = None
     begun = swept = 0
@@ -95,15 +100,14 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
             if last is None:
                 begun = int(azimuth[first])
             elif int(azimuth[first]) < last - TURN // 2:  # passed 0
-                if swept > TURN // 2:
-                    yield _joined(parts)
+                yield swept / TURN, _joined(parts)
                 parts, begun = [], int(azimuth[first])
             inside = (points["block"] >= first) & (points["block"] < end)
             parts.append({name: points[name][inside] for name in NAMES})
             last = int(azimuth[end - 1])
             swept = last - begun
-    if swept > TURN // 2:
-        yield _joined(parts)
+    if parts:
+        yield swept / TURN, _joined(parts)
 
 
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:

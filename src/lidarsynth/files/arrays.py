@@ -28,7 +28,8 @@ PRINTABLE = frozenset(b"\t\n\r" + bytes(range(32, 127)))
 
 def read_bin(data: bytes) -> Fields:
     """KITTI: x y z reflectance, four float32 a point. Raises FileError for text or a size that is not whole points."""
-    hint = " (five floats a point, as nuScenes writes them, are read from .pcd.bin)" if len(data) % 20 == 0 else ""
+    hint = " (three floats a point, without reflectance, are read from .npy)" if len(data) % 12 == 0 else ""
+    hint = " (five floats a point, as nuScenes writes them, are read from .pcd.bin)" if len(data) % 20 == 0 else hint
     return _floats(data, 4, hint)
 
 

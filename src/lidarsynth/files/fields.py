@@ -60,7 +60,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto") -> tuple[Scan, int
         values = np.zeros(len(x), np.float32)
     elif name is None:
         raise FileError(f"expected an intensity field ({', '.join(NAMES['reflectance'][:4])}), "
-                        f"found {_listed(fields)}; --intensity none (intensity='none') takes it for 0")  # fmt: skip
+                        f"found {_listed(fields)}; --intensity none takes it for 0")  # fmt: skip
     else:
         values = _numbers(fields[name], name)
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & np.isfinite(values) & ((x != 0) | (y != 0) | (z != 0))

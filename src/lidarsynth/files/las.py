@@ -65,7 +65,7 @@ def _check_items(data: bytes, at: int, records: int, size: int) -> None:
 
 
 def read_las(data: bytes) -> Fields:
-    """x, y, z in metres, intensity, and every further dimension under one of the usual names.
+    """x, y, z in metres, intensity, every extra dimension, and every one of the format's that is not 0 everywhere.
 
     Raises FileError for anything laspy cannot read, and where laspy is missing, naming the extra that brings it.
     """
@@ -81,6 +81,8 @@ def read_las(data: bytes) -> Fields:
             told = [n for n in points.point_format.dimension_names if n in usual]
             added = [n for n in points.point_format.extra_dimension_names if n not in told]
             columns = {name: np.asarray(points[name]) for name in ("x", "y", "z", *told, *added)}
+            own = [n for n in points.point_format.standard_dimension_names if n not in ("X", "Y", "Z", *told)]
+            columns |= {name: column for name in own if (column := np.asarray(points[name])).any()}
             return {name: column for name, column in columns.items() if column.ndim == 1}
     except FileError:
         raise

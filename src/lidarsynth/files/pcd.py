@@ -47,7 +47,10 @@ def read_pcd(data: bytes) -> Fields:
     header = read_header(data)
     columns = DECODERS[header.encoding](data[header.start :], header)
     named = zip(header.names, header.counts, columns, strict=True)
-    fields = {name: column for name, count, column in reversed(list(named)) if count == 1 and name != "_"}
+    fields: Fields = {}
+    for name, count, column in named:
+        if count == 1 and name != "_":
+            fields.setdefault(name, column)
     if header.rows > 1 and (ring := rings_of_grid(fields, header.shape)) is not None:
         fields["ring"] = ring
     return fields

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from lidarsynth.lidar.ground import leaning, normal
+from lidarsynth.lidar.cones import onto_z
+from lidarsynth.lidar.ground import leaning, normal, plane
 
 FAR = 12.0  # metres, or half the points where fewer are as far: nearer ones show the carrier's motion in a turn most
 POINTS, FEW = 8_000, 3_000  # of a scan are enough; to look for a tilt
@@ -18,6 +20,8 @@ VIEW = (-35.0, 25.0)  # degrees that spinning sensors look
 NEAR = 0.45  # metres: beams of an HDL-64E leave 0.2 m above its origin
 ORIGINS = (0.0, 0.2)  # metres above the origin that a tilt is looked for from
 LEVEL = 0.3  # metres
+LOW, HIGH, LIFTS = 0.8, 3.5, (0.1, 0.05, 0.025)  # metres above the road from which both are looked for, and steps
+OFF, SWAY = 0.4, 1.6  # metres from the road that are off it; degrees of the axis from the road's normal, for both
 TIP, TIPS = 4.0, (0.2, 0.1, 0.05)  # degrees that the road may lie off the sensor's axis, and steps of looking for it
 # The contrast of beams, and how many times that of the frame itself. Of train scans and streets of seven sensors, at
 # rest or with a carrier's 10 m/s taken out, it is 1.75 and more from where the sensor stood; of their points moved off
@@ -30,7 +34,8 @@ def stand_of_beams(xyz: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float] |
     they crowd in the frame itself. None where the points crowd nowhere.
 
     The contrast of elevations is the sum of squares of their histogram by that of the same histogram smoothed. It is
-    sought along z at heights within 3 m, and at the origin about axes within 4 degrees of the ground's normal.
+    sought along z at heights within 3 m; then `off_the_road`; and where no road is seen, or nothing off it crowds, at
+    the origin about axes within 4 degrees of the ground's normal.
     """
     points = _far(xyz)
     points = points[np.random.default_rng(seed).permutation(len(points))[:POINTS]].astype(np.float32)
@@ -39,10 +44,50 @@ def stand_of_beams(xyz: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float] |
     here, best = contrast[np.abs(heights) < NEAR].max(), int(contrast.argmax())
     if here >= CROWDED and contrast[best] < CLEARLY * here:
         return up, 0.0
-    axis, crowding = _leaning(points, normal(xyz))
+    road = normal(xyz)
+    if (both := off_the_road(xyz, road, seed)) and both.contrast >= max(CROWDED, CLEARLY * both.here):
+        return both.axis, both.height
+    axis, crowding = _leaning(points, road)
     if max(crowding, contrast[best]) < max(CROWDED, CLEARLY * here):
         return None
     return (axis, 0.0) if crowding > contrast[best] else (up, float(heights[best]))
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where points off the road crowd most: about which axis, from how many metres along it, and their contrast.
+
+    here  that of the frame itself
+    """
+
+    axis: np.ndarray
+    height: float
+    contrast: float
+    here: float
+
+
+def off_the_road(xyz: np.ndarray, road: np.ndarray, seed: int = 0) -> Stand | None:
+    """Height and tilt at once, by what stands beside the road: rings on it would crowd from any height above it.
+
+    road  the ground's normal; None where no plane of it is seen, or fewer than POINTS / 8 far points stand off it
+    """
+    level = (xyz @ onto_z(road).T).astype(np.float32)
+    if (found := plane(level)) is None:
+        return None
+    points = _far(xyz[np.abs(level[:, 2] + found[0]) > OFF])
+    if len(points) < POINTS / 8:
+        return None
+    points = points[np.random.default_rng(seed).permutation(len(points))[:POINTS]].astype(np.float32)
+    slopes, side = np.degrees(np.arctan(road[:2] / road[2])), np.arange(-SWAY, SWAY + TIPS[0] / 2, TIPS[0])
+    lifts = np.arange(LOW - found[0], HIGH - found[0], LIFTS[0])
+    tips = [(lift, slopes[0] + a, slopes[1] + b) for lift, a, b in product(lifts, side, side)]
+    contrast, (lift, x, y) = _most_crowded(points[:FEW], tips)
+    for step, rise in zip(TIPS[1:], LIFTS[1:], strict=True):
+        around = product(range(-2, 3), repeat=3)
+        tips = [(lift + k * rise, x + i * step, y + j * step) for k, i, j in around]
+        contrast, (lift, x, y) = _most_crowded(points, tips)
+    here = _contrasts(points, np.tile([0.0, 0.0, 1.0], (len(ORIGINS), 1)), np.array(ORIGINS)).max()
+    return Stand(leaning(x, y), float(lift), contrast, float(here))
 
 
 def _far(xyz: np.ndarray) -> np.ndarray:

@@ -62,8 +62,8 @@ class Frame:
 def check_frame(scan: Scan) -> Frame:
     """In which frame a scan's points are.
 
-    Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height or tilt,
-    not both at once, by where elevations crowd.
+    Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height and tilt
+    by where elevations crowd.
     """
     up, has_rings = _upright(scan)
     rotation, words = np.array(AXES[up][0], np.float64), AXES[up][1]

@@ -58,6 +58,7 @@ def _chosen(values: np.ndarray, index: np.ndarray | slice) -> np.ndarray:
     """values[index], by `take`, which is several times as fast."""
     if isinstance(index, slice):
         return values[index]
+    index = np.asarray(index)
     if index.dtype != np.bool_:
         return values.take(index, axis=0)
     return values.take(np.flatnonzero(index), axis=0) if len(index) == len(values) else values[index]

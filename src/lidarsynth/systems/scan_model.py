@@ -267,8 +267,8 @@ class ScanModel(ABC):
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""
         name = sensor if isinstance(sensor, str) else sensor.name
-        raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as iln, lidar-sr or bilinear, "
-                         f"for --to {name}, found one of {self.sensor.name} only")  # fmt: skip
+        raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as default, for {name}, "
+                         f"found one of {self.sensor.name} only")  # fmt: skip
 
     def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> ScanModel:
         """The model that completes this scan in its own sensor's image; here itself, which knows one sensor.

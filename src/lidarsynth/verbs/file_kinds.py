@@ -45,7 +45,7 @@ def file_lines(path: Path) -> Lines | None:
             raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
         return _bag(path) if is_bag(path) else _cache(path) if (path / INDEX).exists() else _folder(path)
     if path.name.lower().endswith(tuple(READERS)):
-        return _image(path) | scan_lines(*read_with_report(path))
+        return _image(path) | _scan_file(path)
     if is_bag(path):
         return _bag(path)
     if is_capture(path):
@@ -69,6 +69,17 @@ def _image(path: Path) -> Lines:
     image = read_image(path)
     return {"kind": f"range image of {image.sensor.name}, {image.shape[0]} x {image.shape[1]}, "
                     f"{image.mask.mean():.1%} of its pixels filled"}  # fmt: skip
+
+
+def _scan_file(path: Path) -> Lines:
+    """Of a scan; also of one without intensities, for which other verbs want to be told that."""
+    try:
+        return scan_lines(*read_with_report(path))
+    except FileError as error:
+        if "--intensity none" not in str(error):
+            raise
+        none = {"reflectance": "none in the file: --intensity none for the other verbs"}
+        return scan_lines(*read_with_report(path, "none")) | none
 
 
 def scan_lines(scan: Scan, dropped: int = 0) -> Lines:
@@ -139,7 +150,7 @@ def _folder(path: Path) -> Lines:
     if rest := _counted(path, files):
         lines["passed over"] = rest
     try:
-        first = {f"first: {key}": text for key, text in scan_lines(*read_with_report(files[0])).items()}
+        first = {f"first: {key}": text for key, text in _scan_file(files[0]).items()}
     except FileError as error:
         first = {"first: broken": str(error)}
     return lines | {"first": str(files[0].relative_to(path))} | first

@@ -26,11 +26,13 @@ class Shown:
 
     boxes  records with kind, centre, size, yaw and, where known, velocity, as `lidarsynth streets` writes them
     notes  lines of what the viewer should say about it
+    name   where only reading tells it, such as the stamp of a message
     """
 
     scan: Scan
     boxes: Sequence[Mapping[str, Any]] = ()
     notes: tuple[str, ...] = ()
+    name: str = ""
 
 
 def packed(shown: Shown) -> bytes:
@@ -46,6 +48,7 @@ def packed(shown: Shown) -> bytes:
                    for name, values in blocks.items()],
         "boxes": list(shown.boxes),
         "notes": list(shown.notes),
+        "name": shown.name,
     }  # fmt: skip
     text = json.dumps(header, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)

@@ -72,9 +72,10 @@ class Stream:
         self._next = 0  # what the stream gives next
 
     def __getitem__(self, index: int) -> Shown:
-        loaded = self._thread.submit(self._at, index).result().read()
+        item = self._thread.submit(self._at, index).result()
+        loaded = item.read()
         dropped = (f"{loaded.dropped} points without a return or not finite were dropped",) if loaded.dropped else ()
-        return Shown(loaded.scan, notes=dropped)
+        return Shown(loaded.scan, notes=dropped, name=item.name)
 
     def _at(self, index: int) -> Input:
         if index < 0:
@@ -127,7 +128,8 @@ def _bag(path: Path, reading: Reading) -> Stream:
 
     def open_at(mark: int, number: int) -> Iterator[tuple[int, Input]]:
         with open_bag(path) as bag:
-            for place, message in enumerate(bag.messages(frozenset([topic]), mark), number):
-                yield message.time, MessageInput(f"{path.stem}/{place:06d}", path, reading, message)
+            for message in bag.messages(frozenset([topic]), mark):
+                name = f"{topic} {message.time / 1e9:.3f} s"
+                yield message.time, MessageInput(name, path, reading, message)
 
     return Stream(open_at, count)

@@ -91,7 +91,7 @@ class CascadeModel(ScanModel):
         if sensor is None:
             sensor, reason = recognise(scan)
             if sensor is None:
-                raise ValueError(f"{reason}, or into(SENSOR)")
+                raise ValueError(reason)
         return self.into(sensor)
 
     def with_labels(self) -> CascadeModel:

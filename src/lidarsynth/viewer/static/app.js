@@ -92,7 +92,7 @@ function paintVersions() {
 function paintBar() {
   const reach = source.reach(state.number), name = source.name(state.number);
   $("title").textContent = reach > 1 && name !== settings.title ? `${settings.title} · ${name}` : settings.title;
-  document.title = `${name} – lidarsynth`;
+  document.title = `${$("title").textContent} – lidarsynth`;
   $("slider").max = reach - 1;
   $("slider").value = state.number;
   $("where").textContent = `${state.number + 1} / ${source.count ?? "…"}`;

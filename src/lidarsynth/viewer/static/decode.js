@@ -22,7 +22,7 @@ const PASSES = [0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15];
 
 function spread(header, blocks) {
   const n = header.points, names = Object.keys(blocks).filter((name) => name !== "xyz" && name !== "row");
-  const scan = { n, boxes: header.boxes, notes: header.notes, strip: header.strip, fields: {} };
+  const scan = { n, boxes: header.boxes, notes: header.notes, name: header.name, strip: header.strip, fields: {} };
   scan.xyz = new Float32Array(n * 3);
   scan.range = new Float32Array(n);
   scan.row = new Int16Array(n);

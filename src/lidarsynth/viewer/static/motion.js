@@ -63,18 +63,18 @@ class Motion {
 
 // Metres beside the rings of distance, and a ring around the point that is pointed at.
 function placeLabels(camera, canvas) {
-  const m = camera.matrix(canvas.clientWidth / canvas.clientHeight), host = $("distances");
-  const put = (element, at) => {
-    const [x, y, w] = projected(m, ...at), here = w > 0 && Math.abs(x) < 1 && Math.abs(y) < 1;
-    element.hidden = !here;
-    if (here) element.style.transform = `translate(${((x + 1) / 2) * canvas.clientWidth}px, ${((1 - y) / 2) * canvas.clientHeight}px)`;
+  const { clientWidth: width, clientHeight: height } = canvas; // asked once: after a change it would be laid out anew
+  const m = camera.matrix(width / height), host = $("distances");
+  const put = (element, at, wanted = true) => {
+    const [x, y, w] = projected(m, ...at), here = wanted && w > 0 && Math.abs(x) < 1 && Math.abs(y) < 1;
+    if (element.hidden === here) element.hidden = !here;
+    if (here) element.style.transform = `translate(${((x + 1) / 2) * width}px, ${((1 - y) / 2) * height}px)`;
   };
   if (!host.childElementCount) host.append(...RINGS.map((d) => made("span", "", `${d} m`)));
   RINGS.forEach((d, k) => {
     const turn = camera.turn + Math.PI; // on the far side, ahead of who looks
-    put(host.children[k], [d * Math.cos(turn), d * Math.sin(turn), settings.ground]);
-    host.children[k].hidden ||= !$("rings").checked;
+    put(host.children[k], [d * Math.cos(turn), d * Math.sin(turn), settings.ground], $("rings").checked);
   });
-  $("cross").hidden = true;
-  if (state.mark !== null) put($("cross"), state.scan.xyz.subarray(3 * state.mark, 3 * state.mark + 3));
+  const mark = state.mark === null ? [0, 0, 0] : state.scan.xyz.subarray(3 * state.mark, 3 * state.mark + 3);
+  put($("cross"), mark, state.mark !== null);
 }

@@ -33,7 +33,9 @@ class Source {
   }
 
   async read(number, version) {
-    return decode(await (this.entries ? this.inside(number, version) : this.served(number, version)));
+    const scan = decode(await (this.entries ? this.inside(number, version) : this.served(number, version)));
+    if (scan.name && version === 0) this.names[number] = scan.name; // of a message, which only reading tells
+    return scan;
   }
 
   async inside(number, version) {

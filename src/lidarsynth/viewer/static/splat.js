@@ -14,7 +14,7 @@ class Splat {
 
   recolour(rgba) { this.colours = new Uint32Array(rgba.buffer); }
 
-  setLines(layers) { this.lines = layers; }
+  setLines(layers) { this.lines = layers.map(({ xyz, rgba }) => ({ xyz, colours: new Uint32Array(rgba.buffer) })); }
 
   finish() {}
 
@@ -28,7 +28,7 @@ class Splat {
     this.out.fill(this.back);
     this.depth.fill(0); // one over the distance: what is nearer has more
     splatPoints(this, m, pointScale(pixels, height, share), Math.ceil(this.colours.length * share));
-    for (const { xyz, rgba } of this.lines) splatLines(this, m, xyz, new Uint32Array(rgba.buffer));
+    for (const { xyz, colours } of this.lines) splatLines(this, m, xyz, colours);
     this.context.putImageData(this.image, 0, 0);
   }
 }

@@ -1,0 +1,30 @@
+"""The turns of a capture that are worth a scan: it begins and ends in the midst of one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import chain
+
+from lidarsynth.files.fields import Fields
+
+WHOLE, HALF = 0.9, 0.5  # of the turns beside it
+
+
+def whole_turns(parts: Iterable[tuple[float, Fields]]) -> Iterator[Fields]:
+    """The turns, of parts (share of a turn, points) as a capture has them.
+
+    The first and the last, which a capture cuts, come if they are nine tenths as long as the one beside them; those
+    between, which may have lost packets, if they are half as long: a sensor may be set to a sector. One that is alone
+    comes from half a turn on.
+    """
+    before, held = 0.0, None
+    for after in chain(parts, [(0.0, None)]):
+        if held is not None:
+            share, fields = held
+            least = WHOLE if before == 0 or after[1] is None else HALF
+            beside = max(before, after[0])
+            if share >= least * beside and (beside > 0 or share > HALF):
+                assert fields is not None
+                yield fields
+            before = share
+        held = after
