@@ -2,10 +2,9 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forked import Forked
 from oracle import assert_close
 from random_images import SENSOR, WHAT, image, name
 from torch.utils.data import DataLoader
@@ -171,19 +171,20 @@ def test_an_interrupted_call_goes_on_where_it_was(tmp_path: Path):
 
 def test_killed_at_any_moment_the_same_command_goes_on(tmp_path: Path):
     scans(tmp_path, 200)
-    command = [sys.executable, "-m", "lidarsynth", "data", "kitti", str(tmp_path), str(tmp_path / "cache"),
-               "--projection", "spherical", "--width", "1024", "--workers", "2"]  # fmt: skip
+    options = ("--projection", "spherical", "--width", 1024, "--workers", 2)
+    words = ("data", "kitti", tmp_path, tmp_path / "cache", *options)
     kills = 0
     for shards in (1, 2):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = Forked(*words)
         while process.poll() is None and len(list((tmp_path / "cache").glob("*.npy"))) < shards:
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
         kills += process.wait() == -signal.SIGKILL
     assert kills >= 1
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "wrote 200 images of 1 sequence in" in done.stdout
+    done = Forked(*words)
+    said, errors = done.communicate()
+    assert done.returncode == 0, errors[-2000:]
+    assert "wrote 200 images of 1 sequence in" in said
     list(cache_source("kitti", tmp_path, tmp_path / "whole", projection="spherical", width=1024))
     assert state(tmp_path / "cache") == state(tmp_path / "whole"), "no leftovers of the killed processes either"
 
@@ -216,23 +217,20 @@ def test_a_wrong_projection_stops_at_once(tmp_path: Path):
     assert not list((tmp_path / "cache").glob("*.npy"))
 
 
-LIMITED = """
-import resource, sys
-from lidarsynth.cli.main import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
-main(sys.argv[1:])
-"""
+def limited(words: list[str]) -> None:
+    """The command line where no file may be larger than 3 MB."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+    main(words)
 
 
 def test_a_full_disk_is_one_clear_line(tmp_path: Path):
     scans(tmp_path, 130)
     words = ["data", "kitti", str(tmp_path), str(tmp_path / "cache"), "--projection", "spherical", "--workers", "2"]
-    script = tmp_path / "limited.py"
-    script.write_text(LIMITED.replace("main(sys.argv[1:])", "if __name__ == '__main__':\n    main(sys.argv[1:])"))
-    done = subprocess.run([sys.executable, str(script), *words], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2, done.stderr
-    line = done.stderr.strip().splitlines()[-1]
-    assert "Traceback" not in done.stderr
+    done = Forked(*words, run=limited)
+    _, errors = done.communicate()
+    assert done.returncode == 2, errors
+    line = errors.strip().splitlines()[-1]
+    assert "Traceback" not in errors
     assert f"{tmp_path}/cache: expected a writable folder with room for 8.0 MiB more, found: File too large" in line
     assert not (tmp_path / "cache" / "0000000.npy").exists() and not list((tmp_path / "cache").glob(".*"))
     main(words)

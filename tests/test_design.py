@@ -2,12 +2,12 @@
 
 import os
 import re
-import subprocess
-import sys
+import runpy
 from pathlib import Path
 
 import pytest
 import rooms
+from forked import Forked
 from test_house import ROOMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,8 +80,13 @@ def test_tables_are_added_to_from_outside(tmp_path: Path):
     """In a process of its own, as a user's file: tables of this one stay as they are."""
     (code,) = re.findall(r"```python\n(.*?)```", DESIGN, re.S)
     (tmp_path / "mine.py").write_text(code + "print(again.sensor.name, int(again.mask.sum()) > 1000, report)\n")
-    done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=200,
-                          env={**os.environ, "PYTHONPATH": str(ROOT / "src")})  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[:2] == ["mine", "True"]
-    assert re.search(r"mine-1 v1.*cells +0\.0\d", done.stdout, re.S), done.stdout
+    done = Forked(tmp_path, run=_users_file)
+    said, errors = done.communicate()
+    assert done.returncode == 0, errors
+    assert said.split()[:2] == ["mine", "True"]
+    assert re.search(r"mine-1 v1.*cells +0\.0\d", said, re.S), said
+
+
+def _users_file(words: list[str]) -> None:
+    os.chdir(words[0])
+    runpy.run_path("mine.py", run_name="__main__")

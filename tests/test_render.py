@@ -21,7 +21,7 @@ from lidarsynth.pictures.colours import (
     reflectance_colours,
     turbo,
 )
-from lidarsynth.pictures.figure import colour_bar, compare, compare_3d, panel
+from lidarsynth.pictures.figure import colour_bar, compare, panel
 from lidarsynth.pictures.perspective import Camera, perspective
 from lidarsynth.pictures.render import (
     BACKGROUNDS,
@@ -232,8 +232,6 @@ def test_panel_says_what_is_wrong():
         panel([[("a", np.zeros((2, 2)))]])
     with pytest.raises(ValueError, match="at least one image, got none"):
         compare({})
-    with pytest.raises(ValueError, match="0 images and 2 columns"):
-        compare_3d({})
 
 
 def test_compare_holds_the_strips_of_every_image():
@@ -242,12 +240,6 @@ def test_compare_holds_the_strips_of_every_image():
     for strip in (range_strip(before), reflectance_strip(after)):
         windows = np.lib.stride_tricks.sliding_window_view(figure[:, 20 : 20 + 32], 12, axis=0)
         assert np.any(np.all(np.moveaxis(windows, -1, 1) == strip, axis=(1, 2, 3)))
-
-
-def test_compare_3d_fills_its_rows():
-    images = {"one": small_image(0), "two": street(500), "three": small_image(2)}
-    assert compare_3d(images, columns=3, size=(80, 45)).shape[1] == 3 * 80 + 2 * 12 + 40
-    assert compare_3d(images, columns=2, size=(80, 45), background="dark").shape[1] == 2 * 80 + 12 + 40
 
 
 @pytest.mark.parametrize("by", ["range", "reflectance"])

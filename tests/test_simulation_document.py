@@ -5,11 +5,13 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from networks import tiny_cascade
 from test_readme import REPO_ROOT, blocks, commands, smaller
 
 from lidarsynth.cli.main import main
+from lidarsynth.data import street_sets
 from lidarsynth.files.formats import read, write
 from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.sensor import SENSORS, get_sensor
@@ -31,6 +33,8 @@ def small(words: list[str]) -> list[str]:
 
 def test_the_walk_through_walks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.chdir(tmp_path)
+    # which casts the frames again; tests/test_street_sets.py looks at a real one
+    monkeypatch.setattr(street_sets, "overview", lambda streets: np.zeros((8, 8, 3), np.uint8))
     (toml,) = ("\n".join(block.lines) for block in SHOWN if block.language == "toml")
     (tmp_path / "own.toml").write_text(toml.replace("width = 900", "width = 128"))
     tiny_cascade(SENSORS["vlp-16"]).save("tiny")

@@ -132,7 +132,8 @@ def test_streets_without_cars_are_the_same_streets():
 def test_worse_scans_get_worse_scores(network: StreetFeatures):
     pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
     benchmark = runpy.run_path(str(REPO_ROOT / "benchmarks/street.py"))
-    judge_of = benchmark["Judge"](STREET_1, accumulation.Loaded({"rangenet": network}, {"rangenet": WEIGHTS}))
+    first = replace(STREET_1, rows=STREET_1.rows[:1])
+    judge_of = benchmark["Judge"](first, accumulation.Loaded({"rangenet": network}, {"rangenet": WEIGHTS}))
     scans = list(benchmark["streets"](3000, 2))
     real = judge_of.gather(scans, "real")
 
@@ -143,9 +144,9 @@ def test_worse_scans_get_worse_scores(network: StreetFeatures):
     assert score(lambda image, rng: image) == pytest.approx(0, abs=1e-6)
     for kind in ("blur", "rows shuffled", "beams without return"):
         weak, *_, strong = benchmark["CORRUPTIONS"][kind].values()
-        assert 1e-4 < 2 * score(weak) < score(strong), kind
-    noise = score(benchmark["noise_image"])
-    assert noise > 2 * score(benchmark["CORRUPTIONS"]["rows shuffled"]["within 64"])
+        assert 1e-4 < 2 * score(weak) < (strongest := score(strong)), kind
+        if kind == "rows shuffled":
+            assert score(benchmark["noise_image"]) > 2 * strongest
 
 
 @pytest.mark.timeout(120)

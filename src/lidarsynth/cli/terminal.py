@@ -65,14 +65,13 @@ def scan_bar(title: str, count: int | None) -> Iterator[Callable[[], object]]:
 
 @contextmanager
 def image_bar() -> Iterator[Callable[[str, int, int], object]]:
-    """A progress bar for work over two seconds; gives what to call with (what, images done, images in all)."""
+    """A progress bar for work over two seconds; gives what to call with (what, done, in all): images, rows, bytes."""
     from tqdm import tqdm
 
-    with tqdm(unit="image", delay=2, leave=False, mininterval=_seconds()) as bar:
+    with tqdm(unit="", delay=2, leave=False, mininterval=_seconds()) as bar:
 
         def on_images(what: str, done: int, total: int) -> None:
-            bar.total, bar.unit = total, {"download": "B", "compute": "row"}.get(what.split()[0], "image")
-            bar.unit_scale = bar.unit == "B"
+            bar.total, bar.unit_scale = total, total > 1_000_000  # then as 1.23M, such as bytes
             bar.set_description(what, refresh=False)
             bar.update(done - bar.n)
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.pictures.colours import range_colours, reflectance_colours
-from lidarsynth.pictures.perspective import BEHIND, Camera, perspective
 from lidarsynth.pictures.render import range_strip, reflectance_strip
 
 Picture = tuple[str, np.ndarray]  # caption, (H, W, 3) uint8
@@ -115,26 +114,3 @@ def compare(
     half = (width - GAP) // 2
     bars = [("range", colour_bar("range", half, end)), ("reflectance", colour_bar("reflectance", half))]
     return panel([*rows, bars], title, width)
-
-
-def compare_3d(
-    images: Mapping[str, Scan | RangeImage],
-    title: str = "",
-    columns: int = 2,
-    by: str = "height",  # word of colours.COLOURS
-    camera: Camera = BEHIND,
-    size: tuple[int, int] = (720, 450),  # pixels of one view, width and height
-    background: str = "white",
-) -> np.ndarray:
-    """(H', W', 3) uint8: one perspective view per caption, all from the same camera, `columns` beside each other.
-
-    Raises ValueError where `images` is empty or `columns` is not positive.
-    """
-    if not images or columns < 1:
-        raise ValueError(f"compare_3d needs images and columns, got {len(images)} images and {columns} columns")
-    views = [(caption, perspective(image, camera, size, by, background)) for caption, image in images.items()]
-    rows = [views[i : i + columns] for i in range(0, len(views), columns)]
-    if len(rows) > 1:
-        paper = np.full((size[1], size[0], 3), PAPER, np.uint8)
-        rows[-1] += [("", paper)] * (columns - len(rows[-1]))
-    return panel(rows, title)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -39,12 +40,13 @@ def colourings(first: Scan) -> dict[str, dict[str, Any]]:
         "height": _scale("Height above the sensor", "m", "linear", low, high,
                          height_colours(low + unit * (high - low), low, high),
                          list(range(math.ceil(low), math.floor(high) + 1))),
-        "reflectance": _scale("Reflectance", "0 to 1", "sqrt", 0, 1, viridis(unit), [0, 0.1, 0.25, 0.5, 1]),
+        "reflectance": _scale("Reflectance", "0 to 1", "sqrt", 0, 1, viridis(unit), [0, 0.1, 0.25, 0.5, 1],
+                              ["reflectance"]),
         "label": {"title": "Class", "fields": ["label"], "classes": [[name, list(rgb)] for name, rgb in CLASSES]},
         "new": {"title": "Measured or new", "fields": ["new"],
                 "classes": [["measured", list(MEASURED)], ["filled in", list(NEW)]]},
         "confidence": _scale("Confidence", "chance of being right", "linear", 0, 1, viridis(unit),
-                             [0, 0.25, 0.5, 0.75, 1]),
+                             [0, 0.25, 0.5, 0.75, 1], ["confidence"]),
     }  # fmt: skip
 
 
@@ -65,9 +67,15 @@ def _log(unit: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def _scale(
-    title: str, unit: str, kind: str, low: float, high: float, shades: np.ndarray, ticks: list[float]
+    title: str,
+    unit: str,
+    kind: str,
+    low: float,
+    high: float,
+    shades: np.ndarray,
+    ticks: list[float],
+    fields: Sequence[str] = (),
 ) -> dict[str, Any]:
-    field = title.split()[0].lower()
     return {
         "title": title,
         "unit": unit,
@@ -76,5 +84,5 @@ def _scale(
         "high": high,
         "ticks": ticks,
         "shades": base64.b64encode(shades.astype(np.uint8).tobytes()).decode(),
-        "fields": [] if field in ("range", "height") else [field],
+        "fields": list(fields),
     }

@@ -40,7 +40,6 @@ from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 
 METHODS = ("auto", "conditional", "sample", "repaint")
-SAMPLERS = tuple(STEPS)
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
 TIMES = 4  # as many beams
@@ -255,8 +254,8 @@ class CascadeModel(ScanModel):
         return 1 + (STEPS_DEFAULT if steps is None else steps)
 
     def _sampler(self, sampler: str | None) -> str:
-        if sampler is not None and sampler not in SAMPLERS:
-            raise ValueError(f"expected a sampler of {', '.join(SAMPLERS)}, found {sampler!r}")
+        if sampler is not None and sampler not in STEPS:
+            raise ValueError(f"expected a sampler of {', '.join(STEPS)}, found {sampler!r}")
         return sampler or "dpmpp-2m"
 
     def _coarse(self, told: Tensor, guided: bool) -> Denoiser:
