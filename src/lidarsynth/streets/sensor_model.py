@@ -60,6 +60,7 @@ FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) w
 DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
 VANISH = -0.14  # signal at which half of the returns vanish
 VANISH_WIDTH = 0.014
+LOSSY = (TABLE[:, 4] > 0) | (TABLE[:, 5] > 0)  # materials of which a beam may pass, or not return at all
 DOUBT = 0.2  # more than VANISH_WIDTH * ln(1e6)
 NOISE = (0.0012, 0.004, 0.014)  # metres: standard deviation per metre, least, most
 ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.08, "stone": 0.02, "bark": 0.02}  # metres along the beam
@@ -146,12 +147,15 @@ def sense(
     face, distance, cosine = caster.cast(origins, rays, times)
     first = face.copy()
     material, label, tint, depth = _surface(world, face, origins, rays, distance)
-    missed, made_of = face < 0, material.astype(np.intp)
+    gone, made_of = face < 0, material.astype(np.intp)
+    missed = np.flatnonzero(gone)
     deeper = depth / np.maximum(cosine, 0.12)
     surface, surface_label = distance + deeper, label.copy()
     surface[missed], surface_label[missed] = np.inf, 0
-    steady = _steady(face, lasers.number)
-    where = np.flatnonzero((0.8 * steady + 0.2 * chance[0] < TABLE[:, 5].take(made_of)) & ~missed)
+    lossy = np.flatnonzero(LOSSY.take(made_of, mode="wrap"))
+    steady, luck = _steady(face.take(lossy), lasers.number.take(lossy)), chance[0].take(lossy)
+    through = 0.8 * steady + 0.2 * luck < TABLE[:, 5].take(made_of.take(lossy))
+    where = lossy.compress(through & ~gone.take(lossy))
     if len(where):
         when = None if times is None else times[where]
         starts, beams = origins.T.take(where, axis=1).T, rays.T.take(where, axis=1).T
@@ -159,11 +163,12 @@ def sense(
         for mine, theirs in zip((face, distance, cosine, made_of, label, tint, depth), far, strict=True):
             mine[where] = theirs
         deeper[where] = far[-1] / np.maximum(far[2], 0.12)
-    optics = [column.take(made_of) for column in eye.table.T[:5]]
+    optics = [column.take(made_of, mode="wrap") for column in eye.table.T[:4]]
     strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
-    gone = (0.7 * steady + 0.3 * chance[0] > 1 - optics[4]) | (face < 0)
+    gone[where] = face.take(where) < 0
+    gone[lossy] |= 0.7 * steady + 0.3 * luck > 1 - TABLE[:, 4].take(made_of.take(lossy))
     faint = np.flatnonzero(strength < VANISH - eye.strength + DOUBT)  # the others return for sure
     gone[faint] |= strength.take(faint) + _doubt(chance[1].take(faint)) < VANISH - eye.strength
     distance = (
@@ -172,9 +177,10 @@ def sense(
     gone |= ~(distance < max_range)
     # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
     grain = optics[2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
-    reflectance = REPORTED.take(np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp))
-    reflectance = eye.reported(reflectance)
-    distance[gone], reflectance[gone], label[gone] = 0, 0, 0
+    step = np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp)
+    reflectance = eye.reported(REPORTED.take(step, mode="wrap"))
+    lost = np.flatnonzero(gone)
+    distance[lost], reflectance[lost], label[lost] = 0, 0, 0
     return Returns(distance, reflectance, label, face, first, surface, surface_label)
 
 
@@ -212,13 +218,16 @@ def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.nda
     table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
         table[NUMBER[name]] = rough * factor
-    return np.hypot(table.take(material), range_noise(distance))
+    spread, uneven = range_noise(distance), np.flatnonzero((table > 0).take(material, mode="wrap"))
+    spread[uneven] = np.hypot(table.take(material.take(uneven)), spread.take(uneven))
+    return spread
 
 
 def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
     """Material, label, tint and depth behind the face of N hits; misses get the last triangle's."""
     hit, triangle = face >= 0, face.astype(np.intp)
-    kind, material, label, tint = (of.take(triangle) for of in (world.kind, world.material, world.label, world.tint))
+    columns = (world.kind, world.material, world.label, world.tint)
+    kind, material, label, tint = (column.take(triangle, mode="wrap") for column in columns)
     depth = np.zeros(len(face), np.float32)
     low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
     x, y, _ = _spots(origins, rays, distance, low)
@@ -232,8 +241,11 @@ def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarr
 
 def _spots(origins: np.ndarray, rays: np.ndarray, distance: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
     """World x, y and z, each (n,), at which the chosen rays, by number, end."""
-    far = distance.take(chosen)
-    return [start.take(chosen) + way.take(chosen) * far for start, way in zip(origins.T, rays.T, strict=True)]
+    far = distance.take(chosen, mode="wrap")
+    return [
+        start.take(chosen, mode="wrap") + way.take(chosen, mode="wrap") * far
+        for start, way in zip(origins.T, rays.T, strict=True)
+    ]
 
 
 def _behind(
