@@ -78,8 +78,8 @@ class WorldBuilder:
     ) -> None:
         """Pieces of one hedge or fence: all of the same variant, height scale and tint, given by `first`."""
         rows = np.empty((len(x), len(ROW)))
+        rows[:] = 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, first[1], first[2], STILL
         rows[:, 0], rows[:, 1], rows[:, 3] = x, y, yaw
-        rows[:, [2, 4, 5, 6, 7, 8]] = 0.0, 1.0, 1.0, first[1], first[2], STILL
         variant = first[0] % len(library()[kind])
         self.groups.append(Group(kind, rows, np.full(len(x), variant), 0.4, (variant,)))
 
@@ -172,10 +172,11 @@ def _instances(things: dict[tuple[str, int], np.ndarray]) -> dict[str, np.ndarra
     first = start = 0
     for shape, mine in zip(shapes, things.values(), strict=True):
         count, last, stop = len(mine), first + len(mine), start + len(mine) * len(shape)
-        part = {key: of[start:stop].reshape(count, len(shape), *of.shape[1:]) for key, of in soup.items()}
-        corners = part["corners"].reshape(count, 3 * len(shape), 3)
+        part = {key: soup[key][start:stop].reshape(count, len(shape)) for key in ("material", "label", "tint", "thing")}
+        corners = soup["corners"][start:stop].reshape(count, 3 * len(shape), 3)
         np.matmul(shape.corners.reshape(-1, 3), turns[first:last], out=corners)
-        corners += rows[first:last, None, :3]
+        for axis in range(3):  # three long passes, not one over triples
+            corners[:, :, axis] += rows[first:last, axis, None]
         part["material"][:], part["label"][:] = shape.material, shape.label
         part["tint"][:], part["thing"][:] = rows[first:last, 7, None], np.arange(first, last)[:, None]
         first, start = last, stop

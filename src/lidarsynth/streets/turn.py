@@ -119,7 +119,8 @@ def world_rays(
             origins[:, a:b] = mine[:, None]
         apart = np.moveaxis(rays, -1, 0).reshape(3, -1)
         if len(apart.T) > ends[-1]:
-            apart = apart.take(np.flatnonzero(seen), axis=1, mode="wrap")
+            number = np.flatnonzero(seen)
+            apart = np.stack([along.take(number, mode="wrap") for along in apart])
         return origins.T, (turn @ apart).T
     origins = np.einsum("hj,wij->hwi", start, turns) + places
     return origins[seen].T.copy().T, np.einsum("hwj,wij->hwi", rays, turns)[seen].T.copy().T
