@@ -1,7 +1,7 @@
 """Labelled streets: how fast they are made, who is in them, and what odometry makes of a drive.
 
 python benchmarks/streets.py                          frames per second of processor time, by sensor, boxes included
-python benchmarks/streets.py --shares                 road users' shares of the pixels, by --pedestrians and --cyclists
+python benchmarks/streets.py --shares                 road users' shares of the pixels, by --pedestrians, --cyclists and --motorcycles
 python benchmarks/streets.py --odometry               KISS-ICP (pip install kiss-icp) on drives, against their poses
 """
 
@@ -42,7 +42,8 @@ def shares(density: Density, worlds: int) -> str:
     counts = np.bincount(labels, minlength=len(CLASS_NUMBER))
     words = ("person", "bicyclist", "motorcyclist", "bicycle", "motorcycle", "car")
     cells = [f"{100 * counts[CLASS_NUMBER[word]] / counts[1:].sum():.3f}" for word in words]
-    return f"| {density.pedestrians:g} | {density.cyclists:g} | " + " | ".join(cells) + " |"
+    asked = (density.pedestrians, density.cyclists, density.motorcycles)
+    return "| " + " | ".join([*(f"{factor:g}" for factor in asked), *cells]) + " |"
 
 
 def estimated(frames: list[Frame], timed: bool) -> np.ndarray:
@@ -101,8 +102,9 @@ def main() -> None:
     if args.odometry:
         odometry(args.drives, args.frames, args.sensor)
     elif args.shares:
-        for pedestrians, cyclists in ((1, 0), (0.1, 0), (0.08, 0), (0.05, 0), (0.08, 0.1)):
-            print(shares(Density(pedestrians=pedestrians, cyclists=cyclists), args.shares), flush=True)
+        for asked in ((1, 0, 0), (0.1, 0, 0), (0.08, 0, 0), (0.05, 0, 0), (0.08, 0.1, 0), (0.08, 0.1, 0.08)):
+            density = Density(**dict(zip(("pedestrians", "cyclists", "motorcycles"), asked, strict=True)))
+            print(shares(density, args.shares), flush=True)
     else:
         for name in ("hdl-64e-kitti", "os1-64", "vlp-16"):
             print(speed(name, 0, 16))

@@ -13,6 +13,8 @@ from lidarsynth.streets.moving import Bodies
 from lidarsynth.streets.turn import Turn, attitudes, some_rays
 from lidarsynth.streets.world import World
 
+MARGIN = 0.05  # m between a shape and each side of its box: flat sides are seen through the noise, boxes stand upright
+# in the sensor's frame, and the sensor tilts
 MOVES = 0.2  # m/s from which a thing counts as moving
 
 
@@ -93,7 +95,7 @@ def boxes_of(
         front = np.array([np.cos(moment.yaw[actor]), np.sin(moment.yaw[actor]), 0]) @ to_world[:3, :3]
         shown = met / alone if alone else 0.0
         found.append(Box(
-            str(actors.kind[actor]), int(actor) + 1, _three(here[actor]), _three(actors.size[actor]),
+            str(actors.kind[actor]), int(actor) + 1, _three(here[actor]), _three(actors.size[actor] + 2 * MARGIN),
             float(np.arctan2(front[1], front[0])), _three(moment.velocity[actor] @ to_world[:3, :3]),
             _three(middles[actor]), float(np.arctan2(np.sin(moment.yaw[actor]), np.cos(moment.yaw[actor]))),
             _three(moment.velocity[actor]), int(points[actor + 1]), float(np.clip(1 - shown, 0, 1)),

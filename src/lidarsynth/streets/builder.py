@@ -78,8 +78,8 @@ class WorldBuilder:
     ) -> None:
         """Pieces of one hedge or fence: all of the same variant, height scale and tint, given by `first`."""
         rows = np.empty((len(x), len(ROW)))
+        rows[:] = 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, first[1], first[2], STILL
         rows[:, 0], rows[:, 1], rows[:, 3] = x, y, yaw
-        rows[:, [2, 4, 5, 6, 7, 8]] = 0.0, 1.0, 1.0, first[1], first[2], STILL
         variant = first[0] % len(library()[kind])
         self.groups.append(Group(kind, rows, np.full(len(x), variant), 0.4, (variant,)))
 
@@ -113,14 +113,21 @@ def assemble(builder: WorldBuilder, poses: np.ndarray) -> World:
     slab, kerb = slab_mesh(builder.ground)
     walls, fronts = walls_of(builder)
     things = placed(builder)
-    soups = [_soup(bare, GROUND, "road", "road"), _soup(slab, SLAB, "sidewalk", "sidewalk")]
-    soups += [_soup(walls, FRONT, "plaster", "building"), _instances(things)]
+    count = sum(len(library()[kind][variant]) * len(rows) for (kind, variant), rows in things.items())
+    parts = ((bare, GROUND, "road", "road"), (slab, SLAB, "sidewalk", "sidewalk"), (walls, FRONT, "plaster", "building"),
+             (np.zeros((count, 0, 3)), THING, "road", "road"))  # fmt: skip
+    ends = np.cumsum([len(corners) for corners, *_ in parts]).tolist()
+    joined = _soup(ends[-1])
+    soups = [{key: of[a:b] for key, of in joined.items()} for a, b in zip([0, *ends], ends, strict=False)]
+    for soup, (corners, kind, material, label) in zip(soups, parts, strict=True):
+        soup["corners"][:, : corners.shape[1]] = corners
+        soup["kind"][:], soup["material"][:], soup["label"][:] = kind, NUMBER[material], CLASS_NUMBER[label]
     soups[1]["material"][kerb] = NUMBER["kerb"]
     if len(fronts):
         per = len(walls) // len(fronts)
         soups[2]["front"][:] = np.repeat(np.arange(len(fronts)), per)
         soups[2]["tint"][:] = np.repeat(fronts[:, 11], per)
-    joined = {key: np.concatenate([soup[key] for soup in soups]) for key in soups[0]}
+    _instances(things, soups[3])
     names = [(kind, variant, row[:8], row[8]) for (kind, variant), rows in things.items() for row in rows]
     return World(**joined, fronts=fronts, ground=builder.ground, poses=poses, things=np.array(names, THINGS))
 
@@ -148,35 +155,31 @@ def walls_of(builder: WorldBuilder) -> tuple[np.ndarray, np.ndarray]:
     return corners, table.reshape(-1, 12).astype(np.float32)
 
 
-def _soup(corners: np.ndarray, kind: int, material: str, label: str) -> dict[str, np.ndarray]:
-    count = len(corners)
+def _soup(count: int) -> dict[str, np.ndarray]:
+    """What `World` says of `count` triangles; corners, kinds, materials and labels are not yet written."""
     return {
-        "corners": np.asarray(corners, np.float32),
-        "kind": np.full(count, kind, np.uint8),
-        "material": np.full(count, NUMBER[material], np.uint8),
-        "label": np.full(count, CLASS_NUMBER[label], np.uint8),
+        "corners": np.empty((count, 3, 3), np.float32),
+        **{key: np.empty(count, np.uint8) for key in ("kind", "material", "label")},
         "tint": np.zeros(count, np.float32),
         "front": np.full(count, -1, np.int16),
         "thing": np.full(count, -1, np.int32),
     }
 
 
-def _instances(things: dict[tuple[str, int], np.ndarray]) -> dict[str, np.ndarray]:
+def _instances(things: dict[tuple[str, int], np.ndarray], soup: dict[str, np.ndarray]) -> None:
     """Copies of library meshes, scaled, turned and shifted by rows (N, 9) of ROW for each kind and variant."""
     rows = np.concatenate([np.zeros((0, len(ROW))), *things.values()]).astype(np.float32)
     c, s, zero = np.cos(rows[:, 3]), np.sin(rows[:, 3]), np.zeros(len(rows), np.float32)
     turns = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1], axis=-1).reshape(-1, 3, 3) * rows[:, 4:7, None]
     shapes = [library()[kind][variant] for kind, variant in things]
-    total = sum(len(shape) * len(mine) for shape, mine in zip(shapes, things.values(), strict=True))
-    soup = _soup(np.empty((total, 3, 3), np.float32), THING, "road", "road")
     first = start = 0
     for shape, mine in zip(shapes, things.values(), strict=True):
         count, last, stop = len(mine), first + len(mine), start + len(mine) * len(shape)
-        part = {key: of[start:stop].reshape(count, len(shape), *of.shape[1:]) for key, of in soup.items()}
-        corners = part["corners"].reshape(count, 3 * len(shape), 3)
+        part = {key: soup[key][start:stop].reshape(count, len(shape)) for key in ("material", "label", "tint", "thing")}
+        corners = soup["corners"][start:stop].reshape(count, 3 * len(shape), 3)
         np.matmul(shape.corners.reshape(-1, 3), turns[first:last], out=corners)
-        corners += rows[first:last, None, :3]
+        for axis in range(3):  # three long passes, not one over triples
+            corners[:, :, axis] += rows[first:last, axis, None]
         part["material"][:], part["label"][:] = shape.material, shape.label
         part["tint"][:], part["thing"][:] = rows[first:last, 7, None], np.arange(first, last)[:, None]
         first, start = last, stop
-    return soup

@@ -126,7 +126,9 @@ class PacketScene:
             deque(map(cast, repeat(every), repeat(scene), SCRATCH.places[:full], repeat(how)), maxlen=0)
             if full < len(packets):
                 cast(last, scene, SCRATCH.places[full], how)
-            mine[:] = packets[:, TRIANGLE].reshape(-1)[: len(mine)].view(np.int32)
+            faces = packets[:, TRIANGLE].view(np.int32)
+            mine[: full * PACKET].reshape(full, PACKET)[:] = faces[:full]
+            mine[full * PACKET :] = faces[full:].reshape(-1)[: len(mine) - full * PACKET]
         return found
 
 

@@ -51,6 +51,8 @@ def _relief(
     """Metres behind the plane of plain wall: uneven plaster, bossed stone, pilasters, a plinth that stands out."""
     rough = 0.004 + 0.03 * _fraction(seed * 0.173) ** 3
     uneven = rough * (np.sin(along * 3.1 + seed) + np.sin(up * 7.3 + along * 1.7) + np.sin(along * 11.0 - up * 5.0))
-    courses = np.where(_fraction(seed / 5) < 0.1, 0.03 * (_fraction(up / 0.45) < 0.13), 0)
-    pilaster = np.where((_fraction(seed / 4) < 0.1) & (np.abs(from_edge) < 0.35), -0.12, 0)
-    return uneven + courses + pilaster - 0.06 * plinth
+    behind = uneven.astype(np.float64)
+    bossed = np.flatnonzero(_fraction(seed / 5) < 0.1)
+    behind[bossed] += 0.03 * (_fraction(up.take(bossed) / 0.45) < 0.13)
+    behind[(_fraction(seed / 4) < 0.1) & (np.abs(from_edge) < 0.35)] -= 0.12  # pilasters
+    return behind - 0.06 * plinth

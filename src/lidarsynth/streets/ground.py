@@ -49,16 +49,34 @@ class Road:
 
     def coordinates(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(s, d) of world points; d is infinite beyond the road's ends. One Newton step to the bend: 2 cm."""
+        u, v = self._endless(x, y)
+        return u, np.where((u >= self.start) & (u <= self.stop), v, np.inf)
+
+    def _endless(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(s, d) of world points, as if the road had no ends."""
         c, sn = np.float32(np.cos(self.yaw)), np.float32(np.sin(self.yaw))
-        u = c * (x - np.float32(self.x)) + sn * (y - np.float32(self.y))
-        v = c * (y - np.float32(self.y)) - sn * (x - np.float32(self.x))
+        east, north = x - np.float32(self.x), y - np.float32(self.y)
+        u, v = c * east + sn * north, c * north - sn * east
         if self.wave[0] != 0:
             shift, slope = self.bend(u)
             foot = u + (v - shift) * slope / (1 + slope**2)
             shift, slope = self.bend(foot)
             v = ((v - shift) - (u - foot) * slope) / np.sqrt(1 + slope**2)
             u = foot
-        return u, np.where((u >= self.start) & (u <= self.stop), v, np.inf)
+        return u, v
+
+    def within(self, x: np.ndarray, y: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which of N world points, by number, lie less than `reach` m beside the road, and their (s, d)."""
+        if self.wave[0] != 0:
+            s, d = self._endless(x, y)
+            near = np.flatnonzero(np.abs(d) < reach)
+            s, d = s.take(near), d.take(near)
+        else:
+            c, sn = np.float32(np.cos(self.yaw)), np.float32(np.sin(self.yaw))
+            near = np.flatnonzero(np.abs(c * (y - np.float32(self.y)) - sn * (x - np.float32(self.x))) < reach)
+            s, d = self._endless(x.take(near), y.take(near))
+        there = (s >= self.start) & (s <= self.stop)
+        return (near, s, d) if there.all() else (near.compress(there), s.compress(there), d.compress(there))
 
 
 @dataclass(frozen=True)
@@ -106,9 +124,7 @@ class Ground:
         sag, tracks = np.zeros(x.shape, np.float32), np.zeros(x.shape, np.float32)
         roadway = np.zeros(x.shape, bool)
         for road in self.roads:
-            s, d = road.coordinates(x, y)
-            near = np.flatnonzero(np.abs(d) < road.half + BESIDE)
-            s, d = s.take(near), d.take(near)
+            near, s, d = road.within(x, y, road.half + BESIDE)
             on = np.abs(d) < road.half
             inside, across = near.compress(on), d.compress(on)
             roadway[inside] = True

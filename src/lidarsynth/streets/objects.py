@@ -97,20 +97,43 @@ def bus(length: float) -> Mesh:
     return join(*parts, *_wheels("other-vehicle", (-h + 2.6, h - 2.6), 0.48, 1.18))
 
 
+STRIDE = 1.4  # radians of the legs for those of the arms: boxes as long as those of KITTI, 0.84 m on average
+
+
 def person(rng: np.random.Generator, label: str = "person", seated: bool = False) -> Mesh:
-    """A walking or, on two wheels, a seated human."""
+    """A human in mid-stride or, on two wheels, a seated one."""
     stride, lean = rng.uniform(0.1, 0.35), rng.uniform(0.25, 0.5) if seated else rng.uniform(-0.05, 0.1)
-    parts = []
-    for side, swing in ((0.1, stride), (-0.1, -stride)):
-        leg = frustum((0.07, 0.10), (0.0, 0.85), 6, "cloth", label)
-        parts.append(moved(leg, -0.85 * np.sin(swing) * 0.5, side, 0.0, tilt=swing * 0.6))
+    legs = _seated_legs(stride, label) if seated else _walking_legs(STRIDE * stride, label)
     rings = (((0.16, 0.21), (0.0, 0.45)), ((0.21, 0.07), (0.45, 0.62)))  # waist to shoulders to neck
     head = (((0.06, 0.11), (0.6, 0.75)), ((0.11, 0.04), (0.75, 0.92)))
     trunk = [frustum(radii, z, 8, "cloth", label) for radii, z in rings]
     trunk += [frustum(radii, z, 6, "skin", label) for radii, z in head]
-    arms = [moved(frustum((0.05, 0.06), (0.0, 0.6), 5, "cloth", label), 0.1 * s, 0.24 * s, -0.02, tilt=-0.3 * s)
+    reach, swing = (0.1, 0.3) if seated else (0.6 * np.sin(stride), stride)  # of the hands; arms go against the legs
+    arms = [moved(frustum((0.05, 0.06), (0.0, 0.6), 5, "cloth", label), reach * s, 0.24 * s, -0.02, tilt=-swing * s)
             for s in (-1, 1)]  # fmt: skip
-    return join(*parts, moved(join(*trunk, *arms), z=0.83, tilt=lean))
+    return join(*legs, moved(join(*trunk, *arms), z=0.83, tilt=lean))
+
+
+def _seated_legs(stride: float, label: str) -> list[Mesh]:
+    leg = frustum((0.07, 0.10), (0.0, 0.85), 6, "cloth", label)
+    return [moved(leg, -0.85 * np.sin(swing) * 0.5, side, 0.0, tilt=swing * 0.6)
+            for side, swing in ((0.1, stride), (-0.1, -stride))]  # fmt: skip
+
+
+def _walking_legs(swing: float, label: str) -> list[Mesh]:
+    """Two straight legs from the hip, `swing` radians behind and before it, on feet that point ahead; as many triangles
+    as the seated ones."""
+    leg = frustum((0.065, 0.10), (0.0, 0.88), 4, "cloth", label)
+    heel, ankle, toe = [-0.08, 0.0, 0.0], [-0.05, 0.0, 0.12], [0.17, 0.0, 0.02]
+    edge = np.array([[0, -0.045, 0], [0, 0.045, 0]])
+    top = shapes.quads(np.array([ankle + edge[0], toe + edge[0], toe + edge[1], ankle + edge[1]]))
+    sides = [[heel + out, toe + out, ankle + out] for out in edge]
+    foot = shapes.mesh(np.concatenate([top, sides]), "tyre", label)
+    parts = []
+    for side, turn in ((0.1, swing), (-0.1, -swing)):
+        x = -0.88 * np.sin(turn)
+        parts += [moved(leg, x, side, 0.0, tilt=turn), moved(foot, x, side, 0.0)]
+    return parts
 
 
 def two_wheeler(label: str, heavy: bool) -> Mesh:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsynth.streets import facades
 from lidarsynth.streets.hdl64e import Lasers
 from lidarsynth.streets.materials import NUMBER, TABLE
 from lidarsynth.streets.raycast import AnyCaster
-from lidarsynth.streets.world import FRONT, GROUND, SLAB, World
+from lidarsynth.streets.surfaces import Met, surfaces
+from lidarsynth.streets.world import World
 
 # Reflectance reported for a signal: nothing when dim, then steep, flat about 0.3, so that the shares of all reported
 # values become those of real scans.
@@ -60,6 +60,9 @@ FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) w
 DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
 VANISH = -0.14  # signal at which half of the returns vanish
 VANISH_WIDTH = 0.014
+GLASS = np.uint8(NUMBER["glass"])  # the material that lets beams pass
+LOSSY = TABLE[:, 4] > 0  # materials from which a beam may not return at all
+PAST = np.float32(0.05)  # metres behind a pane from which a beam goes on
 DOUBT = 0.2  # more than VANISH_WIDTH * ln(1e6)
 NOISE = (0.0012, 0.004, 0.014)  # metres: standard deviation per metre, least, most
 ROUGH = {"grass": 0.035, "gravel": 0.015, "leaves": 0.08, "stone": 0.02, "bark": 0.02}  # metres along the beam
@@ -143,27 +146,28 @@ def sense(
     count = len(rays)
     chance = rng.random((2, count), dtype=np.float32)
     noise = rng.standard_normal((3, count), dtype=np.float32)
-    face, distance, cosine = caster.cast(origins, rays, times)
-    first = face.copy()
-    material, label, tint, depth = _surface(world, face, origins, rays, distance)
-    missed, made_of = face < 0, material.astype(np.intp)
-    deeper = depth / np.maximum(cosine, 0.12)
-    surface, surface_label = distance + deeper, label.copy()
+    met = Met(origins, rays, *caster.cast(origins, rays, times))
+    where = _through(world, met.face, lasers.number, chance[0])
+    beyond = _beyond(caster, met, where, None if times is None else times[where])
+    (material, label, tint, depth), behind = surfaces(world, met, beyond)
+    face, distance, cosine = met[2:]
+    deeper, missed = depth / np.maximum(cosine, 0.12), np.flatnonzero(face < 0)
+    first, surface, surface_label = face.copy(), distance + deeper, label.copy()
     surface[missed], surface_label[missed] = np.inf, 0
-    steady = _steady(face, lasers.number)
-    where = np.flatnonzero((0.8 * steady + 0.2 * chance[0] < TABLE[:, 5].take(made_of)) & ~missed)
     if len(where):
-        when = None if times is None else times[where]
-        starts, beams = origins.T.take(where, axis=1).T, rays.T.take(where, axis=1).T
-        far = _behind(world, caster, starts, beams, distance.take(where), when)
-        for mine, theirs in zip((face, distance, cosine, made_of, label, tint, depth), far, strict=True):
+        pane = distance.take(where) + PAST
+        for mine, theirs in ((face, beyond.face), (distance, pane + beyond.distance), (cosine, beyond.cosine),
+                             (material, behind.material), (label, behind.label), (tint, behind.tint),
+                             (deeper, behind.depth / np.maximum(beyond.cosine, 0.12))):  # fmt: skip
             mine[where] = theirs
-        deeper[where] = far[-1] / np.maximum(far[2], 0.12)
-    optics = [column.take(made_of) for column in eye.table.T[:5]]
+    made_of = material.astype(np.intp)
+    optics = [column.take(made_of, mode="wrap") for column in eye.table.T[:4]]
     strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
     near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
     signal = strength - lasers.dip * np.clip(near, 0, 1)
-    gone = (0.7 * steady + 0.3 * chance[0] > 1 - optics[4]) | (face < 0)
+    gone, lossy = face < 0, np.flatnonzero(LOSSY.take(made_of, mode="wrap"))
+    steady = _steady(first.take(lossy), lasers.number.take(lossy))
+    gone[lossy] |= 0.7 * steady + 0.3 * chance[0].take(lossy) > 1 - TABLE[:, 4].take(made_of.take(lossy))
     faint = np.flatnonzero(strength < VANISH - eye.strength + DOUBT)  # the others return for sure
     gone[faint] |= strength.take(faint) + _doubt(chance[1].take(faint)) < VANISH - eye.strength
     distance = (
@@ -172,9 +176,10 @@ def sense(
     gone |= ~(distance < max_range)
     # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
     grain = optics[2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
-    reflectance = REPORTED.take(np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp))
-    reflectance = eye.reported(reflectance)
-    distance[gone], reflectance[gone], label[gone] = 0, 0, 0
+    step = np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp)
+    reflectance = eye.reported(REPORTED.take(step, mode="wrap"))
+    lost = np.flatnonzero(gone)
+    distance[lost], reflectance[lost], label[lost] = 0, 0, 0
     return Returns(distance, reflectance, label, face, first, surface, surface_label)
 
 
@@ -212,41 +217,22 @@ def _spread(material: np.ndarray, distance: np.ndarray, factor: float) -> np.nda
     table = np.zeros(len(TABLE), np.float32)
     for name, rough in ROUGH.items():
         table[NUMBER[name]] = rough * factor
-    return np.hypot(table.take(material), range_noise(distance))
+    spread, uneven = range_noise(distance), np.flatnonzero((table > 0).take(material, mode="wrap"))
+    spread[uneven] = np.hypot(table.take(material.take(uneven)), spread.take(uneven))
+    return spread
 
 
-def _surface(world: World, face: np.ndarray, origins: np.ndarray, rays: np.ndarray, distance: np.ndarray) -> tuple:
-    """Material, label, tint and depth behind the face of N hits; misses get the last triangle's."""
-    hit, triangle = face >= 0, face.astype(np.intp)
-    kind, material, label, tint = (of.take(triangle) for of in (world.kind, world.material, world.label, world.tint))
-    depth = np.zeros(len(face), np.float32)
-    low = np.flatnonzero(hit & ((kind == GROUND) | (kind == SLAB)) & (material != NUMBER["kerb"]))
-    x, y, _ = _spots(origins, rays, distance, low)
-    stuff, words, wear, depth[low] = world.ground.surface(x, y, kind.take(low) == SLAB)
-    material[low], label[low], tint[low] = stuff, words, wear / TABLE[:, 1].take(stuff)
-    wall = np.flatnonzero(hit & (kind == FRONT))
-    rows = world.fronts.T.take(world.front.take(triangle.take(wall)), axis=1)
-    material[wall], depth[wall] = facades.shade(np.stack(_spots(origins, rays, distance, wall)).T, rows.T)
-    return material, label, tint, depth
+def _through(world: World, face: np.ndarray, number: np.ndarray, luck: np.ndarray) -> np.ndarray:
+    """Numbers of the beams that pass through what they met; luck (N,) in [0, 1)."""
+    pane = np.flatnonzero((world.material.take(face, mode="wrap") == GLASS) & (face >= 0))
+    steady = _steady(face.take(pane), number.take(pane))
+    return pane.compress(0.8 * steady + 0.2 * luck.take(pane) < TABLE[GLASS, 5])
 
 
-def _spots(origins: np.ndarray, rays: np.ndarray, distance: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
-    """World x, y and z, each (n,), at which the chosen rays, by number, end."""
-    far = distance.take(chosen)
-    return [start.take(chosen) + way.take(chosen) * far for start, way in zip(origins.T, rays.T, strict=True)]
-
-
-def _behind(
-    world: World,
-    caster: AnyCaster,
-    origins: np.ndarray,
-    rays: np.ndarray,
-    distance: np.ndarray,
-    times: np.ndarray | None,
-) -> tuple:
-    """The hits behind glass, as `_surface` and the caster give them; a second pane ends the beam."""
-    step = distance + np.float32(0.05)
-    start = origins + rays * step[:, None]
-    face, more, cosine = caster.cast(start, rays, times)
-    material, label, tint, depth = _surface(world, face, start, rays, more)
-    return face, step + more, cosine, material, label, tint, depth
+def _beyond(caster: AnyCaster, met: Met, where: np.ndarray, times: np.ndarray | None) -> Met:
+    """What the beams of the numbers `where` meet behind what they met; a second pane ends the beam."""
+    rays, step = met.rays.T.take(where, axis=1).T, met.distance.take(where) + PAST
+    origins = met.origins.T.take(where, axis=1).T + rays * step[:, None]
+    if not len(where):
+        return Met(origins, rays, met.face[:0], step, step)
+    return Met(origins, rays, *caster.cast(origins, rays, times))

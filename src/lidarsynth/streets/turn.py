@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,29 +51,43 @@ def shoot(
     times (W,) seconds at which the columns are measured, for casters of things that move; None where nothing does
     """
     rays = _jittered(sensor, rng)
-    seen = ~hdl64e.hidden(sensor)
-    origins, directions = world_rays(sensor, rays, seen, attitudes(sensor, poses))
+    view = _view(sensor)
+    origins, directions = world_rays(sensor, rays, view.seen, attitudes(sensor, poses))
     lasers = hdl64e.lasers(sensor, optics.loss, optics.dip, optics.shift)
-    when = None if times is None else np.broadcast_to(times, seen.shape)[seen]
+    when = None if times is None else np.broadcast_to(times, view.seen.shape)[view.seen]
     found = sense(world, caster, origins, directions, lasers, rng, sensor.max_range, optics, when)
-    lost = ~(found.distance >= sensor.min_range)
-    reported = [_whole(seen, v, v.dtype, lost) for v in (found.distance, found.reflectance, found.label)]
-    faces = [_whole(seen, values, np.int32, empty=-1) for values in (found.face, found.first)]
-    beyond = ~((found.surface >= sensor.min_range) & (found.surface < sensor.max_range))
-    surface = [_whole(seen, v, v.dtype, beyond) for v in (found.surface, found.surface_label)]
+    lost = np.flatnonzero(~(found.distance >= sensor.min_range))
+    reported = [_whole(view, v, lost) for v in (found.distance, found.reflectance, found.label)]
+    faces = [_whole(view, values, empty=-1) for values in (found.face, found.first)]
+    beyond = np.flatnonzero(~((found.surface >= sensor.min_range) & (found.surface < sensor.max_range)))
+    surface = [_whole(view, v, beyond) for v in (found.surface, found.surface_label)]
     return Turn(rays, local_points(rays, reported[0], sensor), *reported, *faces, *surface)
 
 
-def _whole(
-    seen: np.ndarray, values: np.ndarray, kind: np.dtype | type, without: np.ndarray | None = None, empty: int = 0
-) -> np.ndarray:
-    """(H, W) image of the values (N,) of the rays that are `seen` (H, W) bool; 0 where `without` (N,) bool says so."""
+class _View(NamedTuple):
+    """seen (H, W) bool: which rays leave the carrier; number (H, W): how many before each do; blocked (n,): the others,
+    as numbers of pixels."""
+
+    seen: np.ndarray
+    number: np.ndarray
+    blocked: np.ndarray
+
+
+@lru_cache(maxsize=4)
+def _view(sensor: Sensor) -> _View:
+    seen = ~hdl64e.hidden(sensor)
+    number = np.cumsum(seen.reshape(-1)) - 1
+    return _View(seen, np.maximum(number, 0).reshape(seen.shape), np.flatnonzero(~seen))
+
+
+def _whole(view: _View, values: np.ndarray, without: np.ndarray | None = None, empty: int = 0) -> np.ndarray:
+    """(H, W) image of the values (N,) of the rays that are seen; 0 for the rays of the numbers `without`."""
     if without is not None:
         values[without] = 0
-    if len(values) == seen.size:
-        return values.reshape(seen.shape)
-    image = np.full(seen.shape, empty, kind)
-    image[seen] = values
+    if not len(view.blocked):
+        return values.reshape(view.seen.shape)
+    image = values.take(view.number, mode="wrap")
+    image.reshape(-1)[view.blocked] = empty
     return image
 
 
@@ -98,9 +113,15 @@ def world_rays(
     turns, places = frames
     if len(turns) == 1:
         turn, place = turns[0], places[0]
-        origins = np.repeat((start @ turn.T + place).T, seen.sum(axis=1), axis=1)
+        ends = np.cumsum(seen.sum(axis=1)).tolist()
+        origins = np.empty((3, ends[-1]), np.float32)
+        for mine, a, b in zip(start @ turn.T + place, [0, *ends], ends, strict=False):
+            origins[:, a:b] = mine[:, None]
         apart = np.moveaxis(rays, -1, 0).reshape(3, -1)
-        return origins.T, (turn @ (apart if seen.all() else apart.take(np.flatnonzero(seen), axis=1))).T
+        if len(apart.T) > ends[-1]:
+            number = np.flatnonzero(seen)
+            apart = np.stack([along.take(number, mode="wrap") for along in apart])
+        return origins.T, (turn @ apart).T
     origins = np.einsum("hj,wij->hwi", start, turns) + places
     return origins[seen].T.copy().T, np.einsum("hwj,wij->hwi", rays, turns)[seen].T.copy().T
 
@@ -119,10 +140,11 @@ def some_rays(
 
 def local_points(rays: np.ndarray, distance: np.ndarray, sensor: Sensor) -> np.ndarray:
     """(H, W, 3) float32 points in the sensor frame, zero where nothing returned."""
-    points = rays * distance[..., None]
+    points = np.moveaxis(rays, -1, 0) * distance
     if sensor.offsets:
-        points[..., 2] += np.where(distance > 0, np.asarray(sensor.offsets, np.float32)[:, None], 0)
-    return points
+        points[2] += np.asarray(sensor.offsets, np.float32)[:, None]
+        points[2][~(distance > 0)] = 0
+    return np.moveaxis(points, 0, -1)
 
 
 @lru_cache(maxsize=4)
@@ -137,8 +159,10 @@ def _jittered(sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
     phase = rng.random((sensor.height, 1), np.float32) / 2 - 0.25
     shake = rng.random((sensor.height, sensor.width), np.float32)
     angle = (phase + 0.16 * shake - 0.08) * np.float32(2 * np.pi / sensor.width)
-    x, y, z = _directions(sensor)
-    rays = np.stack([x - angle * y, y + angle * x, z])  # small angles: the length stays 1 within 1e-6
+    rays = _directions(sensor).copy()
+    x, y, _ = _directions(sensor)
+    rays[0] -= angle * y  # small angles: the length stays 1 within 1e-6
+    rays[1] += angle * x
     return np.moveaxis(rays, 0, -1)
 
 
