@@ -5,6 +5,7 @@ python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of re
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
 python benchmarks/any_sensor.py dense [--sensor vlp-16]   held-out streets in four times as many beams
+python benchmarks/any_sensor.py responses           reflectance of held-out streets, reported in ways never trained on
 Each takes --models (words or folders).
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.streets.virtual import SHARING, VirtualStreets
 
 RIVALS = ("nearest", "bilinear", "bicubic")
 NEAR, FREE = 5.0, 1.25  # metres; a truth so many times as far, or none, proves a near point wrong
@@ -101,7 +104,7 @@ def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
         row = np.abs(np.asarray(image.sensor.elevations)[:, None] - elevations).argmin(1)
         column = (np.arange(image.shape[1]) * kitti.width / image.shape[1]).astype(int)
         car, known = mask[np.ix_(row, column)], every(image, 4)
-        beams = car.any(1)[:, None] & ~known
+        beams = car.any(axis=1, keepdims=True) & ~known
         for word in models:
             filled = completed(word, image, known)
             places = [(chosen, part) for chosen in (beams & car, beams & ~car) for part in (filled, image)]
@@ -122,6 +125,43 @@ def dense(name: str, models: Sequence[str], count: int = 24) -> Iterator[str]:
     yield from (f"| {word} | {a:.3f} | {b:.4f} |" for word, (a, b) in totals.items())
 
 
+def responses(count: int = 8) -> Iterator[str]:
+    """Reflectance of hidden returns against bilinear's, of streets that virtual sensors report otherwise: taken as it
+    stands (a sensor file with a dimness of 0), and as the model finds out."""
+    streets, rng = VirtualStreets(HELD_OUT, SHARING * count), np.random.default_rng(HELD_OUT)
+    images = [
+        replace(street, sensor=replace(street.sensor, dimness=())) for street in map(streets.image, _firsts(count))
+    ]
+    ways: dict[str, Callable[[RangeImage], np.ndarray]] = {
+        "as streets are": lambda image: image.reflectance,
+        "a fifth of it": lambda image: 0.2 * image.reflectance,
+        "its fifth power": lambda image: (1.2 * image.reflectance).clip(0, 1) ** 5,
+        "beams 30 % apart": lambda image: image.reflectance * np.exp(rng.normal(0, 0.3, (image.shape[0], 1))),
+        "less with distance, (6 m / r)^2": lambda image: image.reflectance * (6 / np.maximum(image.range, 6)) ** 2,
+    }
+    yield "| how it is reported | 1/2: as it stands | found out | 1/4: as it stands | found out |"
+    yield "|---|---|---|---|---|"
+    for way, report in ways.items():
+        cells: list[list[np.ndarray]] = []
+        for image in images:
+            seen = replace(image, reflectance=(report(image).clip(0, 1) * 255).round().astype(np.float32) / 255)
+            plain = replace(seen, sensor=replace(seen.sensor, dimness=(0.0,) * seen.sensor.height))
+            rows = [(every(image, step), seen, plain) for step in (2, 4)]
+            cells.append([
+                mean_errors(completed(word, one, known), seen, ~known & seen.mask)[1:]
+                for known, own, bare in rows
+                for word, one in (("bilinear", own), ("default", bare), ("default", own))
+            ])  # fmt: skip
+        mean = np.mean(cells, 0).reshape(2, 3)
+        shown = " | ".join(f"{100 * (value / row[0] - 1):+.1f} %" for row in mean for value in row[1:])
+        yield f"| {way} | {shown} |"
+
+
+def _firsts(count: int) -> range:
+    """One scan of each virtual sensor."""
+    return range(0, SHARING * count, SHARING)
+
+
 REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str]], Iterator[str]]] = {
     "errors": errors,
     "phantoms": phantoms,
@@ -131,14 +171,17 @@ REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str]], Iterator[str]]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=(*REPORTS, "dense"))
+    parser.add_argument("what", choices=(*REPORTS, "dense", "responses"))
     parser.add_argument("scans", nargs="*", type=Path)
     parser.add_argument("--models", nargs="+", default=["default"])
     parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--returned", action="store_true")
     args = parser.parse_args()
     REPORTS["errors"] = partial(errors, returned=args.returned)
-    lines = dense(args.sensor, args.models) if args.what == "dense" else REPORTS[args.what](args.scans, args.models)
+    if args.what == "responses":
+        lines = responses()
+    else:
+        lines = dense(args.sensor, args.models) if args.what == "dense" else REPORTS[args.what](args.scans, args.models)
     for line in lines:
         print(line, flush=True)
 
