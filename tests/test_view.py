@@ -408,6 +408,10 @@ def test_too_many_for_a_file_are_refused_before_any_is_read(tmp_path: Path, caps
 def test_colours_fit_the_first_scan():
     near, far = (colourings(turn(far=distance))["range"]["high"] for distance in (15.0, 100.0))
     assert (near, far) == (20, 120)
+    fields = {word: scale["fields"] for word, scale in colourings(turn()).items()}
+    assert fields == {"range": [], "height": []} | {
+        word: [word] for word in ("reflectance", "label", "new", "confidence")
+    }
 
 
 def test_a_range_image_is_shown_as_its_points(tmp_path: Path):
