@@ -1,7 +1,7 @@
 """Labelled streets: how fast they are made, who is in them, and what odometry makes of a drive.
 
 python benchmarks/streets.py                          frames per second of processor time, by sensor, boxes included
-python benchmarks/streets.py --shares                 road users' shares of the pixels, by their options
+python benchmarks/streets.py --shares                 shares of pixels, by --pedestrians, --cyclists, --motorcycles
 python benchmarks/streets.py --odometry               KISS-ICP (pip install kiss-icp) on drives, against their poses
 """
 

@@ -114,8 +114,9 @@ def assemble(builder: WorldBuilder, poses: np.ndarray) -> World:
     walls, fronts = walls_of(builder)
     things = placed(builder)
     count = sum(len(library()[kind][variant]) * len(rows) for (kind, variant), rows in things.items())
+    written_later = np.zeros((count, 0, 3))
     parts = ((bare, GROUND, "road", "road"), (slab, SLAB, "sidewalk", "sidewalk"),
-             (walls, FRONT, "plaster", "building"), (np.zeros((count, 0, 3)), THING, "road", "road"))  # fmt: skip
+             (walls, FRONT, "plaster", "building"), (written_later, THING, "road", "road"))  # fmt: skip
     ends = np.cumsum([len(corners) for corners, *_ in parts]).tolist()
     joined = _soup(ends[-1])
     soups = [{key: of[a:b] for key, of in joined.items()} for a, b in zip([0, *ends], ends, strict=False)]
