@@ -119,6 +119,23 @@ def test_kitti_labels_are_the_boxes():
     assert label_line(behind) is None
 
 
+def test_points_of_a_thing_lie_in_its_box_as_openpcdet_reads_it():
+    streets = LabelledStreets(0, 64, Sensor("even", tuple(np.linspace(7, -16, 40).tolist()), 512, mount=2.0))
+    inside, told = [], []
+    for frame in (streets[index] for index in (6, 24, 39, 50)):
+        for box in frame.boxes:
+            if box.points > 2 and (line := label_line(box)):
+                centre, size, yaw = box_of(line)
+                away = frame.scan.xyz[frame.raw >> 16 == box.instance] - centre
+                c, s = np.cos(yaw), np.sin(yaw)
+                local = np.column_stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0], away[:, 2]])
+                inside.append((np.abs(local) <= size / 2).all(axis=1).sum())
+                told.append(box.points)
+    share = np.array(inside) / told
+    assert len(told) > 15 and np.sum(inside) > 0.98 * np.sum(told)
+    assert (share > 0.5).all()
+
+
 def test_kitti_has_what_openpcdet_opens(tmp_path: Path):
     folder = written(tmp_path / "set", "kitti")
     lines = (folder / "training" / "calib" / "000002.txt").read_text().splitlines()

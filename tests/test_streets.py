@@ -9,10 +9,11 @@ from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
 from lidarsynth.streets.areas import TODAY, Density
-from lidarsynth.streets.boxes import Box
+from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.layout import build
+from lidarsynth.streets.objects import library
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.recordings import RecordedStreets
 from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
@@ -297,3 +298,10 @@ def test_recordings_differ_as_days_do():
     np.testing.assert_array_equal(image.range, again.range)
     np.testing.assert_array_equal(image.reflectance, again.reflectance)
     assert image.sensor == streets.recording(20).sensor and image.label is not None
+
+
+def test_people_are_as_large_as_kittis():
+    """KITTI's mean pedestrian is 0.84 m long, 0.66 m wide and 1.76 m high, with the annotators' margin."""
+    sizes = [np.ptp(one.corners.reshape(-1, 3), axis=0) + 2 * MARGIN for one in library()["person"]]
+    np.testing.assert_allclose(np.mean(sizes, axis=0), [0.84, 0.66, 1.76], atol=0.12)
+    assert np.ptp(sizes, axis=0)[0] > 0.3  # they are met at different moments of their step

@@ -36,6 +36,7 @@ LAYOUTS: dict[str, Layout] = {
     "nuscenes": NUSCENES,
     "pcd": PCD,
 }
+EDITION = 2  # of the streets: raised when equal settings give other scans or boxes, so that no set mixes them
 RECORD = "streets.json"
 CHUNK = 16  # frames that one process makes in a row, at most; they share their world
 
@@ -117,7 +118,8 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
         for name in later.keys() & of.keys():
             if of[name] == later[name]:
                 del of[name]  # a set of before there was this choice goes on
-    return {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
+    asked = {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
+    return asked | {"edition": EDITION}
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> None:
@@ -128,8 +130,7 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
     if path.exists():
         found = read_json(path)
         if found != settings:
-            differ = [k for k in settings if not isinstance(found, dict) or found.get(k) != settings[k]]
-            asked, was = ({k: of.get(k) for k in differ} if isinstance(of, dict) else of for of in (settings, found))
+            asked, was = _differing(settings, found), _differing(found, settings)
             raise ValueError(f"{folder}: expected a folder of streets made with {asked!s:.200}, found {was!s:.200}; "
                              "use another --out")  # fmt: skip
         return
@@ -137,6 +138,14 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
         raise ValueError(f"{folder}: expected an empty folder, or one with {RECORD}; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
     _put(path, (json.dumps(settings, indent=1) + "\n").encode())
+
+
+def _differing(these: Any, those: Any) -> Any:
+    """What of these settings is not in those, without what is equal."""
+    if not (isinstance(these, dict) and isinstance(those, dict)):
+        return these
+    keys = [key for key in these if key not in those or these[key] != those[key]]
+    return {key: _differing(these[key], those.get(key)) for key in keys}
 
 
 def _put(path: Path, content: bytes | BinaryIO) -> None:
