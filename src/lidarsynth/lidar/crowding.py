@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -108,7 +109,7 @@ def _leaning(points: np.ndarray, road: np.ndarray) -> tuple[np.ndarray, float]:
     return leaning(x, y), crowding
 
 
-def _most_crowded(points: np.ndarray, tips: list[tuple[float, float, float]]) -> tuple[float, tuple[float, ...]]:
+def _most_crowded(points: np.ndarray, tips: Sequence[tuple[float, float, float]]) -> tuple[float, tuple[float, ...]]:
     """The greatest contrast about axes that lean by x and y degrees, from `lift` metres along them, and its tip."""
     contrast = _contrasts(points, np.array([leaning(x, y) for _, x, y in tips]), np.array([tip[0] for tip in tips]))
     best = int(contrast.argmax())
