@@ -382,11 +382,18 @@ def test_demo_runs_and_lists_what_it_made(run: Run, tiny: Path, tmp_path: Path, 
 
 
 KINDS = ("missing", "named pipe", "bin truncated", "pcd endless header")  # `read` has tests of all
+UNLIT = [name for name in BROKEN if name.endswith("without intensity")]
+
+
+@pytest.mark.parametrize("name", UNLIT)
+def test_info_of_a_scan_without_intensity_says_so_and_what_it_is(run: Run, tmp_path: Path, name: str):
+    said = run("info", BROKEN[name](tmp_path)).out
+    assert "points       50" in said and "reflectance  none in the file: --intensity none" in said
 
 
 @pytest.mark.parametrize(
     ("name", "verb"),
-    [*((name, "info") for name in BROKEN), *product(KINDS, ("project", "complete", "upsample"))],
+    [*((name, "info") for name in BROKEN if name not in UNLIT), *product(KINDS, ("project", "complete", "upsample"))],
 )
 def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_path: Path, name: str, verb: str):
     (tmp_path / "in").mkdir()
