@@ -28,7 +28,7 @@ from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
-from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, answered, grid_of, noisy, parts, placed
+from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, SPECKLE, answered, grid_of, noisy, parts, placed
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
@@ -56,6 +56,7 @@ class CascadeModel(ScanModel):
     labelled         whether its images have classes: after `with_labels`
     precision        of the fill's matrix products: fp32 | bf16
     response         how the sensor reports what it sees, as found out from the scan at hand
+    grain            how much of each kind of noise its samples take
     """
 
     network: Cascade
@@ -65,6 +66,7 @@ class CascadeModel(ScanModel):
     labelled: bool = False
     precision: str = "fp32"
     response: Response = AS_STREETS
+    grain: tuple[float, float, float] = GRAIN
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     any_sensor: ClassVar[bool] = True
@@ -81,9 +83,7 @@ class CascadeModel(ScanModel):
     def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> CascadeModel:
         """The model with images of the sensor that made the scan; itself after `into`.
 
-        sensor  None = as recognised from the points
-
-        Raises ValueError when it is not recognised.
+        sensor  None = as recognised from the points; raises ValueError when it is not
         """
         if not self.own:
             return self
@@ -171,7 +171,8 @@ class CascadeModel(ScanModel):
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
         rng, lit = generators(how.seed, 1), bool(image.reflectance[known].any())
-        own, known = replace(self, response=response_of(image, known)), known | (self._blocked & ~image.mask)
+        own = replace(self, response=response_of(image, known), grain=SPECKLE)
+        known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
             metres, reflectance, told = own._holes(metres, reflectance, told, rng, how, on_step)
@@ -352,7 +353,7 @@ class CascadeModel(ScanModel):
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
         drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
-        grain, reach = (GRAIN, ANYHOW) if drawn else (GRAIN_REALISED, SNAP)
+        grain, reach = (self.grain, ANYHOW) if drawn else (GRAIN_REALISED, SNAP)
         classify = self.labelled or (drawn and bool(self.experiment.model.classes))
         filled, rays = self._network(known, rng, weights is not None, classify, grain, reach)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
