@@ -30,9 +30,11 @@ ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 
 
 class Response(NamedTuple):
-    """even = scale * reported ** gamma + dimness, by beam; the fields' defaults change nothing.
+    """scale * reported ** gamma, in [0, 1], plus how dim a beam is, is what even beams of the streets' sensor report.
 
-    plain: the share that the mean of what is known around has in the most likely reflectance, beside the network's.
+    scale, gamma  positive; dimness (H,), in reflectance, or () for what the sensor itself says; the defaults change
+    nothing. plain: share of 0 to 1 that the mean of what is known around has in the most likely reflectance, beside the
+    network's.
     """
 
     scale: float = 1.0
@@ -41,13 +43,13 @@ class Response(NamedTuple):
     plain: float = 0.0
 
     def even(self, reported: np.ndarray) -> np.ndarray:
-        """(H, W) reflectance as the sensor of the streets would report it, but for the beams' dimness."""
+        """Reflectance in [0, 1] of any shape as the streets' sensor would report it, but for the beams' dimness."""
         if (self.scale, self.gamma) == (1, 1):
             return reported
         return np.minimum(np.float32(self.scale) * reported ** np.float32(self.gamma), np.float32(1))
 
     def reported(self, even: np.ndarray) -> np.ndarray:
-        """The inverse of `even`, at most 1."""
+        """The inverse of `even`, of any shape, at most 1."""
         if (self.scale, self.gamma) == (1, 1):
             return even
         return np.minimum((even / np.float32(self.scale)) ** np.float32(1 / self.gamma), np.float32(1))
@@ -76,8 +78,10 @@ AS_STREETS = Response()
 
 
 def response_of(image: RangeImage, known: np.ndarray) -> Response:
-    """By the known returns of an image, known (H, W) bool; nothing is changed for a sensor whose beams are measured,
-    and for fewer than 50 returns of any reflectance."""
+    """By the known returns of an image, known (H, W) bool.
+
+    `AS_STREETS`, which changes nothing, for a sensor whose beams are measured, and for fewer than 50 returns.
+    """
     lit = known & image.mask & (image.reflectance > 0)
     if hdl64e.dimness(image.sensor) or lit.sum() < ENOUGH:
         return AS_STREETS
@@ -94,29 +98,25 @@ def tried(response: Response, fill: FillUNet, image: RangeImage, told: np.ndarra
 
     told (H, W) bool; rays of the padded image. Nothing is changed where fewer than four beams return enough.
     """
-    rows = np.flatnonzero((told & image.mask).sum(1) >= ENOUGH)
-    if response == AS_STREETS or len(rows) < 4:
-        return response
+    returned = told & image.mask
+    rows = np.flatnonzero(returned.sum(1) >= ENOUGH)
     hidden = np.zeros_like(told)
     hidden[rows[1::2]] = True
     size, width = padded(image.sensor), min(PART, padded(image.sensor)[1])
     ahead = slice((size[1] - width) // 2, (size[1] + width) // 2)
-    shades = response.even(image.reflectance)
-    known = known_of(image.range[None], shades[None], (told & ~hidden)[None], True, size)
+    judged, truth = (returned & hidden)[:, ahead], image.reflectance[:, ahead]
+    if response == AS_STREETS or len(rows) < 4 or judged.sum() < ENOUGH:
+        return response
+    known = known_of(image.range[None], response.even(image.reflectance)[None], (told & ~hidden)[None], True, size)
     device = next(fill.parameters()).device
     known = Known(*(part[..., ahead].contiguous().to(device) for part in known))
-    rays = Rays(*(part if part.shape[3] == 1 else part[..., ahead].contiguous() for part in rays))
+    rays = Rays(*((part if part.shape[3] == 1 else part[..., ahead].contiguous()).to(device) for part in rays))
     with torch.inference_mode():
-        filled = fill(
-            known, Rays(*(part.to(device) for part in rays)), known.metres.new_zeros(1, NOISES, size[0], width)
-        )
-    judged, height = (told & image.mask & hidden)[:, ahead], image.shape[0]
-    if judged.sum() < ENOUGH:
-        return response
+        filled = fill(known, rays, known.metres.new_zeros(1, NOISES, size[0], width))
 
     def error(share: float) -> float:
-        mixed = response._replace(plain=share).mixed(filled)[0, 0, :height, : judged.shape[1]].clamp(0, 1).cpu().numpy()
-        return float(np.abs(response.reported(mixed) - image.reflectance[:, ahead])[judged].mean())
+        mixed = response._replace(plain=share).mixed(filled)[0, 0, : truth.shape[0], : truth.shape[1]]
+        return float(np.abs(response.reported(mixed.clamp(0, 1).cpu().numpy()) - truth)[judged].mean())
 
     return response._replace(plain=min(SHARES, key=error))
 
