@@ -1,6 +1,7 @@
 """A sensor learned from its scans is the sensor that made them, ideal or real."""
 
 import lzma
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from lidarsynth.lidar.learning import blocked_runs, learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, read_sensor
-from lidarsynth.verbs.learned_sensor import sensor_toml
+from lidarsynth.verbs.learned_sensor import doubts, sensor_toml
 
 
 def unpacked(path: Path) -> Scan:
@@ -33,6 +34,19 @@ def test_an_ideal_sensor_is_learned(name: str):
     np.testing.assert_allclose(found.offsets or 0.0, known.offsets or 0.0, atol=0.01)
     assert found.mount == pytest.approx(1.7, abs=0.2)
     assert np.abs(found.tilt).max() < 0.2
+
+
+def test_smeared_and_missing_beams_are_told():
+    clean = turn(SENSORS["hdl-32e"])
+    far = np.linalg.norm(clean.xyz, axis=1)
+    off = np.random.default_rng(0).normal(0, np.radians(0.3), len(clean)) * far * (clean.ring >= 20)
+    smeared = replace(clean, xyz=clean.xyz + np.stack([0 * off, 0 * off, off], 1).astype(np.float32))
+    rare = clean[(clean.ring != 7) | (np.arange(len(clean)) % 5 == 0)]
+    assert doubts(learn_sensor([clean], "own")) == []
+    (line,) = doubts(learn_sensor([smeared], "own"))
+    assert "found 12 of 32 beams wider" in line
+    (line,) = doubts(learn_sensor([rare], "own"))
+    assert "in each of 32 rings, found fewer in 1, which are left out" in line
 
 
 def test_beams_are_found_without_rings():

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, arg
-from lidarsynth.cli.terminal import say
+from lidarsynth.cli.terminal import say, warn
 
 
 def sensor(
@@ -30,7 +30,7 @@ def sensor(
     from lidarsynth.pictures.learned import learned_figure
     from lidarsynth.pictures.render import save_png
     from lidarsynth.verbs.inputs import Reading, inputs_of
-    from lidarsynth.verbs.learned_sensor import from_metadata, learn, sensor_toml, summary, write_toml
+    from lidarsynth.verbs.learned_sensor import doubts, from_metadata, learn, sensor_toml, summary, write_toml
 
     if out.suffix != ".toml":
         raise ValueError(f"{out}: expected a name that ends in .toml, found {out.name[-20:]!r}")
@@ -39,6 +39,8 @@ def sensor(
         say(f"wrote {out}: {known.height} beams, {known.width} columns")
         return
     learned = learn(inputs_of(scans, Reading(intensity, topic, metadata)), out.stem)
-    write_toml(out, sensor_toml(learned.sensor, summary(learned).splitlines()))
+    write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))
     say(summary(learned))
+    for line in doubts(learned):
+        warn(line)
     say(f"wrote {out}" + (f" and {save_png(out.with_suffix('.png'), learned_figure(learned))}" if picture else ""))

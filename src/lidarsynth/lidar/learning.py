@@ -31,6 +31,7 @@ class LearnedSensor:
     rings     the fit of each row
     returned  (H, W) share of the scans in which a pixel returned
     scans     how many scans it was learned from; `left` says why others were not used, in words
+    missing   how many rings have too few points, and are no rows
     """
 
     sensor: Sensor
@@ -38,6 +39,7 @@ class LearnedSensor:
     returned: np.ndarray
     scans: int
     left: tuple[str, ...]
+    missing: int = 0
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
@@ -78,7 +80,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         tilt=(round(float(ground[1]), 2), round(float(ground[2]), 2)),
         blocked=blocked_runs(returned, len(kept)),
     )
-    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left))
+    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), count - len(rows))
 
 
 def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[str]]:

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
-from lidarsynth.lidar.learning import LearnedSensor, learn_sensor
+from lidarsynth.lidar.learning import FEWEST, NEAR, LearnedSensor, learn_sensor
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.inputs import Input, Inputs
 
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
+SMEARED = 0.1  # degrees: known sensors' points lie within 0.03 of their beams where nothing has moved them
 
 
 def learn(inputs: Inputs, name: str) -> LearnedSensor:
@@ -83,3 +84,21 @@ def summary(learned: LearnedSensor) -> str:
         f"  from {learned.scans} scans" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
     ]
     return "\n".join(lines)
+
+
+def doubts(learned: LearnedSensor) -> list[str]:
+    """Why the beams are not to be trusted, a line each: points more than SMEARED degrees off some, rings left out."""
+    name, known, missing = learned.sensor.name, len(learned.rings), learned.missing
+    smeared = sum(ring.residual > SMEARED for ring in learned.rings)
+    found = []
+    if smeared:
+        found.append(
+            f"{name}: expected points within {SMEARED} degrees of their beams, found {smeared} of {known} beams wider: "
+            "its elevations may be off; give scans with rings, as the sensor sent them, or name the sensor"
+        )
+    if missing:
+        found.append(
+            f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {missing + known} rings, found fewer in "
+            f"{missing}, which are left out: give scans of wider places, or more of them"
+        )
+    return found
