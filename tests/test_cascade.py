@@ -15,6 +15,7 @@ from lidarsynth.networks import fill_unet
 from lidarsynth.networks.candidates import candidates
 from lidarsynth.networks.cascade import GUIDANCE, Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet, grid_columns, grid_rays, grid_rows, left_filled
+from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import NOISES, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import decode_range, encode_range, level_sines, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden, written_out
@@ -285,6 +286,27 @@ def test_generated_scans_depend_on_their_seed_alone(model: CascadeModel):
     np.testing.assert_array_equal(three[2].range, last.range)
     assert (three[0].range != three[1].range).any()
     assert three[0].range.max() <= SMALL.max_range
+
+
+def test_grids_come_column_by_column_but_where_steps_are_asked_for(model: CascadeModel):
+    torch.manual_seed(1)
+    parts = model.network.coarse, model.network.fill, None, ColumnTransformer(16, layers=1, pixel=16, blocks=1).eval()
+    both, told = replace(model, network=Cascade(*parts)), []
+    three = both.generate(3, seed=5, on_step=lambda: told.append(1))
+    assert len(told) == 3 * both.generation_steps() == 3 * 129
+    (last,) = both.stream(3, seed=5, first=2, sampler="columns")
+    np.testing.assert_array_equal(three[2].range, last.range)
+    assert (three[0].mask != three[1].mask).any() and three[0].mask.any()
+    (diffused,) = both.generate(1, steps=2, seed=5)
+    np.testing.assert_array_equal(diffused.range, model.generate(1, steps=2, seed=5)[0].range)
+    assert both.generation_steps(sampler="ddim") == model.generation_steps() == 17
+    for call, message in (
+        (lambda: both.generation_steps(2, "columns"), "expected no steps with the sampler columns"),
+        (lambda: model.generation_steps(sampler="columns"), "a sampler of ddpm, .*, found 'columns'"),
+        (lambda: both.generation_steps(sampler="nonsense"), "a sampler of columns, ddpm"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_upsampling_keeps_the_beams_where_they_are(model: CascadeModel):

@@ -56,10 +56,10 @@ def test_rows_of_table_ii_differ_in_what_the_table_says():
     assert {rows[r].training for r in rows} == {Training()}
 
 
-def test_the_shipped_model_fits_its_40_mb():
+def test_the_shipped_model_fits_its_60_mb():
     with torch.device("meta"):
         network = build_network(preset("default"))
-    assert sum(p.numel() for p in network.parameters()) * 2 < 40e6
+    assert sum(p.numel() for p in network.parameters()) * 2 < 60e6
 
 
 def test_experiments_are_frozen_and_fields_are_replaced_by_name():

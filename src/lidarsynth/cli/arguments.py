@@ -35,10 +35,14 @@ Method = Annotated[
 Format = Annotated[str, arg(metavar="FORMAT", help="of the files: ply, pcd, bin, npy or npz.")]
 Sampler = Annotated[
     str | None,
-    arg(metavar="SAMPLER", help="such as ddpm, ddim, dpmpp-2m, heun; a wrong word lists all; default the model's."),
+    arg(
+        metavar="SAMPLER",
+        help="such as ddpm, ddim, dpmpp-2m, heun, or columns, default's; a wrong word lists all; default the model's.",
+    ),
 ]
 GenerationSteps = Annotated[
-    int | None, arg(metavar="INT", help="of the sampler, per scan; default 16 of a cascade, 32, or 1161 of langevin.")
+    int | None,
+    arg(metavar="INT", help="of a diffusion's sampler, per scan; default 16 of a cascade, 32, or 1161 of langevin."),
 ]
 Steps = Annotated[
     int | None,

@@ -196,6 +196,7 @@ def default() -> Experiment:
             coords_encoding=None,  # both are told each pixel's rays
             classes=20,
             guide_channels=32,
+            column_channels=256,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
         training=Training(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.networks.coarse_unet import CoarseUNet
+from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
 
 # How much further from the guide's velocity, and between which log-SNR: at more noise it would make streets alike, at
@@ -21,11 +22,18 @@ class Cascade(nn.Module):
 
     guide  a smaller and worse network of the same task as `coarse`: where both err alike, it errs more, and away from
            it is where grids are likelier (autoguidance, Karras et al. 2024)
+    columns  draws such a grid column by column, for generation; `coarse` alone can go around what is known
     """
 
-    def __init__(self, coarse: CoarseUNet, fill: FillUNet, guide: CoarseUNet | None = None):
+    def __init__(
+        self,
+        coarse: CoarseUNet,
+        fill: FillUNet,
+        guide: CoarseUNet | None = None,
+        columns: ColumnTransformer | None = None,
+    ):
         super().__init__()
-        self.coarse, self.fill, self.guide = coarse, fill, guide
+        self.coarse, self.fill, self.guide, self.columns = coarse, fill, guide, columns
 
     def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         """What `coarse` answers, led away from the guide's answer."""

@@ -7,11 +7,12 @@ from lidarsynth.systems.description import About, Description
 
 
 def _network(experiment: Experiment) -> str:
-    return "cascade: a coarse layout from noise, and one step that fills in the rest, for any sensor"
+    return "cascade: a coarse layout, and one step that fills in the rest, for any sensor"
 
 
 def _details(experiment: Experiment) -> dict[str, str]:
-    return {"diffusion": "flow matching of a grid of 16 beams x 128 columns; all pixels are filled in one step"}
+    layout = "column by column, and " if experiment.model.column_channels else ""
+    return {"layout": f"a grid of 16 beams x 128 columns, {layout}by flow matching; all pixels are filled in one step"}
 
 
 def _about(experiment: Experiment) -> About:

@@ -9,6 +9,7 @@ from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet
+from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
 from lidarsynth.networks.tensors import load_weights
 from lidarsynth.systems.cascade.description import DESCRIPTION
@@ -19,7 +20,7 @@ from lidarsynth.systems.system import System
 
 
 def build(experiment: Experiment, sensor: Sensor) -> Cascade:
-    """Both networks; neither knows a sensor. Raises ValueError for other numbers of blocks from level to level."""
+    """All networks; none knows a sensor. Raises ValueError for other numbers of blocks from level to level."""
     model, width = experiment.model, experiment.model.base_channels
     if len(set(model.num_residual_blocks)) > 1:
         raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
@@ -30,7 +31,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     )
     assert coarse is not None
     fill = FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2), classes=model.classes)
-    return Cascade(coarse, fill, guide)
+    columns = ColumnTransformer(model.column_channels) if model.column_channels else None
+    return Cascade(coarse, fill, guide, columns)
 
 
 def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
@@ -40,10 +42,11 @@ def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
 
 
 def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str) -> None:
-    """All weights, of equally wide networks; the sensor may differ, and a guide, which not all have, starts fresh."""
+    """All weights, of equally wide networks; the sensor may differ, and what not all have starts fresh."""
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide")[: 3 if weights.guide and network.guide else 2]:
-        load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
+    for part in ("coarse", "fill", "guide", "columns"):
+        if getattr(network, part) is not None and getattr(weights, part) is not None:
+            load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
 
 
 CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer, graph=fill_graph)

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.diffusion import repaint
-from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.samplers import STEPS, even_log_snr, generators, noise_like, sample
-from lidarsynth.diffusion.schedule import flow
+from lidarsynth.diffusion.samplers import generators
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points, project
@@ -21,7 +19,7 @@ from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
+from lidarsynth.networks.coarse_unet import grid_rays
 from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded
 from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
@@ -30,6 +28,7 @@ from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
 from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, SPECKLE, answered, grid_of, noisy, parts, placed
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
+from lidarsynth.systems.cascade.layout import STEPS_DEFAULT, grids, sampling, times, velocity
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.surfaces import straightened
@@ -40,8 +39,7 @@ from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 
 METHODS = ("auto", "conditional", "sample", "repaint")
-BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
-STEPS_DEFAULT, RESAMPLES_DEFAULT = 16, 10
+RESAMPLES_DEFAULT = 10
 TIMES = 4  # as many beams
 GRIDS = 8  # of the coarse stage at once: half the time of one by one
 
@@ -116,13 +114,14 @@ class CascadeModel(ScanModel):
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
 
-        steps    of the coarse network, default 16; the fill takes one more
-        sampler  ddpm | ddim | dpmpp-2m | heun; default dpmpp-2m
+        sampler  of the grid: columns | ddpm | ddim | dpmpp-2m | heun; default columns, dpmpp-2m where steps are given
+        steps    of diffusion, default 16; the fill takes one more
 
-        Raises ValueError for an unknown sampler, counts below 1, or a sensor of fewer than 16 beams or 128 columns.
+        Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor of fewer than 16 beams
+        or 128 columns.
         """
-        sampler, steps = self._sampler(sampler), STEPS_DEFAULT if steps is None else steps
-        if n < 1 or steps < 1 or batch_size < 1:
+        how = sampling(self.network, steps, sampler)
+        if min(n, how[1], batch_size) < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         (rows, columns), tell = grid_of(self.sensor), on_step or (lambda: None)
         dim, size = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device), self.at_once(batch_size)
@@ -130,12 +129,7 @@ class CascadeModel(ScanModel):
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
             told, standing = self._grid_rays(rows, columns, count)
-            x_0 = x_1 = noise_like(torch.zeros(count, 3, ROWS, COLUMNS, device=self._device), rng)
-            for state in sample(self._coarse(told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
-                x_0 = state.x_s
-                for _ in wanted:
-                    tell()
-            metres, reflectance = self.network.coarse.decode(self.network.settled(x_0, told), standing, dim)
+            metres, reflectance = grids(self.network, told, standing, dim, rng, how, times(len(wanted), tell))
             metres = straightened(metres, rows, self.sensor)
             for part in wanted:
                 yield from self._filled_grids(metres[part], reflectance[part], rows, columns, rng[part])
@@ -250,18 +244,8 @@ class CascadeModel(ScanModel):
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch: the coarse steps, the fill. Raises ValueError as `stream`."""
-        self._sampler(sampler)
         grid_of(self.sensor)
-        return 1 + (STEPS_DEFAULT if steps is None else steps)
-
-    def _sampler(self, sampler: str | None) -> str:
-        if sampler is not None and sampler not in STEPS:
-            raise ValueError(f"expected a sampler of {', '.join(STEPS)}, found {sampler!r}")
-        return sampler or "dpmpp-2m"
-
-    def _coarse(self, told: Tensor, guided: bool) -> Denoiser:
-        network = self.network.velocity if guided else self.network.coarse
-        return Denoiser(network, flow(BOUND), "velocity", clip=False, condition=(told,))
+        return 1 + sampling(self.network, steps, sampler)[1]
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
@@ -320,7 +304,7 @@ class CascadeModel(ScanModel):
         dim = torch.from_numpy(self.response.unevenness(self.sensor)[rows]).to(self._device)
         known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
         # What is known guides; a sector lost erred 6.1 m for 4.3 with both.
-        x_0 = repainted(self._coarse(rays, guided=False), known, here, rng, how, on_step)
+        x_0 = repainted(velocity(self.network, rays, guided=False), known, here, rng, how, on_step)
         drawn, shades = coarse.decode(x_0, standing, dim)
         new = (part[0].cpu().numpy() for part in (straightened(drawn, rows, self.sensor), shades))
         return with_grid((metres, reflectance, told), grid, ~widened(cell), *new, self.sensor)  # type: ignore[call-arg]

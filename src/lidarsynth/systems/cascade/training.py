@@ -14,12 +14,14 @@ from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.coarse_unet import BINS, LOWEST, CoarseUNet
+from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
+from lidarsynth.networks.column_transformer import ColumnTransformer, known_grid, spoilt
 from lidarsynth.networks.fill_unet import Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import CascadeBatch, Crops, draw, grid
-from lidarsynth.systems.cascade.model import BOUND, CascadeModel
+from lidarsynth.systems.cascade.layout import BOUND
+from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
 from lidarsynth.training.task import Phase, Task
@@ -65,12 +67,13 @@ class FillObjective(nn.Module):
 
 
 class CoarseObjective(nn.Module):
-    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N); and
-    `guide`, that of the network that guides, where there is one."""
+    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N);
+    `guide`, that of the network that guides; `columns`, negative log-likelihoods of half of the columns; of what there
+    is."""
 
-    def __init__(self, network: CoarseUNet, guide: CoarseUNet | None = None):
+    def __init__(self, network: CoarseUNet, guide: CoarseUNet | None = None, columns: ColumnTransformer | None = None):
         super().__init__()
-        self.network, self.guide = network, guide
+        self.network, self.guide, self.columns = network, guide, columns
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         metres, reflectance, rays, standing = batch.grids
@@ -81,7 +84,12 @@ class CoarseObjective(nn.Module):
         learners = {"layout": self.network, **({"guide": self.guide} if self.guide else {})}
         denoisers = {part: Denoiser(one, flow(BOUND), "velocity", clip=False, condition=(rays,))
                      for part, one in learners.items()}  # fmt: skip
-        return {part: denoiser.loss(x_0, t, eps, gamma=None) for part, denoiser in denoisers.items()}
+        losses = {part: denoiser.loss(x_0, t, eps, gamma=None) for part, denoiser in denoisers.items()}
+        if self.columns is not None:
+            rng, whole = sample_rng(batch.crops.seeds[0], 2, 0), known_grid(metres, reflectance)
+            judged = torch.randperm(COLUMNS, generator=rng)[: COLUMNS // 2].to(rays.device)
+            losses["columns"] = self.columns(whole, rays, judged, spoilt(whole, rng)).sum(1)
+        return losses
 
 
 def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor, Tensor]:
@@ -204,14 +212,17 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
         fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
     if network.guide is not None:
         network.guide.standard.copy_(network.coarse.standard)
-    return Phase(FillObjective(network.fill), "fill"), Phase(CoarseObjective(network.coarse, network.guide), "coarse")
+    return Phase(FillObjective(network.fill), "fill"), Phase(
+        CoarseObjective(network.coarse, network.guide, network.columns), "coarse"
+    )
 
 
 def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.optim.Optimizer]:
-    """AdamW for each stage; the coarse one, with its guide, at half the rate."""
+    """AdamW for each stage; the coarse one, with its guide and its transformer, at half the rate."""
     assert isinstance(network, Cascade)
     training = experiment.training
-    stage = [*network.coarse.parameters(), *(network.guide.parameters() if network.guide else ())]
+    parts = [part for part in (network.coarse, network.guide, network.columns) if part is not None]
+    stage = [parameter for part in parts for parameter in part.parameters()]
     coarse = {"params": stage, "factor": 0.5}
     options = {"lr": training.learning_rate, "betas": training.betas, "weight_decay": 0.01}
     return {"fill": torch.optim.AdamW(network.fill.parameters(), **options),
@@ -244,7 +255,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "layout", "guide"),
+    parts=("sample", "median", "layout", "guide", "columns"),
     draw=draw,
     phases=phases,
     judge=judge,

@@ -1,0 +1,377 @@
+"""Draws the grid of the coarse stage column by column, from the ground up: an autoregressive transformer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS
+from lidarsynth.networks.rays import decode_range, encode_range
+
+LEFT, AROUND = 3, 2  # columns to the left, and rows up and down in them, that a pixel is told
+HYPOTHESES, SHADES = 8, 3
+# Lowest, highest, and how many bins between them: of the range code (8 % of the range each) and of reflectance.
+CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
+SHARPEST, SHARPEST_SHADE = 0.0005, 0.003  # scales of logistic distributions, of code (2 cm at 10 m) and reflectance
+FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS
+NEAREST, FARTHEST = 0.5, 300.0  # metres of hypotheses
+SHARP, HEAT = 0.3, 1.0
+
+
+class Grid(NamedTuple):
+    """What is known of grids (B, 16, 128): range code, reflectance as of even beams, both 0 where nothing returned, and
+    whether it did."""
+
+    code: Tensor
+    shade: Tensor
+    returned: Tensor
+
+
+def known_grid(metres: Tensor, reflectance: Tensor) -> Grid:
+    """Of metres (B, 16, 128), 0 where nothing returned, and reflectance as of even beams."""
+    back = metres > 0
+    return Grid(torch.where(back, encode_range(metres), 0), torch.where(back, reflectance, 0), back)
+
+
+def spoilt(grid: Grid, rng: torch.Generator) -> Grid:
+    """Every second grid with one to sixteen runs of as many pixels that are wrong, as draws are at times, so that a
+    network learns to go on after them as if they were not there, where it else would go on with them."""
+    code, shade, returned = (part.clone() for part in grid)
+
+    def upto(high: int) -> int:
+        return int(torch.randint(high, (1,), generator=rng))
+
+    for k in range(len(code)):
+        for _ in range(upto(2) * (1 + upto(16))):
+            row, first, kind = upto(ROWS), upto(COLUMNS), upto(5)
+            run = slice(first, first + 1 + upto(16))
+            other = upto(ROWS), upto(COLUMNS)
+            if kind < 3:  # as anything else in the grid
+                for part in (code, shade, returned):
+                    part[k, row, run] = part[k, other[0], other[1]]
+            elif kind == 3:
+                for part in (code, shade, returned):
+                    part[k, row, run] = 0
+            else:  # nearer or farther
+                away = 0.2 * (float(torch.rand(1, generator=rng)) - 0.5)
+                code[k, row, run] += away * returned[k, row, run]
+    return Grid(code, shade, returned)
+
+
+class Drawn(NamedTuple):
+    """Of pixels (..., H): logits and centres and log scales of the range's mixture, and the hidden state."""
+
+    returns: Tensor  # (...) logit
+    choice: Tensor  # (..., 8 + 64) log shares of hypotheses and bins
+    centre: Tensor  # (..., 8)
+    scale: Tensor  # (..., 8) positive
+    hidden: Tensor
+
+
+class ColumnTransformer(nn.Module):
+    """`forward(grid, rays (B, 8, 16, 128)) -> negative log-likelihoods (B, 3)`, in nats a pixel that is not blocked.
+
+    Columns come one after the other, and in a column the beams from the lowest to the highest. A transformer over the
+    columns before says what stands around; a small network then draws each pixel: does it return; its range, a mixture
+    of hypotheses (flat ground; the wall, the plane or the slope that its neighbours to the left and below are of) and
+    of free choice among 64 bins; its reflectance likewise. So surfaces come out flat and their edges sharp, which
+    diffusion learns only after many more samples (docs/training-default.md).
+    """
+
+    def __init__(self, width: int = 256, layers: int = 5, pixel: int = 192, blocks: int = 3):
+        super().__init__()
+        self.place = nn.Parameter(0.02 * torch.randn(COLUMNS, width))
+        self.enter = nn.Linear((3 + RAY_CHANNELS) * ROWS, width)
+        self.layers = nn.ModuleList(Block(width) for _ in range(layers))
+        self.leave = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, pixel))
+        self.stem = nn.Linear(FEATURES, pixel)
+        self.blocks = nn.ModuleList(Mix(pixel) for _ in range(blocks))
+        self.range_head = nn.Sequential(nn.LayerNorm(pixel), nn.Linear(pixel, 1 + CODES[2] + 3 * HYPOTHESES))
+        self.shade_stem = nn.Linear(pixel + HYPOTHESES + 1, pixel // 2)
+        self.shade_head = nn.Linear(pixel // 2, TONES[2] + 3 * SHADES)
+
+    def forward(self, grid: Grid, rays: Tensor, columns: Tensor | None = None, seen: Grid | None = None) -> Tensor:
+        """columns  (n,) indices of those that are judged, for less work; None = all
+        seen     what is told of pixels drawn before, None = what they are: see `spoilt`
+        """
+        here, seen = slice(None) if columns is None else columns, seen or grid
+        around = self.context(seen, rays)[:, None, here]  # (B, 1, 128, D)
+        expected = ranges_expected(seen, rays)
+        features = told(seen, rays, *expected)[:, :, here]  # (B, 16, 128, F)
+        hypotheses, valid, copies, copied = (part[:, :, here] for part in (*expected, *shades_expected(seen)))
+        grid, free = Grid(*(part[:, :, here] for part in grid)), rays[:, 6, :, here] < 0.5
+        drawn = self.pixel(features, around, hypotheses, valid)
+        returned = grid.returned & free
+        back = F.binary_cross_entropy_with_logits(drawn.returns, grid.returned.float(), reduction="none")
+        far = -mixture(grid.code, drawn.choice, drawn.centre, drawn.scale, CODES)
+        shade = grid.shade.clamp(TONES[0] + 1e-4, TONES[1] - 1e-4)
+        of_shade = self.shades(drawn, grid.code, hypotheses, copies, copied)
+        lit = -mixture(shade, *of_shade, TONES)
+        parts = (back * free, torch.where(returned, far, 0), torch.where(returned, lit, 0))
+        return torch.stack([part.sum((1, 2)) for part in parts], 1) / free.sum((1, 2)).clamp_min(1)[:, None]
+
+    def context(self, grid: Grid, rays: Tensor) -> Tensor:
+        """(B, 128, D) of each column, by those before it."""
+        before = F.pad(values(grid), (1, 0))[..., :-1]
+        x = self.enter(torch.cat([before, rays], 1).flatten(1, 2).transpose(1, 2)) + self.place
+        for layer in self.layers:
+            x = layer(x)
+        return self.leave(x)
+
+    def pixel(self, features: Tensor, around: Tensor, hypotheses: Tensor, valid: Tensor) -> Drawn:
+        """Of pixels (..., F), told (..., D) of their column and hypotheses (..., 8)."""
+        x = self.stem(features) + around
+        for block in self.blocks:
+            x = block(x)
+        out = self.range_head(x)
+        returns, choice, shift, scale = out.split([1, HYPOTHESES + CODES[2], HYPOTHESES, HYPOTHESES], -1)
+        named = choice[..., :HYPOTHESES].masked_fill(~valid, -1e4)
+        choice = torch.cat([named, choice[..., HYPOTHESES:]], -1).log_softmax(-1)
+        scale = SHARPEST + 0.02 * torch.exp(scale.clamp(-8, 2) - 1)
+        return Drawn(returns[..., 0], choice, hypotheses + 0.02 * shift, scale, x)
+
+    def shades(
+        self, drawn: Drawn, code: Tensor, hypotheses: Tensor, copies: Tensor, copied: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Log shares (..., 3 + 36), centres and scales (..., 3) of reflectance, told the range code (...)."""
+        near = torch.tanh(20 * (code[..., None] - hypotheses))
+        x = F.silu(self.shade_stem(torch.cat([drawn.hidden, near, code[..., None]], -1)))
+        choice, shift, scale = self.shade_head(x).split([SHADES + TONES[2], SHADES, SHADES], -1)
+        named = choice[..., :SHADES].masked_fill(~copied, -1e4)
+        choice = torch.cat([named, choice[..., SHADES:]], -1).log_softmax(-1)
+        return choice, copies + 0.05 * shift, SHARPEST_SHADE + 0.05 * torch.exp(scale.clamp(-6, 2) - 1)
+
+
+class Block(nn.Module):
+    """A layer of a causal transformer (B, N, D) -> (B, N, D); with `kept`, keys and values of the columns before."""
+
+    def __init__(self, width: int, heads: int = 4):
+        super().__init__()
+        self.heads = heads
+        self.first, self.second = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attend, self.join = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
+
+    def forward(self, x: Tensor, kept: list[Tensor] | None = None) -> Tensor:
+        parts = self.attend(self.first(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k, v = parts
+        if kept is None:
+            y = F.scaled_dot_product_attention(q, k, v, is_causal=True)
+        else:
+            if kept:
+                k, v = torch.cat([kept[0], k], 2), torch.cat([kept[1], v], 2)
+            kept[:] = k, v
+            y = F.scaled_dot_product_attention(q, k, v)
+        x = x + self.join(y.transpose(1, 2).flatten(2))
+        return x + self.mlp(self.second(x))
+
+
+class Mix(nn.Module):
+    """A residual layer of pixels (..., D)."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm, self.up, self.down = nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.down(F.silu(self.up(self.norm(x))))
+
+
+def values(grid: Grid) -> Tensor:
+    """(B, 3, H, W) of known pixels, of the size of one."""
+    back = grid.returned
+    return torch.stack([2 * grid.code * back, 2 * grid.shade * back, 2 * back.float() - 1], 1)
+
+
+def ranges_expected(grid: Grid, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Range codes (B, H, W, 8) as neighbours to the left and below would have them, and whether they say anything."""
+    slope, near = slopes(rays), nearness(grid.code, grid.returned, rays)
+    left, left2 = (_right(near, k) for k in (1, 2))
+    above, under = F.pad(left, (0, 0, 1, 0))[:, :-1], _up(left, 1)
+    down, down2 = slope - _up(slope, 1), _up(slope, 1) - _up(slope, 2)
+    return guesses(left, left2, above, under, _up(near, 1), _up(near, 2), down / down2.clamp_min(1e-4), rays)
+
+
+def slopes(rays: Tensor) -> Tensor:
+    """Tangents (B, H, W) of the elevations."""
+    return (rays[:, 0] / 3).tan()
+
+
+def nearness(code: Tensor, returned: Tensor, rays: Tensor) -> Tensor:
+    """1 / horizontal distance in metres, 0 where nothing returned; rays (B, 8, ...) of pixels (B, ...)."""
+    return returned / (decode_range(code).clamp_min(0.1) * _level(rays))
+
+
+def guesses(
+    left: Tensor,
+    left2: Tensor,
+    above: Tensor,
+    under: Tensor,
+    below: Tensor,
+    below2: Tensor,
+    steeper: Tensor,
+    rays: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Range codes (B, ..., 8) and whether they say anything, of pixels (B, ...) whose neighbours are so near.
+
+    Flat ground; as far as the one to the left; the plane of the two to the left; upright above the one below; the slope
+    of the two below; the plane of three; as far as the one above to the left; and as the second to the left.
+
+    under, above  those to the left of the one below and of the one above; steeper: ratio of the steps of the slope
+    """
+    near = torch.stack(
+        [left, 2 * left - left2, below, below + (below - below2) * steeper, left + below - under, above, left2], -1
+    )
+    there = torch.stack([left, left2, below, below2, under, above], -1) > 0
+    a, a2, b, b2, ab, c = there.unbind(-1)
+    level, ground = _level(rays)[..., None], rays[:, 1, ..., None] / 2
+    metres = 1 / (near.clamp_min(1e-4) * level)
+    valid = torch.stack([a, a & a2, b, b & b2, a & b & ab, c, a2], -1) & (metres < FARTHEST) & (metres > NEAREST)
+    codes = torch.where(valid, encode_range(metres.clamp(NEAREST, FARTHEST)), ground)
+    return torch.cat([ground, codes], -1), torch.cat([torch.ones_like(valid[..., :1]), valid], -1)
+
+
+def shades_expected(grid: Grid) -> tuple[Tensor, Tensor]:
+    """Reflectances (B, H, W, 3) of the two to the left and of the one below, and whether they returned."""
+    shade, back = grid.shade * grid.returned, grid.returned
+    return (torch.stack([_right(part, 1), _right(part, 2), _up(part, 1)], -1) for part in (shade, back))  # type: ignore[return-value]
+
+
+def relative(grid: Grid, rays: Tensor) -> Tensor:
+    """(B, H, W, 3) of known pixels, ranges relative to flat ground's."""
+    far = (4 * (grid.code - rays[:, 1] / 2)).clamp(-4, 4)
+    return torch.stack([far * grid.returned, 2 * grid.shade * grid.returned, 2.0 * grid.returned - 1], -1)
+
+
+def beside(known: Tensor) -> Tensor:
+    """(B, H, W, 45): what each pixel is told of the columns to its left, known (B, H, W, 3)."""
+    height, width = known.shape[1:3]
+    wide = F.pad(known, (0, 0, LEFT, 0, AROUND, AROUND))
+    parts = [wide[:, AROUND + r : AROUND + r + height, LEFT - c : LEFT - c + width]
+             for c in range(1, LEFT + 1) for r in range(-AROUND, AROUND + 1)]  # fmt: skip
+    return torch.cat(parts, -1)
+
+
+def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor) -> Tensor:
+    """(B, H, W, F): what each pixel is told of those around, of its ray and its row, and what it may be."""
+    known = relative(grid, rays)
+    height = known.shape[1]
+    low = F.pad(known, (0, 0, 0, 0, 0, height - 1))
+    beneath = torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
+    rows = torch.eye(height, device=known.device)[None, :, None].expand(*known.shape[:3], height)
+    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, rows)
+
+
+def told_of(beside: Tensor, beneath: Tensor, rays: Tensor, hypotheses: Tensor, valid: Tensor, row: Tensor) -> Tensor:
+    """`told` of pixels (..., F), of the parts that are theirs: beside (..., 45), beneath (..., 45), rays (..., 8),
+    hypotheses (..., 8), and row (..., 16), which is one-hot."""
+    own = (4 * (hypotheses - hypotheses[..., :1])).clamp(-4, 4)
+    fine = torch.asinh(200 * (hypotheses - hypotheses[..., 3:4])) / 4
+    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row], -1)
+
+
+def mixture(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tuple[float, float, int]) -> Tensor:
+    """Log density of x (...): logistic about the centres, even in each of the bins of a span."""
+    low, high, bins = span
+    z = (x[..., None] - centre) / scale
+    named = choice[..., : centre.shape[-1]] - z - 2 * F.softplus(-z) - scale.log()
+    place = ((x - low) / (high - low) * bins).long().clamp(0, bins - 1)
+    free = choice[..., centre.shape[-1] :].gather(-1, place[..., None]) + math.log(bins / (high - low))
+    return torch.cat([named, free], -1).logsumexp(-1)
+
+
+def _level(rays: Tensor) -> Tensor:
+    """Cosines (B, ...) of the elevations, which may be straight up, of rays (B, 8, ...)."""
+    return (rays[:, 0] / 3).cos().clamp_min(0.02)
+
+
+def _up(x: Tensor, rows: int) -> Tensor:
+    """(B, H, W) moved up: each pixel has the value of the one so many rows below, or 0."""
+    return F.pad(x, (0, 0, 0, rows))[:, rows:]
+
+
+def _right(x: Tensor, columns: int) -> Tensor:
+    """(B, H, W) moved to the right."""
+    return F.pad(x, (columns, 0))[..., : x.shape[2]]
+
+
+@torch.inference_mode()
+def draw(
+    network: ColumnTransformer,
+    rays: Tensor,
+    rng: Sequence[torch.Generator],
+    on_column: Callable[[], None] = lambda: None,
+    sharp: float = SHARP,
+    heat: float = HEAT,
+) -> Grid:
+    """Grids of rays (B, 8, 16, 128), each by a generator of its own.
+
+    sharp  the scale of what strays from its hypothesis, of that of recorded scans, whose noise is in it
+    heat   of choices: below 1, the likeliest are chosen more often
+    """
+    count, device = len(rays), rays.device
+    chance = torch.stack([torch.rand(5, ROWS, COLUMNS, generator=one) for one in rng]).to(device).clamp(0.001, 0.999)
+    shape, kinds = (count, ROWS, COLUMNS), (torch.float32, torch.float32, torch.bool)
+    grid = Grid(*(torch.zeros(shape, dtype=kind, device=device) for kind in kinds))
+    kept: list[list[Tensor]] = [[] for _ in network.layers]
+    slope, rows = slopes(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
+    down = slope - _up(slope, 1)
+    steeper = (down / _up(down, 1).clamp_min(1e-4)).nan_to_num()
+    none, nothing = rays.new_zeros(count), [rays.new_zeros(count, 3)] * (ROWS - 1)
+    left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
+    for j in range(COLUMNS):
+        before = values(Grid(*(part[:, :, j - 1 : j] for part in grid))) if j else rays.new_zeros(count, 3, ROWS, 1)
+        x = network.enter(torch.cat([before, rays[..., j : j + 1]], 1).flatten(1)[:, None]) + network.place[j]
+        for layer, one in zip(network.layers, kept, strict=True):
+            x = layer(x, one)
+        around, since = network.leave(x)[:, 0], max(j - LEFT, 0)
+        window = relative(Grid(*(part[:, :, since : j + 1] for part in grid)), rays[..., since : j + 1])
+        of_rows = zip(beside(window)[:, :, -1].unbind(1), rays[..., j].unbind(2), chance[..., j].unbind(2),
+                      steeper[..., j].unbind(1), rows, strict=True)  # fmt: skip
+        shades = [(grid.shade[..., j - k] if j >= k else torch.zeros_like(slope[..., 0])).unbind(1) for k in (1, 2)]
+        near, own, column, lower = [none, none], list(nothing), [], none
+        for i, (beyond, ray, u, ratio, row) in reversed(list(enumerate(of_rows))):
+            a, b = left[i + 1], left2[i + 1]
+            expected = guesses(a, b, left[i], left[i + 2], near[0], near[1], ratio, ray)
+            features = told_of(beyond, torch.cat(own, -1), ray, *expected, row)
+            drawn = network.pixel(features, around, *expected)
+            code = picked(drawn.choice, drawn.centre, drawn.scale, u[:, 1:3], sharp, heat, CODES)
+            copied = torch.stack([a, b, near[0]], -1) > 0
+            copies = torch.stack([shades[0][i], shades[1][i], lower], -1)
+            of_shade = network.shades(drawn, code, expected[0], copies, copied)
+            lower = picked(*of_shade, u[:, 3:5], 1, heat, TONES)
+            back = (u[:, 0] < (drawn.returns / heat).sigmoid()) & (ray[:, 6] < 0.5)
+            pixel = Grid(code * back, lower * back, back)
+            lower = pixel.shade
+            near, own = [nearness(pixel.code, back, ray), *near], [relative(pixel, ray), *own[:-1]]
+            column.append(pixel)
+        for part, new in zip(grid, zip(*column, strict=True), strict=True):
+            part[..., j] = torch.stack(new[::-1], 1)
+        left2, left = left, [none, *near[:ROWS], none]
+        on_column()
+    return grid
+
+
+def picked(
+    choice: Tensor,
+    centre: Tensor,
+    scale: Tensor,
+    u: Tensor,
+    sharp: float,
+    heat: float,
+    span: tuple[float, float, int],
+) -> Tensor:
+    """One draw (B,) of each `mixture`, by chances u (B, 2); sharp and heat as in `draw`."""
+    low, high, bins = span
+    shares = (choice / heat).softmax(-1).cumsum(-1)
+    chosen = (shares < u[:, :1]).sum(-1, keepdim=True).clamp(max=choice.shape[-1] - 1)
+    named = chosen < centre.shape[-1]
+    index = chosen.clamp(max=centre.shape[-1] - 1)
+    about = centre.gather(-1, index) + sharp * scale.gather(-1, index) * torch.logit(u[:, 1:])
+    free = low + (chosen - centre.shape[-1] + u[:, 1:]) * (high - low) / bins
+    return torch.where(named, about, free)[:, 0].clamp(low, high)
