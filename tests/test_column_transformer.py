@@ -12,12 +12,15 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
 from lidarsynth.networks.column_transformer import (
     CODES,
+    SECTORS,
     TONES,
     ColumnTransformer,
     Grid,
     draw,
+    drawn_plan,
     known_grid,
     mixture,
+    openness,
     picked,
     ranges_expected,
     shades_expected,
@@ -29,8 +32,11 @@ SENSOR = Sensor("sixteen", tuple(np.linspace(6, -24, ROWS).tolist()), COLUMNS, 0
 
 @pytest.fixture(scope="module")
 def network() -> ColumnTransformer:
+    """Untrained, and not indifferent to the plan."""
     torch.manual_seed(0)
-    return ColumnTransformer(32, layers=2, pixel=24, blocks=1).eval()
+    network = ColumnTransformer(32, layers=2, pixel=24, blocks=1).eval()
+    torch.nn.init.normal_(network.planned.weight, std=0.3)
+    return network
 
 
 @pytest.fixture(scope="module")
@@ -55,44 +61,67 @@ def to_plane(normal: tuple[float, float, float], level: float) -> torch.Tensor:
     return torch.from_numpy(np.where(nearer > 1 / 120, 1 / np.maximum(nearer, 1 / 120), 0)).float()[None]
 
 
+def chances() -> tuple[torch.Tensor, torch.Tensor]:
+    """What `rngs()` give: (2, 5, 16, 128) for the pixels, then (2, 16) for the plan."""
+    drawn = [(torch.rand(5, ROWS, COLUMNS, generator=one), torch.rand(SECTORS, generator=one)) for one in rngs()]
+    pixels, sectors = (torch.stack(part) for part in zip(*drawn, strict=True))
+    return pixels.clamp(0.001, 0.999), sectors
+
+
 @torch.inference_mode()
 def said(network: ColumnTransformer, grid: Grid, rays: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """All that a network says of a whole grid."""
+    """All that a network says of a whole grid, by the plan that `rngs()` draw."""
+    around = network.context(grid, rays, drawn_plan(network, rays, chances()[1]))[:, None]
     expected = ranges_expected(grid, rays)
-    drawn = network.pixel(told(grid, rays, *expected), network.context(grid, rays)[:, None], *expected)
+    drawn = network.pixel(told(grid, rays, *expected), around, *expected)
     return (*drawn[:4], *network.shades(drawn, grid.code, expected[0], *shades_expected(grid)))
 
 
 def test_a_grid_is_drawn_as_the_network_says_of_the_whole(network: ColumnTransformer, rays: torch.Tensor, drawn: Grid):
-    grid = drawn
-    u = torch.stack([torch.rand(5, ROWS, COLUMNS, generator=one) for one in rngs()]).clamp(0.001, 0.999)
-    returns, choice, centre, scale, shade_choice, copies, spread = (x.flatten(0, 2) for x in said(network, grid, rays))
-    u = u.permute(0, 2, 3, 1).flatten(0, 2)
+    u = chances()[0].permute(0, 2, 3, 1).flatten(0, 2)
+    returns, choice, centre, scale, shade_choice, copies, spread = (x.flatten(0, 2) for x in said(network, drawn, rays))
     back = (u[:, 0] < returns.sigmoid()) & (rays[:, 6] < 0.5).flatten()
-    assert (back == grid.returned.flatten()).all() and 500 < back.sum() < back.numel()
+    assert (back == drawn.returned.flatten()).all() and 500 < back.sum() < back.numel()
     code = picked(choice, centre, scale, u[:, 1:3], 0.5, 1.0, CODES)
-    assert_close(code[back], grid.code.flatten()[back], atol=1e-4, rtol=0)
+    assert_close(code[back], drawn.code.flatten()[back], atol=1e-4, rtol=0)
     shade = picked(shade_choice, copies, spread, u[:, 3:5], 1.0, 1.0, TONES)
-    assert_close(shade[back], grid.shade.flatten()[back], atol=1e-3, rtol=0)
-    assert not grid.code[~grid.returned].any() and not grid.returned[:, 12:, 40:50].any()
+    assert_close(shade[back], drawn.shade.flatten()[back], atol=1e-3, rtol=0)
+    assert not drawn.code[~drawn.returned].any() and not drawn.returned[:, 12:, 40:50].any()
 
 
 def test_a_pixel_knows_what_was_drawn_before_it_alone(network: ColumnTransformer, rays: torch.Tensor, drawn: Grid):
-    grid, row, column = drawn, 7, 60
-    other = Grid(*(part.clone() for part in grid))
+    row, column = 7, 60
+    other = Grid(*(part.clone() for part in drawn))
     other.code[:, row, column], other.shade[:, row, column], other.returned[:, row, column] = 0.3, 0.7, True
-    pairs = zip(said(network, grid, rays)[:4], said(network, other, rays)[:4], strict=True)
+    pairs = zip(said(network, drawn, rays)[:4], said(network, other, rays)[:4], strict=True)
     changed = [(a - b).abs().reshape(2, ROWS, COLUMNS, -1).amax(-1) > 1e-5 for a, b in pairs]
     seen = torch.stack(changed).any(0).any(0)
     assert not seen[:, :column].any() and not seen[row:, column].any()
     assert seen[:row, column].any() and seen[:, column + 1].any()
 
 
-@torch.inference_mode()
+def test_a_plan_says_how_far_sectors_are_open_and_is_drawn_in_turn(network: ColumnTransformer, rays: torch.Tensor):
+    metres = torch.where(torch.arange(COLUMNS) < 64, 5.0, 50.0).expand(1, ROWS, COLUMNS).clone()
+    metres[..., 120:] = 0
+    metres[:, 8:] = 2.0  # the lower beams do not count
+    plan = openness(known_grid(metres, torch.ones_like(metres)))
+    near, far = (1 + int(23 * (math.log2(r + 1) / 4 - 1 + 0.6) / 1.6) for r in (5, 50))
+    assert plan[0].tolist() == [near] * 8 + [far] * 7 + [0]
+    with torch.inference_mode():
+        chosen = drawn_plan(network, rays, chances()[1])
+        shares = network.levels(chosen, rays).softmax(-1).cumsum(-1)
+        again = network.levels(torch.where(torch.arange(SECTORS) < 9, chosen, 1), rays)
+    below = torch.cat([torch.zeros(2, SECTORS, 1), shares], -1).gather(2, chosen[..., None])[..., 0]
+    u = chances()[1]
+    assert (below <= u + 1e-5).all() and (u <= shares.gather(2, chosen[..., None])[..., 0] + 1e-5).all()
+    assert_close(again.softmax(-1).cumsum(-1)[:, :10], shares[:, :10])
+    assert (network.plans(chosen) != network.plans(chosen.flip(1))).any()
+
+
 def test_columns_that_are_judged_are_judged_as_among_all(network: ColumnTransformer, rays: torch.Tensor, drawn: Grid):
     free = (rays[:, 6] < 0.5).sum(1)
-    each = [network(drawn, rays, torch.tensor([k])) * free[:, k, None] for k in range(COLUMNS)]
-    assert_close(sum(each) / free.sum(1)[:, None], network(drawn, rays), atol=1e-4, rtol=1e-4)
+    each = [network(drawn, rays, torch.tensor([k]))[:, :3] * free[:, k, None] for k in range(COLUMNS)]
+    assert_close(sum(each) / free.sum(1)[:, None], network(drawn, rays)[:, :3], atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +176,7 @@ def test_it_learns_a_road(rays: torch.Tensor):
     ground = to_plane((0.0, 0.0, 1.0), -1.8)
     grid = known_grid(ground.expand(2, -1, -1), torch.full((2, ROWS, COLUMNS), 0.3))
     optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-    losses = torch.zeros(3)
+    losses = torch.zeros(4)
     for step in range(60):
         losses = network(grid, rays, torch.arange(step % 8, COLUMNS, 8)).mean(0)
         optimizer.zero_grad()

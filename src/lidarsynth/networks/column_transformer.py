@@ -19,6 +19,7 @@ HYPOTHESES, SHADES = 8, 3
 CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
 SHARPEST, SHARPEST_SHADE = 0.0005, 0.003  # scales of logistic distributions, of code (2 cm at 10 m) and reflectance
 FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS
+SECTORS, LEVELS = 16, 24  # of the turn, and of how far one is open
 NEAREST, FARTHEST = 0.5, 300.0  # metres of hypotheses
 SHARP, HEAT = 0.3, 1.0
 
@@ -74,10 +75,12 @@ class Drawn(NamedTuple):
 
 
 class ColumnTransformer(nn.Module):
-    """`forward(grid, rays (B, 8, 16, 128)) -> negative log-likelihoods (B, 3)`, in nats a pixel that is not blocked.
+    """`forward(grid, rays (B, 8, 16, 128)) -> negative log-likelihoods (B, 4)`: of returning, range and reflectance, in
+    nats a pixel that is not blocked, and of the plan, a tenth of the nats a sector.
 
-    Columns come one after the other, and in a column the beams from the lowest to the highest. A transformer over the
-    columns before says what stands around; a small network then draws each pixel: does it return; its range, a mixture
+    First comes a plan: how far each of 16 sectors is open, one after the other. Then come the columns, and in a column
+    the beams from the lowest to the highest. A transformer, told the plan and the columns before, says what stands
+    around; a small network then draws each pixel: does it return; its range, a mixture
     of hypotheses (flat ground; the wall, the plane or the slope that its neighbours to the left and below are of) and
     of free choice among 64 bins; its reflectance likewise. So surfaces come out flat and their edges sharp, which
     diffusion learns only after many more samples (docs/training-default.md).
@@ -94,13 +97,23 @@ class ColumnTransformer(nn.Module):
         self.range_head = nn.Sequential(nn.LayerNorm(pixel), nn.Linear(pixel, 1 + CODES[2] + 3 * HYPOTHESES))
         self.shade_stem = nn.Linear(pixel + HYPOTHESES + 1, pixel // 2)
         self.shade_head = nn.Linear(pixel // 2, TONES[2] + 3 * SHADES)
+        self.planned = nn.Linear((SECTORS + 1) * LEVELS, width, bias=False)
+        self.planner = nn.Sequential(
+            nn.Linear(SECTORS * (LEVELS + 1) + RAY_CHANNELS * ROWS, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, LEVELS),
+        )
+        nn.init.zeros_(self.planned.weight)
 
     def forward(self, grid: Grid, rays: Tensor, columns: Tensor | None = None, seen: Grid | None = None) -> Tensor:
         """columns  (n,) indices of those that are judged, for less work; None = all
         seen     what is told of pixels drawn before, None = what they are: see `spoilt`
         """
         here, seen = slice(None) if columns is None else columns, seen or grid
-        around = self.context(seen, rays)[:, None, here]  # (B, 1, 128, D)
+        plan = openness(grid)
+        around = self.context(seen, rays, plan)[:, None, here]  # (B, 1, 128, D)
         expected = ranges_expected(seen, rays)
         features = told(seen, rays, *expected)[:, :, here]  # (B, 16, 128, F)
         hypotheses, valid, copies, copied = (part[:, :, here] for part in (*expected, *shades_expected(seen)))
@@ -113,12 +126,29 @@ class ColumnTransformer(nn.Module):
         of_shade = self.shades(drawn, grid.code, hypotheses, copies, copied)
         lit = -mixture(shade, *of_shade, TONES)
         parts = (back * free, torch.where(returned, far, 0), torch.where(returned, lit, 0))
-        return torch.stack([part.sum((1, 2)) for part in parts], 1) / free.sum((1, 2)).clamp_min(1)[:, None]
+        mean = torch.stack([part.sum((1, 2)) for part in parts], 1) / free.sum((1, 2)).clamp_min(1)[:, None]
+        entropy = F.cross_entropy(self.levels(plan, rays).transpose(1, 2), plan, reduction="none")
+        return torch.cat([mean, 0.1 * entropy.mean(1, keepdim=True)], 1)
 
-    def context(self, grid: Grid, rays: Tensor) -> Tensor:
-        """(B, 128, D) of each column, by those before it."""
+    def levels(self, plan: Tensor, rays: Tensor) -> Tensor:
+        """(B, 16, 24) logits of each sector's level, by the levels (B, 16) of those before it."""
+        chosen = F.one_hot(plan, LEVELS).flatten(1)[:, None]
+        sector = torch.arange(SECTORS, device=rays.device)
+        before = (sector.repeat_interleave(LEVELS) < sector[:, None]) * chosen
+        middle = rays[..., COLUMNS // SECTORS // 2 :: COLUMNS // SECTORS].flatten(1, 2).transpose(1, 2)
+        number = torch.eye(SECTORS, device=rays.device).expand(len(rays), -1, -1)
+        return self.planner(torch.cat([before, number, middle], -1))
+
+    def plans(self, plan: Tensor) -> Tensor:
+        """(B, 128, D): what columns are told of the plan (B, 16), the whole and their own sector's part."""
+        chosen = F.one_hot(plan, LEVELS).float()
+        own = chosen.repeat_interleave(COLUMNS // SECTORS, 1)
+        return self.planned(torch.cat([chosen.flatten(1)[:, None].expand(-1, COLUMNS, -1), own], -1))
+
+    def context(self, grid: Grid, rays: Tensor, plan: Tensor) -> Tensor:
+        """(B, 128, D) of each column, by those before it, and by the plan (B, 16)."""
         before = F.pad(values(grid), (1, 0))[..., :-1]
-        x = self.enter(torch.cat([before, rays], 1).flatten(1, 2).transpose(1, 2)) + self.place
+        x = self.enter(torch.cat([before, rays], 1).flatten(1, 2).transpose(1, 2)) + self.place + self.plans(plan)
         for layer in self.layers:
             x = layer(x)
         return self.leave(x)
@@ -180,6 +210,16 @@ class Mix(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.down(F.silu(self.up(self.norm(x))))
+
+
+def openness(grid: Grid) -> Tensor:
+    """(B, 16) int64, how far each sector of a grid is open: the mean range code of the upper beams' returns, in 23
+    levels from 1 on, 0 without any."""
+    upper = slice(None, ROWS // 2)
+    code, count = ((part[:, upper].float().sum(1)).unflatten(1, (SECTORS, -1)).sum(2)
+                   for part in (grid.code * grid.returned, grid.returned))  # fmt: skip
+    level = 1 + (LEVELS - 1) * (code / count.clamp_min(1) + 0.6) / 1.6
+    return torch.where(count > 0, level.long().clamp(1, LEVELS - 1), 0)
 
 
 def values(grid: Grid) -> Tensor:
@@ -316,6 +356,7 @@ def draw(
     """
     count, device = len(rays), rays.device
     chance = torch.stack([torch.rand(5, ROWS, COLUMNS, generator=one) for one in rng]).to(device).clamp(0.001, 0.999)
+    plans = network.plans(drawn_plan(network, rays, torch.stack([torch.rand(SECTORS, generator=one) for one in rng])))
     shape, kinds = (count, ROWS, COLUMNS), (torch.float32, torch.float32, torch.bool)
     grid = Grid(*(torch.zeros(shape, dtype=kind, device=device) for kind in kinds))
     kept: list[list[Tensor]] = [[] for _ in network.layers]
@@ -326,7 +367,8 @@ def draw(
     left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
     for j in range(COLUMNS):
         before = values(Grid(*(part[:, :, j - 1 : j] for part in grid))) if j else rays.new_zeros(count, 3, ROWS, 1)
-        x = network.enter(torch.cat([before, rays[..., j : j + 1]], 1).flatten(1)[:, None]) + network.place[j]
+        x = network.enter(torch.cat([before, rays[..., j : j + 1]], 1).flatten(1)[:, None])
+        x = x + network.place[j] + plans[:, j : j + 1]
         for layer, one in zip(network.layers, kept, strict=True):
             x = layer(x, one)
         around, since = network.leave(x)[:, 0], max(j - LEFT, 0)
@@ -355,6 +397,15 @@ def draw(
         left2, left = left, [none, *near[:ROWS], none]
         on_column()
     return grid
+
+
+def drawn_plan(network: ColumnTransformer, rays: Tensor, u: Tensor) -> Tensor:
+    """(B, 16) int64: how far each sector is to be open, by chances u (B, 16)."""
+    plan = torch.zeros(u.shape, dtype=torch.int64, device=rays.device)
+    for k, one in enumerate(u.to(rays.device).unbind(1)):
+        shares = network.levels(plan, rays)[:, k].softmax(-1).cumsum(-1)
+        plan[:, k] = (shares < one[:, None]).sum(-1).clamp(max=LEVELS - 1)
+    return plan
 
 
 def picked(
