@@ -71,9 +71,10 @@ def chances() -> tuple[torch.Tensor, torch.Tensor]:
 @torch.inference_mode()
 def said(network: ColumnTransformer, grid: Grid, rays: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """All that a network says of a whole grid, by the plan that `rngs()` draw."""
-    around = network.context(grid, rays, drawn_plan(network, rays, chances()[1]))[:, None]
+    plan = drawn_plan(network, rays, chances()[1])
+    around = network.context(grid, rays, plan)[:, None]
     expected = ranges_expected(grid, rays)
-    drawn = network.pixel(told(grid, rays, *expected), around, *expected)
+    drawn = network.pixel(told(grid, rays, *expected, plan), around, *expected)
     return (*drawn[:4], *network.shades(drawn, grid.code, expected[0], *shades_expected(grid)))
 
 
@@ -170,18 +171,18 @@ def test_a_mixture_is_a_density_and_is_drawn_from():
 
 
 def test_it_learns_a_road(rays: torch.Tensor):
-    """Sixty steps on flat ground: which rays return, and that it is the ground, far likelier than one bin of 64."""
+    """Eighty steps on flat ground: which rays return, and that it is the ground, far likelier than one bin of 64."""
     torch.manual_seed(0)
     network = ColumnTransformer(32, layers=1, pixel=32, blocks=1)
     ground = to_plane((0.0, 0.0, 1.0), -1.8)
     grid = known_grid(ground.expand(2, -1, -1), torch.full((2, ROWS, COLUMNS), 0.3))
     optimizer = torch.optim.Adam(network.parameters(), 3e-3)
     losses = torch.zeros(4)
-    for step in range(60):
+    for step in range(80):
         losses = network(grid, rays, torch.arange(step % 8, COLUMNS, 8)).mean(0)
         optimizer.zero_grad()
         losses.sum().backward()
         optimizer.step()
     returned = grid.returned.float().mean()
-    assert losses[0] < 0.15
-    assert losses[1] < -returned * math.log(64 / 1.9) and losses[2] < -returned * math.log(36 / 1.2)
+    assert losses[0] < 0.1
+    assert losses[1] < -returned * math.log(64 / 1.9) - 1 and losses[2] < -2

@@ -18,8 +18,8 @@ HYPOTHESES, SHADES = 8, 3
 # Lowest, highest, and how many bins between them: of the range code (8 % of the range each) and of reflectance.
 CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
 SHARPEST, SHARPEST_SHADE = 0.0005, 0.003  # scales of logistic distributions, of code (2 cm at 10 m) and reflectance
-FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS
-SECTORS, LEVELS = 16, 24  # of the turn, and of how far one is open
+FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 5
+SECTORS, LEVELS, HIGHEST = 16, 24, 1.05  # of the turn; of how far one is open; code of one without returns
 NEAREST, FARTHEST = 0.5, 300.0  # metres of hypotheses
 SHARP, HEAT = 0.3, 1.0
 
@@ -115,7 +115,7 @@ class ColumnTransformer(nn.Module):
         plan = openness(grid)
         around = self.context(seen, rays, plan)[:, None, here]  # (B, 1, 128, D)
         expected = ranges_expected(seen, rays)
-        features = told(seen, rays, *expected)[:, :, here]  # (B, 16, 128, F)
+        features = told(seen, rays, *expected, plan)[:, :, here]  # (B, 16, 128, F)
         hypotheses, valid, copies, copied = (part[:, :, here] for part in (*expected, *shades_expected(seen)))
         grid, free = Grid(*(part[:, :, here] for part in grid)), rays[:, 6, :, here] < 0.5
         drawn = self.pixel(features, around, hypotheses, valid)
@@ -297,22 +297,45 @@ def beside(known: Tensor) -> Tensor:
     return torch.cat(parts, -1)
 
 
-def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor) -> Tensor:
-    """(B, H, W, F): what each pixel is told of those around, of its ray and its row, and what it may be."""
+def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, plan: Tensor) -> Tensor:
+    """(B, H, W, F): what each pixel is told of those around, of its ray and its row, what it may be, and the plan."""
     known = relative(grid, rays)
     height = known.shape[1]
     low = F.pad(known, (0, 0, 0, 0, 0, height - 1))
     beneath = torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
     rows = torch.eye(height, device=known.device)[None, :, None].expand(*known.shape[:3], height)
-    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, rows)
+    ahead = [part[:, None] for part in far_as_planned(plan)]
+    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, rows, *ahead)
 
 
-def told_of(beside: Tensor, beneath: Tensor, rays: Tensor, hypotheses: Tensor, valid: Tensor, row: Tensor) -> Tensor:
+def far_as_planned(plan: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Range codes that a plan (B, 16) has for the sector of each column and the next one, and the share of its sector
+    that lies to a column's left; each (B, 128)."""
+    code = torch.where(plan > 0, (plan.float() - 0.5) / (LEVELS - 1) * 1.6 - 0.6, HIGHEST)
+    columns = COLUMNS // SECTORS
+    part = (torch.arange(COLUMNS, device=plan.device) % columns / columns).expand(len(plan), -1)
+    return code.repeat_interleave(columns, 1), code.roll(-1, 1).repeat_interleave(columns, 1), part
+
+
+def told_of(
+    beside: Tensor,
+    beneath: Tensor,
+    rays: Tensor,
+    hypotheses: Tensor,
+    valid: Tensor,
+    row: Tensor,
+    aim: Tensor,
+    after: Tensor,
+    part: Tensor,
+) -> Tensor:
     """`told` of pixels (..., F), of the parts that are theirs: beside (..., 45), beneath (..., 45), rays (..., 8),
-    hypotheses (..., 8), and row (..., 16), which is one-hot."""
+    hypotheses (..., 8), row (..., 16), which is one-hot, and what is planned (...)."""
     own = (4 * (hypotheses - hypotheses[..., :1])).clamp(-4, 4)
     fine = torch.asinh(200 * (hypotheses - hypotheses[..., 3:4])) / 4
-    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row], -1)
+    ground, left = hypotheses[..., 0], hypotheses[..., 1]
+    ahead = [(4 * (aim - ground)).clamp(-4, 4), (4 * (after - ground)).clamp(-4, 4), torch.tanh(10 * (aim - left)),
+             torch.tanh(10 * (after - left)), part.expand_as(ground)]  # fmt: skip
+    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, torch.stack(ahead, -1)], -1)
 
 
 def mixture(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tuple[float, float, int]) -> Tensor:
@@ -356,7 +379,8 @@ def draw(
     """
     count, device = len(rays), rays.device
     chance = torch.stack([torch.rand(5, ROWS, COLUMNS, generator=one) for one in rng]).to(device).clamp(0.001, 0.999)
-    plans = network.plans(drawn_plan(network, rays, torch.stack([torch.rand(SECTORS, generator=one) for one in rng])))
+    plan = drawn_plan(network, rays, torch.stack([torch.rand(SECTORS, generator=one) for one in rng]))
+    plans, planned = network.plans(plan), [part.unbind(1) for part in far_as_planned(plan)]
     shape, kinds = (count, ROWS, COLUMNS), (torch.float32, torch.float32, torch.bool)
     grid = Grid(*(torch.zeros(shape, dtype=kind, device=device) for kind in kinds))
     kept: list[list[Tensor]] = [[] for _ in network.layers]
@@ -380,7 +404,7 @@ def draw(
         for i, (beyond, ray, u, ratio, row) in reversed(list(enumerate(of_rows))):
             a, b = left[i + 1], left2[i + 1]
             expected = guesses(a, b, left[i], left[i + 2], near[0], near[1], ratio, ray)
-            features = told_of(beyond, torch.cat(own, -1), ray, *expected, row)
+            features = told_of(beyond, torch.cat(own, -1), ray, *expected, row, *(part[j] for part in planned))
             drawn = network.pixel(features, around, *expected)
             code = picked(drawn.choice, drawn.centre, drawn.scale, u[:, 1:3], sharp, heat, CODES)
             copied = torch.stack([a, b, near[0]], -1) > 0
