@@ -28,7 +28,7 @@ from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
 from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, SPECKLE, answered, grid_of, noisy, parts, placed
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
-from lidarsynth.systems.cascade.layout import STEPS_DEFAULT, grids, sampling, times, velocity
+from lidarsynth.systems.cascade.layout import STEPS_DEFAULT, block, grids, sampling, times, velocity
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.surfaces import straightened
@@ -41,7 +41,6 @@ from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 METHODS = ("auto", "conditional", "sample", "repaint")
 RESAMPLES_DEFAULT = 10
 TIMES = 4  # as many beams
-GRIDS = 8  # of the coarse stage at once: half the time of one by one
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,7 +124,7 @@ class CascadeModel(ScanModel):
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         (rows, columns), tell = grid_of(self.sensor), on_step or (lambda: None)
         dim, size = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device), self.at_once(batch_size)
-        count = max(size, GRIDS)
+        count = max(size, block(how))
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
             told, standing = self._grid_rays(rows, columns, count)
