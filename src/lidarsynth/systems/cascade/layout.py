@@ -12,7 +12,7 @@ from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sampl
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
-from lidarsynth.networks.column_transformer import Grid, draw
+from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.rays import decode_range
 
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
@@ -74,10 +74,7 @@ def grids(
     sampler, steps = how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
-        # The sensor's first column is behind; so the first and the last of a grid, which know little of each other,
-        # meet ahead, where least stands.
-        turned = draw(network.columns, rays.roll(COLUMNS // 2, -1), rng, on_step)
-        grid = Grid(*(part.roll(COLUMNS // 2, -1) for part in turned))
+        grid = draw(network.columns, rays, rng, on_step)
         return decode_range(grid.code) * grid.returned, (grid.shade - dim).clamp(0, 1) * grid.returned
     x_0 = x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
     for state in sample(velocity(network, rays, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):

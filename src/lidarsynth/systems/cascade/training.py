@@ -87,8 +87,6 @@ class CoarseObjective(nn.Module):
         losses = {part: denoiser.loss(x_0, t, eps, gamma=None) for part, denoiser in denoisers.items()}
         if self.columns is not None:
             rng = sample_rng(batch.crops.seeds[0], 2, 0)
-            turn = int(torch.randint(COLUMNS, (1,), generator=rng))  # any column may be the first
-            metres, reflectance, rays = (part.roll(turn, -1) for part in (metres, reflectance, rays))
             whole = known_grid(metres, reflectance)
             judged = torch.randperm(COLUMNS, generator=rng)[: COLUMNS // 2].to(rays.device)
             losses["columns"] = self.columns(whole, rays, judged, spoilt(whole, rng)).sum(1)
