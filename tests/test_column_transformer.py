@@ -10,22 +10,16 @@ from torch.testing import assert_close
 
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
-from lidarsynth.networks.column_transformer import (
-    CODES,
+from lidarsynth.networks.column_neighbours import (
     SECTORS,
-    TONES,
-    ColumnTransformer,
     Grid,
-    draw,
-    drawn_plan,
     known_grid,
-    mixture,
     openness,
-    picked,
     ranges_expected,
     shades_expected,
     told,
 )
+from lidarsynth.networks.column_transformer import CODES, TONES, ColumnTransformer, draw, drawn_plan, mixture, picked
 
 SENSOR = Sensor("sixteen", tuple(np.linspace(6, -24, ROWS).tolist()), COLUMNS, 0.5, 120.0, mount=1.8)
 

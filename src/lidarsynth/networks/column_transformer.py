@@ -11,57 +11,33 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS
-from lidarsynth.networks.rays import decode_range, encode_range
+from lidarsynth.networks.column_neighbours import (
+    FEATURES,
+    HYPOTHESES,
+    LEFT,
+    LEVELS,
+    SECTORS,
+    SHADES,
+    Grid,
+    beside,
+    far_as_planned,
+    guesses,
+    moved_up,
+    nearness,
+    openness,
+    ranges_expected,
+    relative,
+    shades_expected,
+    slopes,
+    told,
+    told_of,
+    values,
+)
 
-LEFT, AROUND = 3, 2  # columns to the left, and rows up and down in them, that a pixel is told
-HYPOTHESES, SHADES = 8, 3
 # Lowest, highest, and how many bins between them: of the range code (8 % of the range each) and of reflectance.
 CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
 SHARPEST, SHARPEST_SHADE = 0.0005, 0.003  # scales of logistic distributions, of code (2 cm at 10 m) and reflectance
-FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 5
-SECTORS, LEVELS, HIGHEST = 16, 24, 1.05  # of the turn; of how far one is open; code of one without returns
-NEAREST, FARTHEST = 0.5, 300.0  # metres of hypotheses
-SHARP, HEAT = 0.3, 1.0
-
-
-class Grid(NamedTuple):
-    """What is known of grids (B, 16, 128): range code, reflectance as of even beams, both 0 where nothing returned, and
-    whether it did."""
-
-    code: Tensor
-    shade: Tensor
-    returned: Tensor
-
-
-def known_grid(metres: Tensor, reflectance: Tensor) -> Grid:
-    """Of metres (B, 16, 128), 0 where nothing returned, and reflectance as of even beams."""
-    back = metres > 0
-    return Grid(torch.where(back, encode_range(metres), 0), torch.where(back, reflectance, 0), back)
-
-
-def spoilt(grid: Grid, rng: torch.Generator) -> Grid:
-    """Every second grid with one to sixteen runs of as many pixels that are wrong, as draws are at times, so that a
-    network learns to go on after them as if they were not there, where it else would go on with them."""
-    code, shade, returned = (part.clone() for part in grid)
-
-    def upto(high: int) -> int:
-        return int(torch.randint(high, (1,), generator=rng))
-
-    for k in range(len(code)):
-        for _ in range(upto(2) * (1 + upto(16))):
-            row, first, kind = upto(ROWS), upto(COLUMNS), upto(5)
-            run = slice(first, first + 1 + upto(16))
-            other = upto(ROWS), upto(COLUMNS)
-            if kind < 3:  # as anything else in the grid
-                for part in (code, shade, returned):
-                    part[k, row, run] = part[k, other[0], other[1]]
-            elif kind == 3:
-                for part in (code, shade, returned):
-                    part[k, row, run] = 0
-            else:  # nearer or farther
-                away = 0.2 * (float(torch.rand(1, generator=rng)) - 0.5)
-                code[k, row, run] += away * returned[k, row, run]
-    return Grid(code, shade, returned)
+SHARP, HEAT = 1.0, 1.0  # of draws: chosen by street-2 (docs/training-default.md)
 
 
 class Drawn(NamedTuple):
@@ -212,132 +188,6 @@ class Mix(nn.Module):
         return x + self.down(F.silu(self.up(self.norm(x))))
 
 
-def openness(grid: Grid) -> Tensor:
-    """(B, 16) int64, how far each sector of a grid is open: the mean range code of the upper beams' returns, in 23
-    levels from 1 on, 0 without any."""
-    upper = slice(None, ROWS // 2)
-    code, count = ((part[:, upper].float().sum(1)).unflatten(1, (SECTORS, -1)).sum(2)
-                   for part in (grid.code * grid.returned, grid.returned))  # fmt: skip
-    level = 1 + (LEVELS - 1) * (code / count.clamp_min(1) + 0.6) / 1.6
-    return torch.where(count > 0, level.long().clamp(1, LEVELS - 1), 0)
-
-
-def values(grid: Grid) -> Tensor:
-    """(B, 3, H, W) of known pixels, of the size of one."""
-    back = grid.returned
-    return torch.stack([2 * grid.code * back, 2 * grid.shade * back, 2 * back.float() - 1], 1)
-
-
-def ranges_expected(grid: Grid, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Range codes (B, H, W, 8) as neighbours to the left and below would have them, and whether they say anything."""
-    slope, near = slopes(rays), nearness(grid.code, grid.returned, rays)
-    left, left2 = (_right(near, k) for k in (1, 2))
-    above, under = F.pad(left, (0, 0, 1, 0))[:, :-1], _up(left, 1)
-    down, down2 = slope - _up(slope, 1), _up(slope, 1) - _up(slope, 2)
-    return guesses(left, left2, above, under, _up(near, 1), _up(near, 2), down / down2.clamp_min(1e-4), rays)
-
-
-def slopes(rays: Tensor) -> Tensor:
-    """Tangents (B, H, W) of the elevations."""
-    return (rays[:, 0] / 3).tan()
-
-
-def nearness(code: Tensor, returned: Tensor, rays: Tensor) -> Tensor:
-    """1 / horizontal distance in metres, 0 where nothing returned; rays (B, 8, ...) of pixels (B, ...)."""
-    return returned / (decode_range(code).clamp_min(0.1) * _level(rays))
-
-
-def guesses(
-    left: Tensor,
-    left2: Tensor,
-    above: Tensor,
-    under: Tensor,
-    below: Tensor,
-    below2: Tensor,
-    steeper: Tensor,
-    rays: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Range codes (B, ..., 8) and whether they say anything, of pixels (B, ...) whose neighbours are so near.
-
-    Flat ground; as far as the one to the left; the plane of the two to the left; upright above the one below; the slope
-    of the two below; the plane of three; as far as the one above to the left; and as the second to the left.
-
-    under, above  those to the left of the one below and of the one above; steeper: ratio of the steps of the slope
-    """
-    near = torch.stack(
-        [left, 2 * left - left2, below, below + (below - below2) * steeper, left + below - under, above, left2], -1
-    )
-    there = torch.stack([left, left2, below, below2, under, above], -1) > 0
-    a, a2, b, b2, ab, c = there.unbind(-1)
-    level, ground = _level(rays)[..., None], rays[:, 1, ..., None] / 2
-    metres = 1 / (near.clamp_min(1e-4) * level)
-    valid = torch.stack([a, a & a2, b, b & b2, a & b & ab, c, a2], -1) & (metres < FARTHEST) & (metres > NEAREST)
-    codes = torch.where(valid, encode_range(metres.clamp(NEAREST, FARTHEST)), ground)
-    return torch.cat([ground, codes], -1), torch.cat([torch.ones_like(valid[..., :1]), valid], -1)
-
-
-def shades_expected(grid: Grid) -> tuple[Tensor, Tensor]:
-    """Reflectances (B, H, W, 3) of the two to the left and of the one below, and whether they returned."""
-    shade, back = grid.shade * grid.returned, grid.returned
-    return (torch.stack([_right(part, 1), _right(part, 2), _up(part, 1)], -1) for part in (shade, back))  # type: ignore[return-value]
-
-
-def relative(grid: Grid, rays: Tensor) -> Tensor:
-    """(B, H, W, 3) of known pixels, ranges relative to flat ground's."""
-    far = (4 * (grid.code - rays[:, 1] / 2)).clamp(-4, 4)
-    return torch.stack([far * grid.returned, 2 * grid.shade * grid.returned, 2.0 * grid.returned - 1], -1)
-
-
-def beside(known: Tensor) -> Tensor:
-    """(B, H, W, 45): what each pixel is told of the columns to its left, known (B, H, W, 3)."""
-    height, width = known.shape[1:3]
-    wide = F.pad(known, (0, 0, LEFT, 0, AROUND, AROUND))
-    parts = [wide[:, AROUND + r : AROUND + r + height, LEFT - c : LEFT - c + width]
-             for c in range(1, LEFT + 1) for r in range(-AROUND, AROUND + 1)]  # fmt: skip
-    return torch.cat(parts, -1)
-
-
-def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, plan: Tensor) -> Tensor:
-    """(B, H, W, F): what each pixel is told of those around, of its ray and its row, what it may be, and the plan."""
-    known = relative(grid, rays)
-    height = known.shape[1]
-    low = F.pad(known, (0, 0, 0, 0, 0, height - 1))
-    beneath = torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
-    rows = torch.eye(height, device=known.device)[None, :, None].expand(*known.shape[:3], height)
-    ahead = [part[:, None] for part in far_as_planned(plan)]
-    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, rows, *ahead)
-
-
-def far_as_planned(plan: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Range codes that a plan (B, 16) has for the sector of each column and the next one, and the share of its sector
-    that lies to a column's left; each (B, 128)."""
-    code = torch.where(plan > 0, (plan.float() - 0.5) / (LEVELS - 1) * 1.6 - 0.6, HIGHEST)
-    columns = COLUMNS // SECTORS
-    part = (torch.arange(COLUMNS, device=plan.device) % columns / columns).expand(len(plan), -1)
-    return code.repeat_interleave(columns, 1), code.roll(-1, 1).repeat_interleave(columns, 1), part
-
-
-def told_of(
-    beside: Tensor,
-    beneath: Tensor,
-    rays: Tensor,
-    hypotheses: Tensor,
-    valid: Tensor,
-    row: Tensor,
-    aim: Tensor,
-    after: Tensor,
-    part: Tensor,
-) -> Tensor:
-    """`told` of pixels (..., F), of the parts that are theirs: beside (..., 45), beneath (..., 45), rays (..., 8),
-    hypotheses (..., 8), row (..., 16), which is one-hot, and what is planned (...)."""
-    own = (4 * (hypotheses - hypotheses[..., :1])).clamp(-4, 4)
-    fine = torch.asinh(200 * (hypotheses - hypotheses[..., 3:4])) / 4
-    ground, left = hypotheses[..., 0], hypotheses[..., 1]
-    ahead = [(4 * (aim - ground)).clamp(-4, 4), (4 * (after - ground)).clamp(-4, 4), torch.tanh(10 * (aim - left)),
-             torch.tanh(10 * (after - left)), part.expand_as(ground)]  # fmt: skip
-    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, torch.stack(ahead, -1)], -1)
-
-
 def mixture(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tuple[float, float, int]) -> Tensor:
     """Log density of x (...): logistic about the centres, even in each of the bins of a span."""
     low, high, bins = span
@@ -346,21 +196,6 @@ def mixture(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tupl
     place = ((x - low) / (high - low) * bins).long().clamp(0, bins - 1)
     free = choice[..., centre.shape[-1] :].gather(-1, place[..., None]) + math.log(bins / (high - low))
     return torch.cat([named, free], -1).logsumexp(-1)
-
-
-def _level(rays: Tensor) -> Tensor:
-    """Cosines (B, ...) of the elevations, which may be straight up, of rays (B, 8, ...)."""
-    return (rays[:, 0] / 3).cos().clamp_min(0.02)
-
-
-def _up(x: Tensor, rows: int) -> Tensor:
-    """(B, H, W) moved up: each pixel has the value of the one so many rows below, or 0."""
-    return F.pad(x, (0, 0, 0, rows))[:, rows:]
-
-
-def _right(x: Tensor, columns: int) -> Tensor:
-    """(B, H, W) moved to the right."""
-    return F.pad(x, (columns, 0))[..., : x.shape[2]]
 
 
 @torch.inference_mode()
@@ -385,8 +220,8 @@ def draw(
     grid = Grid(*(torch.zeros(shape, dtype=kind, device=device) for kind in kinds))
     kept: list[list[Tensor]] = [[] for _ in network.layers]
     slope, rows = slopes(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
-    down = slope - _up(slope, 1)
-    steeper = (down / _up(down, 1).clamp_min(1e-4)).nan_to_num()
+    down = slope - moved_up(slope, 1)
+    steeper = (down / moved_up(down, 1).clamp_min(1e-4)).nan_to_num()
     none, nothing = rays.new_zeros(count), [rays.new_zeros(count, 3)] * (ROWS - 1)
     left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
     for j in range(COLUMNS):

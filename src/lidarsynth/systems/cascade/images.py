@@ -17,7 +17,7 @@ from lidarsynth.streets.sensor_model import range_noise
 
 # Of the kinds of noise of training, speckle, stripes, patches: generation's, chosen by street-2
 # (docs/training-default.md); a completed sample's, which errs less by speckle alone; `realise`'s.
-GRAIN, SPECKLE, GRAIN_REALISED = (1.0, 0.3, 0.0), (1.0, 0.0, 0.0), (0.4, 0.4, 0.8)
+GRAIN, SPECKLE, GRAIN_REALISED = (1.0, 0.5, 0.0), (1.0, 0.0, 0.0), (0.4, 0.4, 0.8)
 # Metres, standard deviation along the ray by class, of the STRAYING share of rays that miss the surface the fill has
 # drawn, for a leaf, a stalk or a branch before or behind it. Chosen by street-2 (docs/training-default.md).
 STRAYING = 1 / 3

@@ -15,7 +15,8 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
-from lidarsynth.networks.column_transformer import ColumnTransformer, known_grid, spoilt
+from lidarsynth.networks.column_neighbours import known_grid, spoilt
+from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
