@@ -12,6 +12,7 @@ from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.coarse_unet import BINS, CoarseUNet, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.column_neighbours import known_grid, spoilt
 from lidarsynth.networks.fill_unet import Filled, Known
 from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.virtual import VirtualStreets
@@ -25,7 +26,7 @@ from lidarsynth.verbs.training import run
 TINY = with_fields(
     preset("default"),
     {"model.base_channels": 16, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1),
-     "model.guide_channels": 8,
+     "model.guide_channels": 8, "model.column_channels": 16,
      "training.batch_size": 2, "training.steps": 2, "training.warmup": 0, "model.gn_num_groups": 8},
 )  # fmt: skip
 
@@ -145,9 +146,22 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
     for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
         before = before or progress
     losses = progress.losses
-    assert {"sample", "median", "layout", "guide"} <= losses.keys()
+    assert {"sample", "median", "layout", "guide", "columns"} <= losses.keys()
     assert all(np.isfinite(value) for value in losses.values())
     from lidarsynth import load
 
     model = load(tmp_path / "run")
+    assert model.network.columns is not None
     assert model.generate(1, steps=1)[0].shape == (64, 1024)
+
+
+def test_what_columns_are_told_of_their_neighbours_is_spoilt_at_times_and_never_what_they_learn():
+    rng = torch.Generator().manual_seed(0)
+    metres = 5 + 20 * torch.rand(16, 16, 128, generator=rng)
+    grid = known_grid(metres, torch.rand(metres.shape, generator=rng))
+    whole = [part.clone() for part in grid]
+    wrong = spoilt(grid, torch.Generator().manual_seed(1))
+    assert all((a == b).all() for a, b in zip(grid, whole, strict=True))
+    share = ((wrong.code - grid.code).abs() > 1e-6).float().mean((1, 2))
+    assert 3 <= (share == 0).sum() <= 13 and share.max() < 0.12
+    assert (wrong.code[~wrong.returned] == 0).all() and not wrong.returned.all()

@@ -222,7 +222,7 @@ def draw(
     slope, rows = slopes(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
     down = slope - moved_up(slope, 1)
     steeper = (down / moved_up(down, 1).clamp_min(1e-4)).nan_to_num()
-    none, nothing = rays.new_zeros(count), [rays.new_zeros(count, 3)] * (ROWS - 1)
+    none, nothing = rays.new_zeros(count), rays.new_zeros(count, 3 * (ROWS - 1))
     left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
     for j in range(COLUMNS):
         before = values(Grid(*(part[:, :, j - 1 : j] for part in grid))) if j else rays.new_zeros(count, 3, ROWS, 1)
@@ -235,21 +235,24 @@ def draw(
         of_rows = zip(beside(window)[:, :, -1].unbind(1), rays[..., j].unbind(2), chance[..., j].unbind(2),
                       steeper[..., j].unbind(1), rows, strict=True)  # fmt: skip
         shades = [(grid.shade[..., j - k] if j >= k else torch.zeros_like(slope[..., 0])).unbind(1) for k in (1, 2)]
-        near, own, column, lower = [none, none], list(nothing), [], none
+        near, beneath, column, lower = [none, none], nothing, [], none
         for i, (beyond, ray, u, ratio, row) in reversed(list(enumerate(of_rows))):
             a, b = left[i + 1], left2[i + 1]
             expected = guesses(a, b, left[i], left[i + 2], near[0], near[1], ratio, ray)
-            features = told_of(beyond, torch.cat(own, -1), ray, *expected, row, *(part[j] for part in planned))
+            features = told_of(beyond, beneath, ray, *expected, row, *(part[j] for part in planned))
             drawn = network.pixel(features, around, *expected)
             code = picked(drawn.choice, drawn.centre, drawn.scale, u[:, 1:3], sharp, heat, CODES)
             copied = torch.stack([a, b, near[0]], -1) > 0
             copies = torch.stack([shades[0][i], shades[1][i], lower], -1)
             of_shade = network.shades(drawn, code, expected[0], copies, copied)
             lower = picked(*of_shade, u[:, 3:5], 1, heat, TONES)
-            back = (u[:, 0] < (drawn.returns / heat).sigmoid()) & (ray[:, 6] < 0.5)
+            back = ((u[:, 0] < (drawn.returns / heat).sigmoid()) & (ray[:, 6] < 0.5)).float()
             pixel = Grid(code * back, lower * back, back)
             lower = pixel.shade
-            near, own = [nearness(pixel.code, back, ray), *near], [relative(pixel, ray), *own[:-1]]
+            near, beneath = (
+                [nearness(pixel.code, back, ray), *near],
+                torch.cat([relative(pixel, ray), beneath[:, :-3]], 1),
+            )
             column.append(pixel)
         for part, new in zip(grid, zip(*column, strict=True), strict=True):
             part[..., j] = torch.stack(new[::-1], 1)
