@@ -140,6 +140,18 @@ def test_grids_of_a_dome_keep_their_ranges_where_beams_look_straight_up():
     assert torch.isfinite(found).all()
 
 
+def test_a_dome_whose_beams_look_straight_up_is_completed(model: CascadeModel):
+    dome = Sensor("dome", tuple(np.linspace(90, 0, 16).tolist()), 128, 0.5, 50.0)
+    image = RangeImage(
+        np.full((16, 128), 5.0, np.float32), np.ones((16, 128), np.float32), np.ones((16, 128), bool), dome
+    )
+    known = np.zeros(image.shape, bool)
+    known[3::4] = True
+    filled = model.into(dome).complete(image.keep(known), known)
+    assert np.isfinite(filled.range).all() and np.isfinite(filled.reflectance).all()
+    assert filled.mask[~known].any()
+
+
 def test_samples_are_rough_where_something_grows():
     label = np.repeat(np.array([[9, 15, 17, 9]]), 64, 1).repeat(24, 0)
     image = RangeImage(np.full(label.shape, 10.0), np.ones(label.shape), np.ones(label.shape, bool), SMALL, label)

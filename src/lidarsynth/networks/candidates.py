@@ -17,6 +17,7 @@ REFLECTANCE_CANDIDATES = 6  # mean of the sides, above, below, left, right, near
 LOW, AT_LEAST = 0.01, 0.004  # radians below the horizon from which on a plane may be the ground, and least sine
 SHIFTS = (0, -1, 1, -2, 2)  # rows in which the nearest value at all is sought, the nearer ones first
 NOWHERE = 1 << 30  # eighths of squared pixels
+STEEPEST = 1e-3  # cosine of an elevation: a dome's beam may look straight up
 # One surface to the left and right: how much 1 / range changes from one to the other at most, and how far from straight
 # it goes on to the next known pixel on either side, as a share of that change and of 1 / range. Chosen on streets.
 STEEP, BEND, LEAST = 0.2, 1.0, 0.01
@@ -70,7 +71,7 @@ def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
     found, distance, source = around.found, around.distance, around.source
     r, tilt = metres.flatten()[source], rays.elevation.expand_as(metres).flatten()
     e, elevation = tilt[source], tilt[around.place]
-    wall = torch.cat([r[:2] * (e[:2].cos() / elevation.cos()), r[2:]])
+    wall = torch.cat([r[:2] * (e[:2].cos() / elevation.cos().clamp_min(STEEPEST)), r[2:]])
     ground = r[:2] * e[:2].sin().clamp(max=-AT_LEAST) / elevation.sin().clamp(max=-AT_LEAST)
     usable = found[:2] & (e[:2] < -LOW) & (elevation < -0.8 * LOW)
     code = encode_range(r)

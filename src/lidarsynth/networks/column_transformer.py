@@ -41,7 +41,7 @@ SHARP, HEAT = 1.0, 1.0  # of draws: chosen by street-2 (docs/training-default.md
 
 
 class Drawn(NamedTuple):
-    """Of pixels (..., H): logits and centres and log scales of the range's mixture, and the hidden state."""
+    """Of pixels: whether they return, the mixture of their range, and the hidden state (..., D)."""
 
     returns: Tensor  # (...) logit
     choice: Tensor  # (..., 8 + 64) log shares of hypotheses and bins
@@ -56,10 +56,11 @@ class ColumnTransformer(nn.Module):
 
     First comes a plan: how far each of 16 sectors is open, one after the other. Then come the columns, and in a column
     the beams from the lowest to the highest. A transformer, told the plan and the columns before, says what stands
-    around; a small network then draws each pixel: does it return; its range, a mixture
-    of hypotheses (flat ground; the wall, the plane or the slope that its neighbours to the left and below are of) and
-    of free choice among 64 bins; its reflectance likewise. So surfaces come out flat and their edges sharp, which
-    diffusion learns only after many more samples (docs/training-default.md).
+    around; a small network then draws each pixel: does it return; its range, a mixture of hypotheses (flat ground; the
+    wall, the plane or the slope that its neighbours to the left and below are of) and of free choice among 64 bins; its
+    reflectance likewise. So surfaces come out flat and their edges sharp, which
+    diffusion learns only after many more samples (docs/training-default.md). cf. van den Oord et al. 2016 (PixelCNN),
+    Salimans et al. 2017 (mixtures of logistics).
     """
 
     def __init__(self, width: int = 256, layers: int = 5, pixel: int = 192, blocks: int = 3):
