@@ -35,7 +35,8 @@ def generate(
     loaded = loaded.into(sensor) if sensor else loaded
     loaded = loaded.with_labels() if labels else loaded
     calls = loaded.generation_steps(steps, sampler)
-    settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": sampler, "seed": seed}
+    used = loaded.sampler_used(steps, sampler)
+    settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": used, "seed": seed}
     settings |= {"labels": True} if labels else {}
     with only_writer(out, "generation"):
         claim(out, settings)

@@ -85,16 +85,17 @@ def far_as_planned(plan: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def ranges_expected(grid: Grid, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Range codes (B, H, W, 8) as neighbours to the left and below would have them, and whether they say anything."""
-    slope, near = slopes(rays), nearness(grid.code, grid.returned, rays)
+    near = nearness(grid.code, grid.returned, rays)
     left, left2 = (_right(near, k) for k in (1, 2))
     above, under = F.pad(left, (0, 0, 1, 0))[:, :-1], moved_up(left, 1)
-    down, down2 = slope - moved_up(slope, 1), moved_up(slope, 1) - moved_up(slope, 2)
-    return guesses(left, left2, above, under, moved_up(near, 1), moved_up(near, 2), down / down2.clamp_min(1e-4), rays)
+    return guesses(left, left2, above, under, moved_up(near, 1), moved_up(near, 2), steepening(rays), rays)
 
 
-def slopes(rays: Tensor) -> Tensor:
-    """Tangents (B, H, W) of the elevations."""
-    return (rays[:, 0] / 3).tan()
+def steepening(rays: Tensor) -> Tensor:
+    """(B, H, W): the step of the elevation's tangent from the beam below, over that beam's own step."""
+    slope = (rays[:, 0] / 3).tan()
+    down = slope - moved_up(slope, 1)
+    return down / moved_up(down, 1).clamp_min(1e-4)
 
 
 def nearness(code: Tensor, returned: Tensor, rays: Tensor) -> Tensor:

@@ -22,13 +22,12 @@ from lidarsynth.networks.column_neighbours import (
     beside,
     far_as_planned,
     guesses,
-    moved_up,
     nearness,
     openness,
     ranges_expected,
     relative,
     shades_expected,
-    slopes,
+    steepening,
     told,
     told_of,
     values,
@@ -220,9 +219,7 @@ def draw(
     shape, kinds = (count, ROWS, COLUMNS), (torch.float32, torch.float32, torch.bool)
     grid = Grid(*(torch.zeros(shape, dtype=kind, device=device) for kind in kinds))
     kept: list[list[Tensor]] = [[] for _ in network.layers]
-    slope, rows = slopes(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
-    down = slope - moved_up(slope, 1)
-    steeper = (down / moved_up(down, 1).clamp_min(1e-4)).nan_to_num()
+    steeper, rows = steepening(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
     none, nothing = rays.new_zeros(count), rays.new_zeros(count, 3 * (ROWS - 1))
     left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
     for j in range(COLUMNS):
@@ -235,7 +232,9 @@ def draw(
         window = relative(Grid(*(part[:, :, since : j + 1] for part in grid)), rays[..., since : j + 1])
         of_rows = zip(beside(window)[:, :, -1].unbind(1), rays[..., j].unbind(2), chance[..., j].unbind(2),
                       steeper[..., j].unbind(1), rows, strict=True)  # fmt: skip
-        shades = [(grid.shade[..., j - k] if j >= k else torch.zeros_like(slope[..., 0])).unbind(1) for k in (1, 2)]
+        shades = [
+            (grid.shade[..., j - k] if j >= k else torch.zeros_like(grid.shade[..., 0])).unbind(1) for k in (1, 2)
+        ]
         near, beneath, column, lower = [none, none], nothing, [], none
         for i, (beyond, ray, u, ratio, row) in reversed(list(enumerate(of_rows))):
             a, b = left[i + 1], left2[i + 1]

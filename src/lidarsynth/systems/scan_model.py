@@ -302,6 +302,10 @@ class ScanModel(ABC):
         """How often `generate` calls `on_step` per batch. Raises ValueError as `stream` does."""
         raise self._generates_nothing()
 
+    def sampler_used(self, steps: int | None = None, sampler: str | None = None) -> str | None:
+        """What a folder of generated scans records as its sampler: the word that was given, None for the default."""
+        return sampler
+
     def evaluations(
         self,
         method: str = "auto",

@@ -28,7 +28,7 @@ from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
 from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, SPECKLE, answered, grid_of, noisy, parts, placed
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
-from lidarsynth.systems.cascade.layout import STEPS_DEFAULT, block, grids, sampling, times, velocity
+from lidarsynth.systems.cascade.layout import BY_COLUMNS, STEPS_DEFAULT, block, grids, sampling, times, velocity
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.surfaces import straightened
@@ -245,6 +245,11 @@ class CascadeModel(ScanModel):
         """How often `generate` calls `on_step` per batch: the coarse steps, the fill. Raises ValueError as `stream`."""
         grid_of(self.sensor)
         return 1 + sampling(self.network, steps, sampler)[1]
+
+    def sampler_used(self, steps: int | None = None, sampler: str | None = None) -> str | None:
+        """`columns` where they draw, by default too: 128 steps of diffusion are as many calls."""
+        word = sampling(self.network, steps, sampler)[0]
+        return word if word == BY_COLUMNS else sampler
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
