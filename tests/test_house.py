@@ -264,7 +264,7 @@ def test_help_does_not_import_torch():
     assert "lidarsynth" in done.stdout
     read = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
     assert "lidarsynth.cli.main" in read, "importtime lists what --help imported"
-    assert not read & {"torch", "numpy", "PIL", "tqdm.auto", "safetensors", "einops"}
+    assert not read & {"torch", "numpy", "PIL", "tqdm.auto", "safetensors", "einops", "typeguard"}
 
 
 def cpu_seconds(*arguments: str) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from difflib import get_close_matches
 from functools import partial, wraps
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn, Union
 
 import tyro
 
@@ -34,12 +34,17 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
     if not word.startswith("-"):
         raise ValueError(f"expected a verb of {', '.join(verbs)}, found {word!r}{_meant(word, verbs)}")
     with _refusals(()):
-        return tyro.extras.subcommand_cli_from_dict(
-            {name: _later(verb) for name, verb in verbs.items()},
+        named = [tyro.conf.subcommand(name, constructor=_later(verb)) for name, verb in verbs.items()]
+        return tyro.cli(  # tyro.extras.subcommand_cli_from_dict says Any for _Verb, and loads typeguard to check it
+            Union[tuple(Annotated[_Verb, each] for each in named)],  # type: ignore[arg-type]
             prog="lidarsynth",
             description="Generate, complete and judge LiDAR scans.",
             args=argv or ["--help"],
         )
+
+
+class _Verb:
+    """What a verb with its arguments is, to tyro."""
 
 
 def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
