@@ -36,7 +36,7 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
     with _refusals(()):
         named = [tyro.conf.subcommand(name, constructor=_later(verb)) for name, verb in verbs.items()]
         return tyro.cli(  # tyro.extras.subcommand_cli_from_dict says Any for _Verb, and loads typeguard to check it
-            Union[tuple(Annotated[_Verb, each] for each in named)],  # type: ignore[arg-type]
+            Union[tuple(Annotated[_Verb, each] for each in named)],  # noqa: UP007, of a tuple
             prog="lidarsynth",
             description="Generate, complete and judge LiDAR scans.",
             args=argv or ["--help"],
