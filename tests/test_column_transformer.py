@@ -19,7 +19,8 @@ from lidarsynth.networks.column_neighbours import (
     shades_expected,
     told,
 )
-from lidarsynth.networks.column_transformer import CODES, TONES, ColumnTransformer, draw, drawn_plan, mixture, picked
+from lidarsynth.networks.column_transformer import ColumnTransformer, draw, drawn_plan
+from lidarsynth.networks.pixel_mixture import CODES, TONES, mixture, picked
 
 SENSOR = Sensor("sixteen", tuple(np.linspace(6, -24, ROWS).tolist()), COLUMNS, 0.5, 120.0, mount=1.8)
 

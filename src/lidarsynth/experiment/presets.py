@@ -197,6 +197,7 @@ def default() -> Experiment:
             classes=20,
             guide_channels=32,
             column_channels=256,
+            between_channels=64,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
         training=Training(

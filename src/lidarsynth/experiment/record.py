@@ -50,6 +50,7 @@ class Model:
     classes: int = within(0, 0, 1000)  # cascade: SemanticKITTI classes that it names for each pixel, 0 = none
     guide_channels: int = within(0, 0, 8192)  # cascade: width of the network that guides the coarse one, 0 = none
     column_channels: int = within(0, 0, 8192)  # cascade: width of the transformer that draws grids, 0 = none
+    between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):

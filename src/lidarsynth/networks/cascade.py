@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
@@ -23,6 +24,7 @@ class Cascade(nn.Module):
     guide  a smaller and worse network of the same task as `coarse`: where both err alike, it errs more, and away from
            it is where grids are likelier (autoguidance, Karras et al. 2024)
     columns  draws such a grid column by column, for generation; `coarse` alone can go around what is known
+    between  draws the columns between those, twice over
     """
 
     def __init__(
@@ -31,9 +33,10 @@ class Cascade(nn.Module):
         fill: FillUNet,
         guide: CoarseUNet | None = None,
         columns: ColumnTransformer | None = None,
+        between: BetweenColumns | None = None,
     ):
         super().__init__()
-        self.coarse, self.fill, self.guide, self.columns = coarse, fill, guide, columns
+        self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
 
     def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         """What `coarse` answers, led away from the guide's answer."""

@@ -25,13 +25,13 @@ def grid_rows(height: int, first: float = 0.5) -> np.ndarray:
     return np.floor((np.arange(ROWS) + first) * height / ROWS).astype(int)
 
 
-def grid_columns(width: int, first: float = 0.5) -> np.ndarray:
-    """Which of `width` columns it sees: 128, evenly."""
-    return np.floor((np.arange(COLUMNS) + first) * width / COLUMNS).astype(int)
+def grid_columns(width: int, first: float = 0.5, count: int = COLUMNS) -> np.ndarray:
+    """Which of `width` columns it sees: `count`, evenly."""
+    return np.floor((np.arange(count) + first) * width / count).astype(int)
 
 
 def grid_rays(sensor: Sensor, blocked: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[Tensor, Tensor]:
-    """What the network is told of the rays, (8, 16, 128), and their standing elevations (16, 128) in radians.
+    """What the network is told of the rays, (8, R, C), and their standing elevations (R, C) in radians.
 
     Elevation, ground, steps to the beams above and below, azimuth, blocked, and the sensor's limit. The standing
     elevation is that at which a sensor 1.73 m up sees the same spot of flat ground.
@@ -46,7 +46,7 @@ def grid_rays(sensor: Sensor, blocked: np.ndarray, rows: np.ndarray, columns: np
     limit = math.log2(min(sensor.max_range, 250) + 1) / 4 - 1
     parts = (3 * elevation[:, None], 2 * encode_range(ground).numpy(), up, down, np.sin(azimuth)[None],
              np.cos(azimuth)[None], blocked[np.ix_(rows, columns)], limit)  # fmt: skip
-    told = np.stack([np.broadcast_to(part, (ROWS, COLUMNS)) for part in parts]).astype(np.float32)
+    told = np.stack([np.broadcast_to(part, (len(rows), len(columns))) for part in parts]).astype(np.float32)
     standing = np.arcsin(np.clip(sine * STANDARD_MOUNT / mount, -1, 1)).astype(np.float32)
     return torch.from_numpy(told), torch.from_numpy(standing)
 

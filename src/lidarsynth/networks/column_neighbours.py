@@ -100,7 +100,7 @@ def steepening(rays: Tensor) -> Tensor:
 
 def nearness(code: Tensor, returned: Tensor, rays: Tensor) -> Tensor:
     """1 / horizontal distance in metres, 0 where nothing returned; rays (B, 8, ...) of pixels (B, ...)."""
-    return returned / (decode_range(code).clamp_min(0.1) * _level(rays))
+    return returned / (decode_range(code).clamp_min(0.1) * levelled(rays))
 
 
 def guesses(
@@ -125,7 +125,7 @@ def guesses(
     )
     there = torch.stack([left, left2, below, below2, under, above], -1) > 0
     a, a2, b, b2, ab, c = there.unbind(-1)
-    level, ground = _level(rays)[..., None], rays[:, 1, ..., None] / 2
+    level, ground = levelled(rays)[..., None], rays[:, 1, ..., None] / 2
     metres = 1 / (near.clamp_min(1e-4) * level)
     valid = torch.stack([a, a & a2, b, b & b2, a & b & ab, c, a2], -1) & (metres < FARTHEST) & (metres > NEAREST)
     codes = torch.where(valid, encode_range(metres.clamp(NEAREST, FARTHEST)), ground)
@@ -153,12 +153,18 @@ def beside(known: Tensor) -> Tensor:
     return torch.cat(parts, -1)
 
 
+def beneath_of(known: Tensor) -> Tensor:
+    """(B, H, W, 45): what each pixel is told of those below in its column, the next one first, known (B, H, W, 3)."""
+    height = known.shape[1]
+    low = F.pad(known, (0, 0, 0, 0, 0, height - 1))
+    return torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
+
+
 def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, plan: Tensor) -> Tensor:
     """(B, H, W, F): what each pixel is told of those around, of its ray and its row, what it may be, and the plan."""
     known = relative(grid, rays)
     height = known.shape[1]
-    low = F.pad(known, (0, 0, 0, 0, 0, height - 1))
-    beneath = torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
+    beneath = beneath_of(known)
     rows = torch.eye(height, device=known.device)[None, :, None].expand(*known.shape[:3], height)
     ahead = [part[:, None] for part in far_as_planned(plan)]
     return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, rows, *ahead)
@@ -185,7 +191,7 @@ def told_of(
     return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, torch.stack(ahead, -1)], -1)
 
 
-def _level(rays: Tensor) -> Tensor:
+def levelled(rays: Tensor) -> Tensor:
     """Cosines (B, ...) of the elevations, which may be straight up, of rays (B, 8, ...)."""
     return (rays[:, 0] / 3).cos().clamp_min(0.02)
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -32,24 +30,12 @@ from lidarsynth.networks.column_neighbours import (
     told_of,
     values,
 )
+from lidarsynth.networks.pixel_mixture import CODES, TONES, PixelDrawer, picked
 
-# Lowest, highest, and how many bins between them: of the range code (8 % of the range each) and of reflectance.
-CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
-SHARPEST, SHARPEST_SHADE = 0.0005, 0.003  # scales of logistic distributions, of code (2 cm at 10 m) and reflectance
 SHARP, HEAT = 1.0, 1.0  # of draws: chosen by street-2 (docs/training-default.md)
 
 
-class Drawn(NamedTuple):
-    """Of pixels: whether they return, the mixture of their range, and the hidden state (..., D)."""
-
-    returns: Tensor  # (...) logit
-    choice: Tensor  # (..., 8 + 64) log shares of hypotheses and bins
-    centre: Tensor  # (..., 8)
-    scale: Tensor  # (..., 8) positive
-    hidden: Tensor
-
-
-class ColumnTransformer(nn.Module):
+class ColumnTransformer(PixelDrawer):
     """`forward(grid, rays (B, 8, 16, 128)) -> negative log-likelihoods (B, 4)`: of returning, range and reflectance, in
     nats a pixel that is not blocked, and of the plan, a tenth of the nats a sector.
 
@@ -63,16 +49,11 @@ class ColumnTransformer(nn.Module):
     """
 
     def __init__(self, width: int = 256, layers: int = 5, pixel: int = 192, blocks: int = 3):
-        super().__init__()
+        super().__init__(FEATURES, HYPOTHESES, SHADES, pixel, blocks)
         self.place = nn.Parameter(0.02 * torch.randn(COLUMNS, width))
         self.enter = nn.Linear((3 + RAY_CHANNELS) * ROWS, width)
         self.layers = nn.ModuleList(Block(width) for _ in range(layers))
         self.leave = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, pixel))
-        self.stem = nn.Linear(FEATURES, pixel)
-        self.blocks = nn.ModuleList(Mix(pixel) for _ in range(blocks))
-        self.range_head = nn.Sequential(nn.LayerNorm(pixel), nn.Linear(pixel, 1 + CODES[2] + 3 * HYPOTHESES))
-        self.shade_stem = nn.Linear(pixel + HYPOTHESES + 1, pixel // 2)
-        self.shade_head = nn.Linear(pixel // 2, TONES[2] + 3 * SHADES)
         self.planned = nn.Linear((SECTORS + 1) * LEVELS, width, bias=False)
         self.planner = nn.Sequential(
             nn.Linear(SECTORS * (LEVELS + 1) + RAY_CHANNELS * ROWS, width),
@@ -95,14 +76,7 @@ class ColumnTransformer(nn.Module):
         hypotheses, valid, copies, copied = (part[:, :, here] for part in (*expected, *shades_expected(seen)))
         grid, free = Grid(*(part[:, :, here] for part in grid)), rays[:, 6, :, here] < 0.5
         drawn = self.pixel(features, around, hypotheses, valid)
-        returned = grid.returned & free
-        back = F.binary_cross_entropy_with_logits(drawn.returns, grid.returned.float(), reduction="none")
-        far = -mixture(grid.code, drawn.choice, drawn.centre, drawn.scale, CODES)
-        shade = grid.shade.clamp(TONES[0] + 1e-4, TONES[1] - 1e-4)
-        of_shade = self.shades(drawn, grid.code, hypotheses, copies, copied)
-        lit = -mixture(shade, *of_shade, TONES)
-        parts = (back * free, torch.where(returned, far, 0), torch.where(returned, lit, 0))
-        mean = torch.stack([part.sum((1, 2)) for part in parts], 1) / free.sum((1, 2)).clamp_min(1)[:, None]
+        mean = self.unlikelihood(drawn, grid, hypotheses, copies, copied, free)
         entropy = F.cross_entropy(self.levels(plan, rays).transpose(1, 2), plan, reduction="none")
         return torch.cat([mean, 0.1 * entropy.mean(1, keepdim=True)], 1)
 
@@ -129,29 +103,6 @@ class ColumnTransformer(nn.Module):
             x = layer(x)
         return self.leave(x)
 
-    def pixel(self, features: Tensor, around: Tensor, hypotheses: Tensor, valid: Tensor) -> Drawn:
-        """Of pixels (..., F), told (..., D) of their column and hypotheses (..., 8)."""
-        x = self.stem(features) + around
-        for block in self.blocks:
-            x = block(x)
-        out = self.range_head(x)
-        returns, choice, shift, scale = out.split([1, HYPOTHESES + CODES[2], HYPOTHESES, HYPOTHESES], -1)
-        named = choice[..., :HYPOTHESES].masked_fill(~valid, -1e4)
-        choice = torch.cat([named, choice[..., HYPOTHESES:]], -1).log_softmax(-1)
-        scale = SHARPEST + 0.02 * torch.exp(scale.clamp(-8, 2) - 1)
-        return Drawn(returns[..., 0], choice, hypotheses + 0.02 * shift, scale, x)
-
-    def shades(
-        self, drawn: Drawn, code: Tensor, hypotheses: Tensor, copies: Tensor, copied: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Log shares (..., 3 + 36), centres and scales (..., 3) of reflectance, told the range code (...)."""
-        near = torch.tanh(20 * (code[..., None] - hypotheses))
-        x = F.silu(self.shade_stem(torch.cat([drawn.hidden, near, code[..., None]], -1)))
-        choice, shift, scale = self.shade_head(x).split([SHADES + TONES[2], SHADES, SHADES], -1)
-        named = choice[..., :SHADES].masked_fill(~copied, -1e4)
-        choice = torch.cat([named, choice[..., SHADES:]], -1).log_softmax(-1)
-        return choice, copies + 0.05 * shift, SHARPEST_SHADE + 0.05 * torch.exp(scale.clamp(-6, 2) - 1)
-
 
 class Block(nn.Module):
     """A layer of a causal transformer (B, N, D) -> (B, N, D); with `kept`, keys and values of the columns before."""
@@ -175,27 +126,6 @@ class Block(nn.Module):
             y = F.scaled_dot_product_attention(q, k, v)
         x = x + self.join(y.transpose(1, 2).flatten(2))
         return x + self.mlp(self.second(x))
-
-
-class Mix(nn.Module):
-    """A residual layer of pixels (..., D)."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.norm, self.up, self.down = nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.down(F.silu(self.up(self.norm(x))))
-
-
-def mixture(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tuple[float, float, int]) -> Tensor:
-    """Log density of x (...): logistic about the centres, even in each of the bins of a span."""
-    low, high, bins = span
-    z = (x[..., None] - centre) / scale
-    named = choice[..., : centre.shape[-1]] - z - 2 * F.softplus(-z) - scale.log()
-    place = ((x - low) / (high - low) * bins).long().clamp(0, bins - 1)
-    free = choice[..., centre.shape[-1] :].gather(-1, place[..., None]) + math.log(bins / (high - low))
-    return torch.cat([named, free], -1).logsumexp(-1)
 
 
 @torch.inference_mode()
@@ -268,23 +198,3 @@ def drawn_plan(network: ColumnTransformer, rays: Tensor, u: Tensor) -> Tensor:
         shares = network.levels(plan, rays)[:, k].softmax(-1).cumsum(-1)
         plan[:, k] = (shares < one[:, None]).sum(-1).clamp(max=LEVELS - 1)
     return plan
-
-
-def picked(
-    choice: Tensor,
-    centre: Tensor,
-    scale: Tensor,
-    u: Tensor,
-    sharp: float,
-    heat: float,
-    span: tuple[float, float, int],
-) -> Tensor:
-    """One draw (B,) of each `mixture`, by chances u (B, 2); sharp and heat as in `draw`."""
-    low, high, bins = span
-    shares = (choice / heat).softmax(-1).cumsum(-1)
-    chosen = (shares < u[:, :1]).sum(-1, keepdim=True).clamp(max=choice.shape[-1] - 1)
-    named = chosen < centre.shape[-1]
-    index = chosen.clamp(max=centre.shape[-1] - 1)
-    about = centre.gather(-1, index) + sharp * scale.gather(-1, index) * torch.logit(u[:, 1:])
-    free = low + (chosen - centre.shape[-1] + u[:, 1:]) * (high - low) / bins
-    return torch.where(named, about, free)[:, 0].clamp(low, high)

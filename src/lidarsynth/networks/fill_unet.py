@@ -16,6 +16,7 @@ STEM = (4, 2)  # rows, columns of the patches that become channels
 NOISES = 3  # per pixel, along a ring, in patches
 INPUTS = 34
 OUTPUTS = (RANGE_CANDIDATES + 2) + (REFLECTANCE_CANDIDATES + 1 + NOISES) + (1 + NOISES)
+COHERENT = (2.0, 1.0)  # columns and rows over which the noise of returning is alike, standard deviation
 PRIOR = 2.0  # score of the first guess before any training
 # Of the code: from so near a hypothesis is taken as it is, 3 % of the range; from anywhere, in samples.
 SNAP, ANYHOW = 0.01, 2.0
@@ -102,8 +103,9 @@ class FillUNet(nn.Module):
     """`forward(known, rays, noise) -> Filled`, for any number of beams in multiples of 32 and columns of 16.
 
     noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
-    the grain of a recorded scan. For each pixel the network chooses among `candidates` by a softmax, corrects the
-    choice, and says whether the ray returns at all; and, if it has learned `classes`, of which class the surface is.
+    the grain of a recorded scan; lost: the noise of returning, where it is another. For each pixel the network chooses
+    among `candidates` by a softmax, corrects the choice, and says whether the ray returns at all; and, if it has
+    learned `classes`, of which class the surface is.
     In use, not in training, a choice closer than `reach` (of the code) to a candidate is that candidate, and ranges
     have no grain. Reflectances are compared as even beams would read them: what a beam loses (`dimness`) is added
     before, and taken off after.
@@ -134,7 +136,14 @@ class FillUNet(nn.Module):
         self.classes = Pointwise(2 * widths[0], classes * patch) if classes else None
 
     def forward(
-        self, known: Known, rays: Rays, noise: Tensor, classify: bool = False, doubt: bool = False, reach: float = SNAP
+        self,
+        known: Known,
+        rays: Rays,
+        noise: Tensor,
+        classify: bool = False,
+        doubt: bool = False,
+        reach: float = SNAP,
+        lost: Tensor | None = None,
     ) -> Filled:
         with torch.no_grad():
             even = (known.reflectance + rays.dimness) * known.lit
@@ -153,7 +162,7 @@ class FillUNet(nn.Module):
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
         out = _to_pixels(self.out(h))
-        filled, shares = _assemble(out, guesses, noise, rays.dimness, self.training)
+        filled, shares = _assemble(out, guesses, noise, noise if lost is None else lost, rays.dimness, self.training)
         if not self.training:
             filled = filled._replace(code=_snapped(filled.code, guesses, reach))
         if doubt:
@@ -173,7 +182,7 @@ def _through(blocks: nn.Module, h: Tensor) -> Tensor:
 
 
 def _assemble(
-    out: Tensor, guesses: Candidates, noise: Tensor, dimness: Tensor, training: bool
+    out: Tensor, guesses: Candidates, noise: Tensor, lost: Tensor, dimness: Tensor, training: bool
 ) -> tuple[Filled, Tensor]:
     """The image, and the shares of the candidates in its ranges, (B, 10, H, W)."""
     scores, shift, grain, f_scores, f_shift, f_gain, logit, gain = out.split(
@@ -185,7 +194,7 @@ def _assemble(
         code = code + 0.02 * grain * noise[:, :1]
     reflectance = (f_scores.softmax(1) * guesses.reflectance).sum(1, keepdim=True) + 0.2 * f_shift
     reflectance = reflectance + 0.2 * (f_gain * noise).sum(1, keepdim=True) - dimness
-    logit = 2 * logit + 2 * (gain * noise).sum(1, keepdim=True) + 1.0
+    logit = 2 * logit + 2 * (gain * lost).sum(1, keepdim=True) + 1.0
     return Filled(code, reflectance, logit, plain=guesses.reflectance[:, :1] - dimness), shares
 
 
@@ -246,6 +255,16 @@ def draw_noise(shape: tuple[int, int, int], rng: torch.Generator | None = None) 
     patch = torch.randn(batch, 1, -(-height // 4), -(-width // 8), generator=rng)
     patch = patch.repeat_interleave(4, 2).repeat_interleave(8, 3)[:, :, :height, :width]
     return torch.cat([pixel, along, patch], 1)
+
+
+def draw_coherent(shape: tuple[int, int, int], rng: torch.Generator | None = None) -> Tensor:
+    """`draw_noise` whose pixels are alike around: what a ray meets, its neighbours meet too, or the sky."""
+    noise = draw_noise(shape, rng)
+    steps = torch.arange(-6.0, 7.0)
+    along, down = (torch.exp(-0.5 * (steps / spread) ** 2) for spread in COHERENT)
+    kernel = (down[:, None] * along) / (down.square().sum() * along.square().sum()).sqrt()
+    pixel = F.pad(ring(noise[:, :1], 6), (0, 0, 6, 6), mode="reflect")
+    return torch.cat([F.conv2d(pixel, kernel[None, None]), noise[:, 1:]], 1)
 
 
 def _to_patches(x: Tensor) -> Tensor:

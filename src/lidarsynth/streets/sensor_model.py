@@ -174,10 +174,7 @@ def sense(
         distance + deeper + noise[0] * np.float32(eye.noise) * _spread(made_of, distance, eye.rough) + lasers.shift
     )
     gone |= ~(distance < max_range)
-    # Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
-    grain = optics[2] * np.clip(signal / 0.3, 0.1, 2) * noise[1] * (0.5 + 0.85 * np.abs(noise[2]))
-    step = np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp)
-    reflectance = eye.reported(REPORTED.take(step, mode="wrap"))
+    reflectance = eye.reported(_read(signal, optics[2], noise[1:]))
     lost = np.flatnonzero(gone)
     distance[lost], reflectance[lost], label[lost] = 0, 0, 0
     return Returns(distance, reflectance, label, face, first, surface, surface_label)
@@ -194,6 +191,25 @@ def _signal(
     far = np.log(np.maximum(np.minimum(distance.take(dimmed), 999) / FADE[2], 1))
     signal[dimmed] -= np.float32(fade) * far * (FADE[0] + FADE[1] * far)
     return signal - lasers.loss
+
+
+def _read(signal: np.ndarray, spread: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Reflectance (...) of signals whose speckle spreads so much; noise (2, ...) unit Gaussians.
+
+    Speckle is multiplicative and its tails are longer than a Gaussian's; what reads 0 reads 0 all over.
+    """
+    grain = spread * np.clip(signal / 0.3, 0.1, 2) * noise[0] * (0.5 + 0.85 * np.abs(noise[1]))
+    step = np.clip((signal + grain) * 1000, 0, len(REPORTED) - 1).astype(np.intp)
+    return REPORTED.take(step, mode="wrap")
+
+
+def speckled(reflectance: np.ndarray, spread: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Reflectance (...) float32 as it is read with the speckle of its material, given as it is on average.
+
+    spread  (...) `grain` of the materials, `materials.TABLE[:, 2]`; noise (2, ...) unit Gaussians
+    """
+    signals = (0.0, *RESPONSE[0][1:])
+    return _read(np.interp(reflectance, RESPONSE[1], signals).astype(np.float32), spread, noise)
 
 
 def _doubt(chance: np.ndarray) -> np.ndarray:

@@ -40,19 +40,20 @@ class Crops(NamedTuple):
 
 
 class Grids(NamedTuple):
-    """Whole turns at the coarse stage."""
+    """Whole turns at the coarse stage, of C columns."""
 
-    metres: Tensor  # (b, 16, 128)
+    metres: Tensor  # (b, 16, C)
     reflectance: Tensor
-    rays: Tensor  # (b, 8, 16, 128)
-    standing: Tensor  # (b, 16, 128) radians
+    rays: Tensor  # (b, 8, 16, C)
+    standing: Tensor  # (b, 16, C) radians
 
 
 class CascadeBatch(NamedTuple):
     """One process's share of one pass."""
 
     crops: Crops
-    grids: Grids
+    grids: Grids  # of 128 columns
+    finer: Grids  # of 256 or, every second step, 512, where the sensors have so many
 
 
 def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> CascadeBatch:
@@ -64,12 +65,14 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     pairs = zip(taken, rngs, positions, strict=True)
     crops = [crop(image, rng, position < samples) for image, rng, position in pairs]
     grids = [grid(image, rng) for image, rng in zip(taken, rngs, strict=True)]
+    wide = 4 * COLUMNS if step % 2 and min(image.shape[1] for image in taken) >= 4 * COLUMNS else 2 * COLUMNS
+    finer = [grid(image, np.random.default_rng((n, wide)), wide) for image, n in zip(taken, seeds, strict=True)]
     known, truth = ([torch.cat(part) for part in zip(*(c[i] for c in crops), strict=True)] for i in (0, 2))
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
     return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
-        Grids(*(torch.stack(part) for part in zip(*grids, strict=True))),
+        *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer)),
     )
 
 
@@ -196,12 +199,13 @@ def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled
     return known
 
 
-def grid(image: RangeImage, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Metres, reflectance, rays and standing elevations of an image at the coarse stage, any phase, maybe mirrored.
+def grid(image: RangeImage, rng: np.random.Generator, count: int = COLUMNS) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Metres, reflectance, rays and standing elevations of an image in 16 beams and `count` columns, any phase, maybe
+    mirrored.
 
     Reflectance as beams that are all alike would read it.
     """
-    rows, columns = grid_rows(image.shape[0], rng.random()), grid_columns(image.shape[1], rng.random())
+    rows, columns = grid_rows(image.shape[0], rng.random()), grid_columns(image.shape[1], rng.random(), count)
     rays, standing = grid_rays(image.sensor, hidden(image.sensor), rows, columns)
     at = np.ix_(rows, columns)
     metres = torch.from_numpy(np.where(image.range[at] < 250, image.range[at], 0).astype(np.float32))
@@ -210,5 +214,5 @@ def grid(image: RangeImage, rng: np.random.Generator) -> tuple[Tensor, Tensor, T
     if rng.random() < 0.5:
         metres, reflectance, rays, standing = (part.flip(-1) for part in (metres, reflectance, rays, standing))
         rays[4] *= -1  # the sine of the azimuth
-    assert metres.shape == (ROWS, COLUMNS)
+    assert metres.shape == (ROWS, count)
     return metres, reflectance, rays, standing

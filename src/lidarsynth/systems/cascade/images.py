@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,17 +15,32 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rows
 from lidarsynth.streets.hdl64e import shifts
-from lidarsynth.streets.sensor_model import range_noise
+from lidarsynth.streets.materials import NUMBER, TABLE
+from lidarsynth.streets.sensor_model import range_noise, speckled
 
-# Of the kinds of noise of training, speckle, stripes, patches: generation's, chosen by street-2
-# (docs/training-default.md); a completed sample's, which errs less by speckle alone; `realise`'s.
-GRAIN, SPECKLE, GRAIN_REALISED = (1.0, 0.5, 0.0), (1.0, 0.0, 0.0), (0.4, 0.4, 0.8)
+
+class Grain(NamedTuple):
+    """How much samples take of each kind of noise of training, speckle, stripes and patches; and of `draw_coherent`,
+    where whether rays return has noise of its own."""
+
+    noise: tuple[float, float, float]
+    returning: tuple[float, float, float] | None = None
+
+
+# Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
+# `realise`'s.
+GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.2, 0.5)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 # Metres, standard deviation along the ray by class, of the STRAYING share of rays that miss the surface the fill has
 # drawn, for a leaf, a stalk or a branch before or behind it. Chosen by street-2 (docs/training-default.md).
 STRAYING = 1 / 3
 ROUGH = np.zeros(len(CLASSES), np.float32)
 for _name, _metres in {"vegetation": 0.14, "trunk": 0.035, "terrain": 0.05}.items():
     ROUGH[CLASS_NUMBER[_name]] = _metres
+# What gives a class its speckle, and what gives it to all others.
+_MADE_OF = {"road": "road", "parking": "parking", "sidewalk": "sidewalk", "building": "wall", "fence": "fence",
+            "vegetation": "leaves", "trunk": "bark", "terrain": "grass", "car": "paint", "truck": "paint",
+            "other-vehicle": "paint", "pole": "pole", "traffic-sign": "sign"}  # fmt: skip
+SPREAD = np.array([TABLE[NUMBER[_MADE_OF.get(name, "cloth")], 2] for name, _ in CLASSES], np.float32)
 
 
 def grid_of(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -67,6 +84,29 @@ def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
         strays = torch.rand(image.shape, generator=rng).numpy() < STRAYING
         noise = noise + torch.randn(image.shape, generator=rng).numpy() * strays * ROUGH[image.label]
     return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask)
+
+
+def weighted(
+    draw: Callable[[tuple[int, int, int], torch.Generator], Tensor],
+    amounts: tuple[float, float, float],
+    shape: tuple[int, int],
+    rng: list[torch.Generator],
+) -> Tensor:
+    """(B, 3, H, W): so much of each kind of noise, each image's by a generator of its own."""
+    return torch.tensor(amounts)[:, None, None] * torch.cat([draw((1, *shape), generator) for generator in rng])
+
+
+def shades_of(drawn: list[RangeImage], calm: list[RangeImage]) -> np.ndarray:
+    """(B, H, W): the likeliest reflectances of samples; where the likeliest image has no return, the sample's own."""
+    return np.stack([np.where(b.mask, b.reflectance, a.reflectance) for a, b in zip(drawn, calm, strict=True)])
+
+
+def as_read(image: RangeImage, even: np.ndarray, rng: torch.Generator) -> RangeImage:
+    """The image with reflectances that are `even` (H, W) on average, and the speckle of what it meets, by its labels if
+    any, as streets have it."""
+    spread = SPREAD[np.zeros(image.shape, int) if image.label is None else image.label]
+    shades = speckled(even, spread, torch.randn(2, *image.shape, generator=rng).numpy())
+    return replace(image, reflectance=shades * image.mask)
 
 
 def answered(

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample
 from lidarsynth.diffusion.schedule import flow
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.between_columns import draw_between, joined
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
+from lidarsynth.networks.column_neighbours import Grid, known_grid
 from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.rays import decode_range
+from lidarsynth.streets.hdl64e import unevenness
+from lidarsynth.systems.cascade.surfaces import evened, straightened
 
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT = 16
+FINEST = 4 * COLUMNS  # of the columns between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion
 
 
@@ -60,24 +67,58 @@ def times(count: int, tell: Callable[[], object]) -> Callable[[], None]:
 
 def grids(
     network: Cascade,
-    rays: Tensor,
-    standing: Tensor,
-    dim: Tensor,
+    sensor: Sensor,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    rays_of: Callable[[np.ndarray], tuple[Tensor, Tensor]],
     rng: list[torch.Generator],
     how: tuple[str, int],
     on_step: Callable[[], None],
-) -> tuple[Tensor, Tensor]:
-    """Metres, 0 for no return, and reflectance, each (B, 16, 128), of rays (B, 8, 16, 128) and standing elevations.
+) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Metres, 0 for no return, and reflectance, each (B, 16, C), of these rows, and the columns (C,) that were drawn:
+    those given, and what is between them where the network draws them.
 
-    dim  (16, 1), how much less than the mean beam each one reads; how  as `sampling` says; on_step  called after each
+    rays_of  columns -> what is told of their rays (B, 8, 16, C), and their standing elevations
+    how      as `sampling` says; on_step  called after each
     """
-    sampler, steps = how
+    (told, standing), (sampler, steps) = rays_of(columns), how
+    dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     if sampler == BY_COLUMNS:
         assert network.columns is not None
-        grid = draw(network.columns, rays, rng, on_step)
-        return decode_range(grid.code) * grid.returned, (grid.shade - dim).clamp(0, 1) * grid.returned
-    x_0 = x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
-    for state in sample(velocity(network, rays, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
+        grid = _straight(draw(network.columns, told, rng, on_step), rows, sensor)
+        grid, told, columns = _finer(network, grid, told, columns, rays_of, sensor.width, rng)
+        metres, shade = straightened(_metres(grid), rows, sensor), evened(grid, told)
+        order = np.argsort(columns)
+        return metres[..., order], ((shade - dim).clamp(0, 1) * grid.returned)[..., order], columns[order]
+    x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
+    for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
         x_0 = state.x_s
         on_step()
-    return network.coarse.decode(network.settled(x_0, rays), standing, dim)
+    metres, shade = network.coarse.decode(network.settled(x_0, told), standing, dim)
+    return straightened(metres, rows, sensor), shade, columns
+
+
+def _finer(
+    network: Cascade,
+    grid: Grid,
+    told: Tensor,
+    columns: np.ndarray,
+    rays_of: Callable[[np.ndarray], tuple[Tensor, Tensor]],
+    width: int,
+    rng: list[torch.Generator],
+) -> tuple[Grid, Tensor, np.ndarray]:
+    """The grid with twice and four times the columns, as far as a sensor of so many has them, in their order."""
+    while network.between is not None and 2 * len(columns) <= min(FINEST, width):
+        half = (columns + (np.roll(columns, -1) - columns) % width // 2) % width
+        grid = joined(grid, draw_between(network.between, grid, told, rays_of(half)[0], rng))
+        columns = np.stack([columns, half], 1).ravel()
+        told = rays_of(columns)[0]
+    return grid, told, columns
+
+
+def _straight(grid: Grid, rows: np.ndarray, sensor: Sensor) -> Grid:
+    return known_grid(straightened(_metres(grid), rows, sensor), grid.shade)
+
+
+def _metres(grid: Grid) -> Tensor:
+    return decode_range(grid.code) * grid.returned

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -20,13 +21,26 @@ from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import grid_rays
-from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_noise
+from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_coherent, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded
-from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
+from lidarsynth.streets.hdl64e import hidden, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
-from lidarsynth.systems.cascade.images import GRAIN, GRAIN_REALISED, SPECKLE, answered, grid_of, noisy, parts, placed
+from lidarsynth.systems.cascade.images import (
+    GENERATED,
+    REALISED,
+    SPECKLE,
+    Grain,
+    answered,
+    as_read,
+    grid_of,
+    noisy,
+    parts,
+    placed,
+    shades_of,
+    weighted,
+)
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, STEPS_DEFAULT, block, grids, sampling, times, velocity
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
@@ -63,7 +77,7 @@ class CascadeModel(ScanModel):
     labelled: bool = False
     precision: str = "fp32"
     response: Response = AS_STREETS
-    grain: tuple[float, float, float] = GRAIN
+    grain: Grain = GENERATED
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     any_sensor: ClassVar[bool] = True
@@ -122,16 +136,14 @@ class CascadeModel(ScanModel):
         how = sampling(self.network, steps, sampler)
         if min(n, how[1], batch_size) < 1:
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
-        (rows, columns), tell = grid_of(self.sensor), on_step or (lambda: None)
-        dim, size = torch.from_numpy(unevenness(self.sensor)[rows]).to(self._device), self.at_once(batch_size)
+        (rows, columns), tell, size = grid_of(self.sensor), on_step or (lambda: None), self.at_once(batch_size)
         count = max(size, block(how))
+        rays_of = partial(self._grid_rays, rows, count=count)
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
-            told, standing = self._grid_rays(rows, columns, count)
-            metres, reflectance = grids(self.network, told, standing, dim, rng, how, times(len(wanted), tell))
-            metres = straightened(metres, rows, self.sensor)
+            grid = grids(self.network, self.sensor, rows, columns, rays_of, rng, how, times(len(wanted), tell))
             for part in wanted:
-                yield from self._filled_grids(metres[part], reflectance[part], rows, columns, rng[part])
+                yield from self._filled_grids(grid[0][part], grid[1][part], rows, grid[2], rng[part])
                 tell()
 
     def resolved(self, how: Filling) -> Filling:
@@ -253,28 +265,25 @@ class CascadeModel(ScanModel):
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
         told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
-        return (part.to(self._device).expand(count, *part.shape) for part in (told, standing))  # type: ignore[return-value]
+        told, standing = (part.to(self._device).expand(count, *part.shape) for part in (told, standing))
+        return told, standing
 
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
-        """Coarse grids (B, 16, 128) as samples of whole images: first the grid's beams, then all between them.
+        """Grids (B, 16, C) as samples of whole images: first the grid's beams, then all between them.
 
-        At once, most pixels would know nothing above or below. Those between are told the beams without their speckle,
-        else it would go on as stripes.
+        At once, most pixels would know nothing above or below. Reflectances are the likeliest ones, of each beam and
+        then between them, for speckle that is told would go on as stripes; in the end they get that of their class.
         """
         own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
-        if len(rows) == self.sensor.height:
-            images = own._between(*told, rows, columns, rng)
-        else:
-            beams = replace(own, sensor=own.sensor.rows(rows.tolist()), labelled=False)
+        if len(rows) < self.sensor.height:
+            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
             drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
-            shades = [np.where(b.mask, b.reflectance, a.reflectance) for a, b in zip(drawn, calm, strict=True)]
-            whole = np.arange(self.sensor.width)
-            images = own._between(np.stack([a.range for a in drawn]), np.stack(shades), rows, whole, rng)
-            for image, beam in zip(images, drawn, strict=True):
-                image.reflectance[rows] = beam.reflectance
-        return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(images, rng, strict=True)]
+            told, columns = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
+        drawn, calm = (own._between(*told, rows, columns, noise) for noise in (rng, None))
+        read = map(as_read, drawn, shades_of(drawn, calm), rng)
+        return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
 
     def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
         """A sample with its sensor's noise, without the labels that nobody asked for."""
@@ -341,7 +350,7 @@ class CascadeModel(ScanModel):
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
         drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
-        grain, reach = (self.grain, ANYHOW) if drawn else (GRAIN_REALISED, SNAP)
+        grain, reach = (self.grain, ANYHOW) if drawn else (REALISED, SNAP)
         classify = self.labelled or (drawn and bool(self.experiment.model.classes))
         filled, rays = self._network(known, rng, weights is not None, classify, grain, reach)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
@@ -362,21 +371,21 @@ class CascadeModel(ScanModel):
         rng: list | None,
         doubt: bool = False,
         classify: bool = False,
-        grain: tuple = GRAIN,
+        grain: Grain = GENERATED,
         reach: float = SNAP,
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
         rays = self.response.told(rays_told(self.sensor))
-        noise = torch.zeros(count, NOISES, height, width)
+        noise, lost, device = torch.zeros(count, NOISES, height, width), None, self._device
         if rng is not None:
-            kinds = torch.tensor(grain)[:, None, None]
-            noise = kinds * torch.cat([draw_noise((1, height, width), generator) for generator in rng])
-        device = self._device
+            noise = weighted(draw_noise, grain.noise, (height, width), rng).to(device)
+            if grain.returning is not None:
+                lost = weighted(draw_coherent, grain.returning, (height, width), rng).to(device)
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-            return self.network.fill(known, rays, noise.to(device), classify, doubt, reach), rays
+            return self.network.fill(known, rays, noise.to(device), classify, doubt, reach, lost), rays
 
     @property
     def _blocked(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The surfaces of a generated grid, flat and upright where they nearly are: the noise that is left makes them waves."""
+"""The surfaces of a generated grid, flat, upright, of one reflectance where they nearly are: else noise makes waves."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import torch
 from torch import Tensor
 
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.column_neighbours import Grid
 
 # Rounds; the share of the range within which a return is of its neighbours' surface, and from beam to beam, where the
 # foot of a wall is no slope; all chosen by street-2 (docs/training-default.md). A step between beams that is less than
 # GROUND of flat ground's is none of the ground.
 ROUNDS, NEAR, CORNER, GROUND = 4, 0.04, 0.03, 0.3
+# Of `evened`: differences of reflectance that are speckle, on the ground and elsewhere; of the range code, on flat
+# ground and to the neighbours along a ring.
+ALIKE, FLAT, BESIDE = (0.04, 0.15), 0.02, 0.1
 
 
 def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
@@ -33,6 +37,29 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
     cosine = elevation.cos().clamp_min(1e-3)  # a beam may look straight up
     away = torch.where(returned, cosine / inverse.clamp_min(1e-6), 0)
     return _upright(away, height) / cosine
+
+
+def evened(grid: Grid, rays: Tensor) -> Tensor:
+    """Reflectances (B, R, C) of a grid, told rays (B, 8, R, C), each nearer to those of its neighbours on the same
+    surface, so that its speckle is not taken for that of its surroundings.
+
+    On the ground, where kerbs and lanes differ by little, only what is nearly alike is of one surface.
+    """
+    flat = (grid.code - rays[:, 1] / 2).abs() < FLAT
+    near = torch.where(flat, ALIKE[0], ALIKE[1])
+    height = torch.arange(grid.code.shape[1], device=grid.code.device)[:, None]
+    shade, count = grid.shade * grid.returned, grid.code.shape[1]
+    for _ in range(ROUNDS):
+        total, weights = shade, torch.ones_like(shade)
+        for rows, columns in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            other, code, back = (part.roll((rows, columns), (1, 2)) for part in (shade, grid.code, grid.returned))
+            same = back & grid.returned & (height - rows >= 0) & (height - rows < count)
+            if columns:
+                same &= (code - grid.code).abs() < BESIDE
+            weight = same * torch.exp(-(((other - shade) / near) ** 2))
+            total, weights = total + weight * other, weights + weight
+        shade = total / weights
+    return shade
 
 
 def _nearer(inverse: Tensor, one: Tensor, other: Tensor, share: Tensor | float, near: float) -> Tensor:

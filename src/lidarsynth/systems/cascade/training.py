@@ -13,9 +13,10 @@ from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
-from lidarsynth.networks.column_neighbours import known_grid, spoilt
+from lidarsynth.networks.column_neighbours import Grid, known_grid, spoilt
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, encode_range
@@ -69,12 +70,18 @@ class FillObjective(nn.Module):
 
 class CoarseObjective(nn.Module):
     """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N);
-    `guide`, that of the network that guides; `columns`, negative log-likelihoods of half of the columns; of what there
-    is."""
+    `guide`, that of the network that guides; `columns`, negative log-likelihoods of half of the columns; `between`, of
+    every second column of finer grids; of what there is."""
 
-    def __init__(self, network: CoarseUNet, guide: CoarseUNet | None = None, columns: ColumnTransformer | None = None):
+    def __init__(
+        self,
+        network: CoarseUNet,
+        guide: CoarseUNet | None = None,
+        columns: ColumnTransformer | None = None,
+        between: BetweenColumns | None = None,
+    ):
         super().__init__()
-        self.network, self.guide, self.columns = network, guide, columns
+        self.network, self.guide, self.columns, self.between = network, guide, columns, between
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         metres, reflectance, rays, standing = batch.grids
@@ -91,6 +98,10 @@ class CoarseObjective(nn.Module):
             whole = known_grid(metres, reflectance)
             judged = torch.randperm(COLUMNS, generator=rng)[: COLUMNS // 2].to(rays.device)
             losses["columns"] = self.columns(whole, rays, judged, spoilt(whole, rng)).sum(1)
+        if self.between is not None:
+            whole, rays = known_grid(batch.finer.metres, batch.finer.reflectance), batch.finer.rays
+            known, hidden = (Grid(*(part[..., k::2] for part in whole)) for k in (0, 1))
+            losses["between"] = self.between(known, rays[..., ::2], hidden, rays[..., 1::2]).sum(1)
         return losses
 
 
@@ -215,15 +226,15 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
     if network.guide is not None:
         network.guide.standard.copy_(network.coarse.standard)
     return Phase(FillObjective(network.fill), "fill"), Phase(
-        CoarseObjective(network.coarse, network.guide, network.columns), "coarse"
+        CoarseObjective(network.coarse, network.guide, network.columns, network.between), "coarse"
     )
 
 
 def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.optim.Optimizer]:
-    """AdamW for each stage; the coarse one, with its guide and its transformer, at half the rate."""
+    """AdamW for each stage; the coarse one, with all but the fill, at half the rate."""
     assert isinstance(network, Cascade)
     training = experiment.training
-    parts = [part for part in (network.coarse, network.guide, network.columns) if part is not None]
+    parts = [part for part in (network.coarse, network.guide, network.columns, network.between) if part is not None]
     stage = [parameter for part in parts for parameter in part.parameters()]
     coarse = {"params": stage, "factor": 0.5}
     options = {"lr": training.learning_rate, "betas": training.betas, "weight_decay": 0.01}
@@ -257,7 +268,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "layout", "guide", "columns"),
+    parts=("sample", "median", "layout", "guide", "columns", "between"),
     draw=draw,
     phases=phases,
     judge=judge,

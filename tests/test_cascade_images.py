@@ -1,0 +1,63 @@
+"""What makes generated images look recorded: coherent returns, speckle by class, one reflectance for a surface."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch.testing import assert_close
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.networks.column_neighbours import known_grid
+from lidarsynth.networks.fill_unet import draw_coherent, draw_noise
+from lidarsynth.networks.rays import encode_range
+from lidarsynth.systems.cascade.images import as_read
+from lidarsynth.systems.cascade.surfaces import evened
+
+
+def test_the_noise_of_returning_is_alike_around():
+    noise = draw_coherent((1, 256, 1024), torch.Generator().manual_seed(0))[0, 0]
+    assert abs(float(noise.std()) - 1) < 0.05
+    along, down, apart = (float((noise * noise.roll(k, (0, 1))).mean()) for k in ((0, 2), (2, 0), (0, 9)))
+    assert 0.7 < along < 0.85 and 0.3 < down < 0.45 and abs(apart) < 0.05  # exp(-d^2 / 4 s^2)
+    assert torch.equal(*(part[0, 1:] for part in (draw_coherent((1, 32, 64), rng(3)), draw_noise((1, 32, 64), rng(3)))))
+
+
+def rng(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_speckle_is_that_of_the_class_and_leaves_the_mean_alone():
+    even = np.full((64, 512), 0.3, np.float32)
+    even[:32] = 0
+    label = np.full((64, 512), CLASS_NUMBER["road"])
+    label[:, 256:] = CLASS_NUMBER["vegetation"]
+    sensor = replace(SENSORS["vlp-16"], elevations=tuple(np.linspace(5, -25, 64).tolist()), width=512)
+    image = RangeImage(np.full((64, 512), 9, np.float32), even, np.ones((64, 512), bool), sensor, label)
+    read = as_read(image, even, rng(0)).reflectance
+    dark, road, leaves = read[:32], read[32:, :256], read[32:, 256:]
+    assert (dark[:, :256] == 0).all() and dark.mean() < 0.01
+    assert abs(road.mean() - 0.3) < 0.01 and abs(leaves.mean() - 0.3) < 0.04
+    assert 0.01 < road.std() < 0.05 and leaves.std() > 2 * road.std()
+    plain = as_read(replace(image, label=None, mask=image.mask & (label > 9)), even, rng(0)).reflectance
+    assert road.std() < plain[32:, 256:].std() and not plain[:, :256].any()
+
+
+def test_reflectances_of_one_surface_are_evened_and_kerbs_stay():
+    noise = 0.02 * torch.randn(1, 16, 128, generator=rng(0))
+    metres, shade = torch.full((1, 16, 128), 10.0), torch.full((1, 16, 128), 0.3)
+    metres[..., 64:], shade[..., 32:64] = 20, 0.5
+    shade[..., 64:] = 0.8
+    metres[:, 5, 10] = 0
+    told = torch.zeros(1, 8, 16, 128)
+    told[:, 1] = 2 * encode_range(metres)  # all is flat ground
+    found = evened(known_grid(metres, shade + noise), told)
+    for part, level in ((slice(2, 30), 0.3), (slice(34, 62), 0.5), (slice(66, 126), 0.8)):
+        assert abs(float(found[0, :, part].mean()) - level) < 0.02
+    rest = (found - shade)[0, :, 12:30]
+    assert rest.std() < 0.5 * noise.std() and found[0, 5, 10] == 0
+    assert_close(found[0, 4:7, 9:12].flatten()[[0, 2, 6, 8]], torch.full((4,), 0.3), atol=0.03, rtol=0)
+    strict = (found - shade)[0, 0].abs().max()  # the lowest beam is no neighbour of the highest
+    metres[:, -1], shade[:, -1] = 10, 0.33
+    assert (evened(known_grid(metres, shade + noise), told) - shade)[0, 0].abs().max() <= strict + 1e-6
