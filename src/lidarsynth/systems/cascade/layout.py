@@ -19,7 +19,7 @@ from lidarsynth.networks.column_neighbours import Grid, known_grid
 from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.rays import decode_range
 from lidarsynth.streets.hdl64e import unevenness
-from lidarsynth.systems.cascade.surfaces import evened, straightened
+from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
 
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT = 16
@@ -87,7 +87,8 @@ def grids(
         assert network.columns is not None
         grid = _straight(draw(network.columns, told, rng, on_step), rows, sensor)
         grid, told, columns = _finer(network, grid, told, columns, rays_of, sensor.width, rng)
-        metres, shade = straightened(_metres(grid), rows, sensor), evened(grid, told)
+        metres, shade = _metres(grid), evened(grid, told)
+        metres = metres if len(columns) == COLUMNS else along_rings(metres)
         order = np.argsort(columns)
         return metres[..., order], ((shade - dim).clamp(0, 1) * grid.returned)[..., order], columns[order]
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)

@@ -39,6 +39,15 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
     return _upright(away, height) / cosine
 
 
+def along_rings(metres: Tensor) -> Tensor:
+    """`straightened` along rings alone, for what was drawn between columns that are straight already."""
+    returned = metres > 0
+    inverse = returned / metres.clamp_min(0.1)
+    for _ in range(ROUNDS):
+        inverse = _nearer(inverse, inverse.roll(1, 2), inverse.roll(-1, 2), 0.5, NEAR)
+    return torch.where(returned, 1 / inverse.clamp_min(1e-6), 0)
+
+
 def evened(grid: Grid, rays: Tensor) -> Tensor:
     """Reflectances (B, R, C) of a grid, told rays (B, 8, R, C), each nearer to those of its neighbours on the same
     surface, so that its speckle is not taken for that of its surroundings.
