@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import torch
@@ -26,7 +27,7 @@ class Drawn(NamedTuple):
     hidden: Tensor
 
 
-class PixelDrawer(nn.Module):
+class PixelDrawer(nn.Module, ABC):
     """The part of a network that draws single pixels, of what they are told: `pixel`, then `shades`.
 
     features  how many numbers a pixel is told
@@ -41,6 +42,10 @@ class PixelDrawer(nn.Module):
         self.range_head = nn.Sequential(nn.LayerNorm(pixel), nn.Linear(pixel, 1 + CODES[2] + 3 * guesses))
         self.shade_stem = nn.Linear(pixel + guesses + 1, pixel // 2)
         self.shade_head = nn.Linear(pixel // 2, TONES[2] + 3 * shades)
+
+    @abstractmethod
+    def forward(self, *args: Tensor) -> Tensor:
+        """Negative log-likelihoods (B, 3 or more) of a grid's pixels."""
 
     def pixel(self, features: Tensor, around: Tensor, hypotheses: Tensor, valid: Tensor) -> Drawn:
         """Of pixels (..., F), told (..., D) of what is around and hypotheses (..., H)."""

@@ -11,8 +11,11 @@ def _network(experiment: Experiment) -> str:
 
 
 def _details(experiment: Experiment) -> dict[str, str]:
-    layout = "column by column, and " if experiment.model.column_channels else ""
-    return {"layout": f"a grid of 16 beams x 128 columns, {layout}by flow matching; all pixels are filled in one step"}
+    model = experiment.model
+    layout = "column by column, and " if model.column_channels else ""
+    between = "; 512 columns by what is drawn between them" if model.between_channels else ""
+    grid = f"a grid of 16 beams x 128 columns, {layout}by flow matching{between}"
+    return {"layout": f"{grid}; all pixels are filled in one step"}
 
 
 def _about(experiment: Experiment) -> About:
