@@ -12,7 +12,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import draw_coherent, draw_noise
 from lidarsynth.networks.rays import encode_range
-from lidarsynth.systems.cascade.images import as_read
+from lidarsynth.systems.cascade.images import agreed, as_read
 from lidarsynth.systems.cascade.surfaces import evened
 
 
@@ -22,6 +22,24 @@ def test_the_noise_of_returning_is_alike_around():
     along, down, apart = (float((noise * noise.roll(k, (0, 1))).mean()) for k in ((0, 2), (2, 0), (0, 9)))
     assert 0.7 < along < 0.85 and 0.3 < down < 0.45 and abs(apart) < 0.05  # exp(-d^2 / 4 s^2)
     assert torch.equal(*(part[0, 1:] for part in (draw_coherent((1, 32, 64), rng(3)), draw_noise((1, 32, 64), rng(3)))))
+
+
+def test_rays_between_two_that_agree_do_as_they_do():
+    sensor = replace(SENSORS["vlp-16"], width=512)
+    columns, shape = np.arange(1, 512, 2), (16, 512)
+    metres = np.zeros((1, 16, 256), np.float32)
+    metres[:, :, 10:20] = 9
+    empty, full = np.zeros(shape, np.float32), np.full(shape, 7, np.float32)
+    nothing = RangeImage(empty, empty, empty > 0, sensor)
+    everything = RangeImage(full, full / 10, full > 0, sensor)
+    (lit,) = agreed([nothing], [everything], metres, columns)
+    between = lit.mask[:, 0::2]  # of column 2 k, before the known number k
+    assert between[:, 11:20].all() and not between[:, :11].any() and not between[:, 20:].any()
+    assert (lit.range[:, 22:39:2] == 7).all() and (lit.reflectance[:, 22:39:2] == np.float32(0.7)).all()
+    (dark,) = agreed([everything], [nothing], metres, columns)
+    assert dark.mask[:, 20:41].all() and dark.mask.sum() == 16 * 21
+    sparse = metres[..., ::2]
+    assert agreed([everything], [nothing], sparse, columns[::2])[0] is everything
 
 
 def rng(seed: int) -> torch.Generator:

@@ -29,7 +29,7 @@ class Grain(NamedTuple):
 
 # Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
 # `realise`'s.
-GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.2, 0.5)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
+GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 # Metres, standard deviation along the ray by class, of the STRAYING share of rays that miss the surface the fill has
 # drawn, for a leaf, a stalk or a branch before or behind it. Chosen by street-2 (docs/training-default.md).
 STRAYING = 1 / 3
@@ -94,6 +94,30 @@ def weighted(
 ) -> Tensor:
     """(B, 3, H, W): so much of each kind of noise, each image's by a generator of its own."""
     return torch.tensor(amounts)[:, None, None] * torch.cat([draw((1, *shape), generator) for generator in rng])
+
+
+def agreed(
+    drawn: list[RangeImage], calm: list[RangeImage], metres: np.ndarray, columns: np.ndarray
+) -> list[RangeImage]:
+    """Samples whose rays between two known ones of a beam that agree whether they return, do as they do.
+
+    metres   (B, H, C), 0 for no return, of these columns; where they are only 128, too much may be between them
+    columns  (C,), rising
+
+    A ray between two that return has the likeliest range, where the sample has none.
+    """
+    if len(columns) <= COLUMNS:
+        return drawn
+    left = np.searchsorted(columns, np.arange(drawn[0].sensor.width), side="right") - 1  # -1: the last, around the turn
+    right = np.where(np.isin(np.arange(len(left)), columns), left, (left + 1) % len(columns))
+    images = []
+    for sample, likely, known in zip(drawn, calm, metres > 0, strict=True):
+        lost = known[:, left] & known[:, right] & ~sample.mask & likely.mask
+        mask = (sample.mask | lost) & (known[:, left] | known[:, right])
+        both = zip((sample.range, sample.reflectance), (likely.range, likely.reflectance), strict=True)
+        metres, shades = (np.where(lost, b, a) * mask for a, b in both)
+        images.append(replace(sample, range=metres, reflectance=shades, mask=mask))
+    return images
 
 
 def shades_of(drawn: list[RangeImage], calm: list[RangeImage]) -> np.ndarray:

@@ -32,6 +32,7 @@ from lidarsynth.systems.cascade.images import (
     REALISED,
     SPECKLE,
     Grain,
+    agreed,
     answered,
     as_read,
     grid_of,
@@ -277,12 +278,15 @@ class CascadeModel(ScanModel):
         then between them, for speckle that is told would go on as stripes; in the end they get that of their class.
         """
         own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
+        beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
+        drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
+        drawn = agreed(drawn, calm, told[0], columns)
+        shades = shades_of(drawn, calm)
         if len(rows) < self.sensor.height:
-            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
-            drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
-            told, columns = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
-        drawn, calm = (own._between(*told, rows, columns, noise) for noise in (rng, None))
-        read = map(as_read, drawn, shades_of(drawn, calm), rng)
+            told, every = (np.stack([a.range for a in drawn]), shades), np.arange(self.sensor.width)
+            drawn, calm = (own._between(*told, rows, every, noise) for noise in (rng, None))
+            shades = shades_of(drawn, calm)
+        read = map(as_read, drawn, shades, rng)
         return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
 
     def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:

@@ -15,7 +15,7 @@ from lidarsynth.networks.column_neighbours import Grid
 ROUNDS, NEAR, CORNER, GROUND = 4, 0.04, 0.03, 0.3
 # Of `evened`: differences of reflectance that are speckle, on the ground and elsewhere; of the range code, on flat
 # ground and to the neighbours along a ring.
-ALIKE, FLAT, BESIDE = (0.04, 0.15), 0.02, 0.1
+ALIKE, FLAT, BESIDE = (0.04, 0.08), 0.02, 0.1
 
 
 def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
