@@ -1,4 +1,4 @@
-"""Draws the columns between those of a grid: outlines, and what is narrower than a cell, such as poles and people."""
+"""Draws the columns between those of a grid: outlines, and what is narrower than a cell, such as poles."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class BetweenColumns(PixelDrawer):
         back = known.returned.float()
         far = (known.code - rays[:, 1] / 2) * back
         values = torch.stack([3 * far, 2 * known.shade * back, 2 * back - 1], 1)
-        x = torch.cat([values, rays, torch.full_like(values[:, :1], _step(known))], 1)
+        x = torch.cat([values, rays, torch.full_like(values[:, :1], _step(values.shape[-1]))], 1)
         x = F.silu(self.enter(_padded(x)))
         for layer in self.layers:
             x = x + F.silu(layer(_padded(x)))
@@ -147,9 +147,9 @@ def guesses(
     return torch.cat([ground, codes], -1), torch.cat([torch.ones_like(valid[..., :1]), valid], -1)
 
 
-def _step(known: Grid) -> float:
-    """How far columns are apart: 0 where 128 make the turn, 1 where 256 do."""
-    return math.log2(known.code.shape[-1] / COLUMNS)
+def _step(columns: int) -> float:
+    """How far known columns are apart: 0 where 128 make the turn, 1 where 256 do."""
+    return math.log2(columns / COLUMNS)
 
 
 def _padded(x: Tensor) -> Tensor:
@@ -181,7 +181,7 @@ def _told(beside: Tensor, beneath: Tensor, rays: Tensor, hypotheses: Tensor, val
     """(B, ..., C, F): what new pixels are told, of the parts that are theirs, rays (B, ..., C, 8)."""
     own = (4 * (hypotheses - hypotheses[..., :1])).clamp(-4, 4)
     fine = torch.asinh(200 * (hypotheses - hypotheses[..., 3:4])) / 4
-    step = torch.full_like(own[..., :1], math.log2(own.shape[-2] / COLUMNS))
+    step = torch.full_like(own[..., :1], _step(own.shape[-2]))
     rows = row.expand(*own.shape[:-1], row.shape[-1])
     return torch.cat([beside, beneath, rays, own, fine, valid.float(), rows, step], -1)
 

@@ -26,13 +26,14 @@ def accelerator_of(options: Options) -> Accelerator:
         from accelerate import Accelerator
     except ImportError:
         raise ImportError("training needs accelerate: pip install 'lidarsynth[train]'") from None
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    return Accelerator(
+    accelerator = Accelerator(
         mixed_precision="no" if options.precision == "fp32" else options.precision,
         gradient_accumulation_steps=options.accumulate,
         cpu=not torch.accelerator.is_available(),  # without this, two processes on CPUs would not know of each other
     )
+    if options.threads:  # behind accelerate, which sets a number of its own for several processes on CPUs
+        torch.set_num_threads(options.threads)
+    return accelerator
 
 
 def workers_of(options: Options, wanted: bool) -> int:
