@@ -9,10 +9,20 @@ import torch
 
 import lidarsynth as ls
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.rays import padded, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.systems.cascade.response import AS_STREETS, SHARES, Response, dimness_of, response_of, tried
+from lidarsynth.systems.cascade.response import (
+    AS_STREETS,
+    MEASURED,
+    SHARES,
+    USUAL,
+    Response,
+    dimness_of,
+    response_of,
+    tried,
+)
+from lidarsynth.systems.cascade.speckle import calm
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +101,36 @@ def test_the_share_of_the_mean_is_what_suits_the_scan(street: RangeImage, offset
             return answer
 
     rays = rays_of(street.sensor, street.sensor.blocked_rays())
-    found = tried(response, Fill(1, 1), street, told, rays)  # type: ignore[arg-type]
-    assert found.plain == share
+    fill, shades = Fill(1, 1), response.even(street.reflectance)
+    found = tried(response, fill, street, told, shades, rays)  # type: ignore[arg-type]
+    assert found.plain == (USUAL + share) / 2
     assert share in SHARES
-    assert tried(AS_STREETS, Fill(1, 1), street, told, rays) == AS_STREETS  # type: ignore[arg-type]
+    assert tried(AS_STREETS, fill, street, told, shades, rays) == Response(plain=MEASURED)  # type: ignore[arg-type]
+    dark = replace(street, reflectance=0 * street.reflectance)
+    assert tried(AS_STREETS, fill, dark, told, shades, rays) == AS_STREETS  # type: ignore[arg-type]
+
+
+def test_known_reflectances_are_calm_on_their_own_surface():
+    """A near wall and one behind it, each of one reflectance but for its speckle; a sign alone; rays without return."""
+    rng, shape = np.random.default_rng(3), (4, 64)
+    metres = np.where(np.arange(64) < 32, 10.0, 20.0).astype(np.float32) * np.ones(shape, np.float32)
+    even = np.where(metres < 15, 0.2, 0.6).astype(np.float32)
+    shades = even + rng.normal(0, 0.05, shape).astype(np.float32)
+    metres[:, 10], shades[:, 10] = 5.0, 0.9
+    mask = rng.random(shape) < 0.9
+    mask[:, 10] = True
+    known = np.zeros(shape, bool)
+    known[::2] = True
+    image = RangeImage(metres * mask, shades * mask, mask, Sensor("s", (0.0, -1.0, -2.0, -3.0), 64))
+    found, lit = calm(image.reflectance, image, known), known & mask
+    assert not found[~lit].any()
+    others = lit & (np.arange(64) != 10)
+    assert np.abs(found - even)[others].mean() < 0.6 * np.abs(shades - even)[others].mean()
+    assert np.allclose(found[lit & (np.arange(64) == 10)], 0.9)
+    assert np.abs(found - even)[others].max() < 0.2
+
+
+def test_few_columns_and_nothing_known_are_no_error():
+    image = RangeImage(np.ones((2, 4)), np.full((2, 4), 0.5), np.ones((2, 4), bool), Sensor("s", (0.0, -1.0), 4))
+    assert np.allclose(calm(np.full((2, 4), 0.5, np.float32), image, image.mask), 0.5)
+    assert not calm(np.full((2, 4), 0.5, np.float32), image, ~image.mask).any()

@@ -71,9 +71,9 @@ class BetweenColumns(PixelDrawer):
         far = (known.code - rays[:, 1] / 2) * back
         values = torch.stack([3 * far, 2 * known.shade * back, 2 * back - 1], 1)
         x = torch.cat([values, rays, torch.full_like(values[:, :1], _step(values.shape[-1]))], 1)
-        x = F.silu(self.enter(_padded(x)))
+        x = F.silu(self.enter(padded(x)))
         for layer in self.layers:
-            x = x + F.silu(layer(_padded(x)))
+            x = x + F.silu(layer(padded(x)))
         x = x.permute(0, 2, 3, 1)
         return self.leave(torch.cat([x, x.roll(-1, 2)], -1))
 
@@ -103,9 +103,9 @@ def draw_between(
         expected = guesses(sides[:, :, i], under[:, :, i], below, below2, steeper[:, i], ray)
         features = _told(beside[:, i], beneath, ray.transpose(1, 2), *expected, row[i])
         drawn = network.pixel(features, around[:, i], *expected)
-        code = _one_of((drawn.choice, drawn.centre, drawn.scale), u[..., 1:3], sharp, heat, CODES)
+        code = one_of((drawn.choice, drawn.centre, drawn.scale), u[..., 1:3], sharp, heat, CODES)
         copies = _copies(Grid(*(part[:, i] for part in known)), lower, below > 0)
-        shade = _one_of(network.shades(drawn, code, expected[0], *copies), u[..., 3:5], 1, 1, TONES)
+        shade = one_of(network.shades(drawn, code, expected[0], *copies), u[..., 3:5], 1, 1, TONES)
         returned = (u[..., 0] < (drawn.returns / heat).sigmoid()) & (ray[:, 6] < 0.5)
         pixel = Grid(code * returned, shade * returned, returned)
         below2, below, lower = below, nearness(pixel.code, returned, ray), pixel.shade
@@ -152,7 +152,7 @@ def _step(columns: int) -> float:
     return math.log2(columns / COLUMNS)
 
 
-def _padded(x: Tensor) -> Tensor:
+def padded(x: Tensor) -> Tensor:
     """(B, C, H, W) with a column of the other end on either side, and rows of zeros."""
     return F.pad(torch.cat([x[..., -1:], x, x[..., :1]], -1), (0, 0, 1, 1))
 
@@ -186,9 +186,9 @@ def _told(beside: Tensor, beneath: Tensor, rays: Tensor, hypotheses: Tensor, val
     return torch.cat([beside, beneath, rays, own, fine, valid.float(), rows, step], -1)
 
 
-def _one_of(
+def one_of(
     parts: tuple[Tensor, Tensor, Tensor], u: Tensor, sharp: float, heat: float, span: tuple[float, float, int]
 ) -> Tensor:
-    """(B, C): `picked` of mixtures (B, C, ...), by chances u (B, C, 2)."""
-    choice, centre, scale = (part.flatten(0, 1) for part in parts)
-    return picked(choice, centre, scale, u.flatten(0, 1), sharp, heat, span).view(u.shape[:-1])
+    """(...): `picked` of mixtures of pixels (..., N), by chances u (..., 2)."""
+    choice, centre, scale = (part.flatten(0, -2) for part in parts)
+    return picked(choice, centre, scale, u.flatten(0, -2), sharp, heat, span).view(u.shape[:-1])

@@ -12,6 +12,8 @@ from lidarsynth.networks.rays import COLUMNS, Rays, decode_range, padded, rays_o
 from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.cascade.confidence import confidence
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.response import AS_STREETS, MEASURED
+from lidarsynth.systems.cascade.speckle import calmed
 from lidarsynth.systems.graph import Graph
 
 SAYS = {
@@ -47,7 +49,7 @@ class FillGraph(nn.Module):
         told = (known > 0.5) | self._buffer("closed")
         returned = told & (range > 0)
         metres = self._padded(torch.where(returned, range, 0.0), 0)
-        light = self._padded(torch.where(returned, reflectance, 0.0), 0)
+        light = self._padded(calmed(reflectance, range, returned), 0)
         answered = metres > 0
         seen = Known(metres, light, self._padded(told.float(), 1) > 0.5, answered, answered)
         rays = self._rays(seen.metres)
@@ -57,7 +59,8 @@ class FillGraph(nn.Module):
         metres = decode_range(filled.code)[:, :, : sensor.height, : range.shape[3]]
         answers = filled.logit[:, :, : sensor.height, : range.shape[3]] > 0
         answers = answers & (metres <= sensor.max_range) & (metres >= sensor.min_range) & ~self._buffer("closed")
-        shade = filled.reflectance[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
+        shade = AS_STREETS._replace(plain=MEASURED).mixed(filled)
+        shade = shade[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
         answers = returned | (answers & ~told)
         full = torch.where(answers, torch.where(returned, range, metres), 0.0)
         light = torch.where(answers, torch.where(returned, reflectance, shade), 0.0)

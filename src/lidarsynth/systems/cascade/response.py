@@ -26,6 +26,8 @@ LEAST, NARROWEST = 0.002, 0.05  # reflectance; natural logarithm between the qua
 ENOUGH = 50  # returns
 SECTORS, FEW = 12, 12  # of a turn, in which beams are compared; returns of both beams in one
 SHARES, PART = (0.0, 0.25, 0.5, 0.75, 1.0), 128  # of the mean of what is known around; columns in which it is tried
+# What is tried tells little: half of it, and half of what is best on average. And where nothing can be tried.
+USUAL, MEASURED = 0.4, 0.25
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 
 
@@ -33,8 +35,8 @@ class Response(NamedTuple):
     """scale * reported ** gamma, in [0, 1], plus how dim a beam is, is what even beams of the streets' sensor report.
 
     scale, gamma  positive; dimness (H,), in reflectance, or () for what the sensor itself says; the defaults change
-    nothing. plain: share of 0 to 1 that the mean of what is known around has in the most likely reflectance, beside the
-    network's.
+    nothing. plain: share of 0 to 1 that the mean of what is known around, calm, has in the most likely reflectance,
+    beside the network's.
     """
 
     scale: float = 1.0
@@ -92,13 +94,18 @@ def response_of(image: RangeImage, known: np.ndarray) -> Response:
     return response._replace(dimness=tuple(dim.tolist()))
 
 
-def tried(response: Response, fill: FillUNet, image: RangeImage, told: np.ndarray, rays: Rays) -> Response:
-    """The response with that share of the mean which suits the scan: every second known beam of a part of the turn,
-    ahead, is hidden and filled, and the share with the least absolute error of reflectance taken.
+def tried(
+    response: Response, fill: FillUNet, image: RangeImage, told: np.ndarray, reflectance: np.ndarray, rays: Rays
+) -> Response:
+    """The response with a share of the mean: half of the way from the usual one to that which suits the scan. Every
+    second known beam of a part of the turn, ahead, is hidden and filled, and the share taken that errs least.
 
-    told (H, W) bool; rays of the padded image. Nothing is changed where fewer than four beams return enough.
+    told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. Of a sensor whose
+    beams are measured, and where fewer than four beams return enough, 1/4; where no reflectance is known, none.
     """
     returned = told & image.mask
+    if not image.reflectance[returned].any():
+        return response
     rows = np.flatnonzero(returned.sum(1) >= ENOUGH)
     hidden = np.zeros_like(told)
     hidden[rows[1::2]] = True
@@ -106,8 +113,8 @@ def tried(response: Response, fill: FillUNet, image: RangeImage, told: np.ndarra
     ahead = slice((size[1] - width) // 2, (size[1] + width) // 2)
     judged, truth = (returned & hidden)[:, ahead], image.reflectance[:, ahead]
     if response == AS_STREETS or len(rows) < 4 or judged.sum() < ENOUGH:
-        return response
-    known = known_of(image.range[None], response.even(image.reflectance)[None], (told & ~hidden)[None], True, size)
+        return response._replace(plain=MEASURED)
+    known = known_of(image.range[None], reflectance[None], (told & ~hidden)[None], True, size)
     device = next(fill.parameters()).device
     known = Known(*(part[..., ahead].contiguous().to(device) for part in known))
     rays = Rays(*((part if part.shape[3] == 1 else part[..., ahead].contiguous()).to(device) for part in rays))
@@ -118,7 +125,7 @@ def tried(response: Response, fill: FillUNet, image: RangeImage, told: np.ndarra
         mixed = response._replace(plain=share).mixed(filled)[0, 0, : truth.shape[0], : truth.shape[1]]
         return float(np.abs(response.reported(mixed.clamp(0, 1).cpu().numpy()) - truth)[judged].mean())
 
-    return response._replace(plain=min(SHARES, key=error))
+    return response._replace(plain=(USUAL + min(SHARES, key=error)) / 2)
 
 
 def dimness_of(reflectance: np.ndarray, metres: np.ndarray, returned: np.ndarray) -> np.ndarray:
