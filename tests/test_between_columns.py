@@ -131,16 +131,17 @@ def test_grids_are_as_fine_as_the_sensor_has_columns(network: BetweenColumns, wi
     columns_first = ColumnTransformer(16, layers=1, pixel=16, blocks=1).eval()
     coarse, fill = CoarseUNet(16, (1, 1, 1, 1), 1).eval(), FillUNet((16, 16), (1, 1)).eval()
 
-    def rays_of(which: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        told, standing = grid_rays(sensor, blocked, rows, which)
+    def rays_of(chosen: np.ndarray, which: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        told, standing = grid_rays(sensor, blocked, chosen, which)
         return told.expand(2, -1, -1, -1), standing.expand(2, -1, -1)
 
     drawn = partial(grids, sensor=sensor, rows=rows, columns=columns, rays_of=rays_of, how=("columns", 128))
     told: list[int] = []
     finer = drawn(Cascade(coarse, fill, None, columns_first, network), rng=rngs(), on_step=lambda: told.append(1))
     plain = drawn(Cascade(coarse, fill, None, columns_first), rng=rngs(), on_step=lambda: None)
-    assert len(told) == COLUMNS and finer[2].tolist() == sorted(set(finer[2].tolist())) and len(finer[2]) == count
-    assert finer[0].shape == finer[1].shape == (2, ROWS, count) and set(columns) <= set(finer[2])
-    kept = np.isin(finer[2], columns)
+    assert len(told) == COLUMNS and finer[3].tolist() == sorted(set(finer[3].tolist())) and len(finer[3]) == count
+    assert finer[0].shape == finer[1].shape == (2, ROWS, count) and set(columns) <= set(finer[3])
+    assert (finer[2] == rows).all()
+    kept = np.isin(finer[3], columns)
     assert torch.equal(finer[0][..., kept] > 0, plain[0] > 0)
     assert not finer[1][finer[0] == 0].any()

@@ -27,6 +27,7 @@ TINY = with_fields(
     preset("default"),
     {"model.base_channels": 16, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1),
      "model.guide_channels": 8, "model.column_channels": 16, "model.between_channels": 16,
+     "model.beam_channels": 14,
      "training.batch_size": 2, "training.steps": 2, "training.warmup": 0, "model.gn_num_groups": 8},
 )  # fmt: skip
 
@@ -146,12 +147,12 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
     for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
         before = before or progress
     losses = progress.losses
-    assert {"sample", "median", "layout", "guide", "columns", "between"} <= losses.keys()
+    assert {"sample", "median", "layout", "guide", "columns", "between", "beams"} <= losses.keys()
     assert all(np.isfinite(value) for value in losses.values())
     from lidarsynth import load
 
     model = load(tmp_path / "run")
-    assert model.network.columns is not None and model.network.between is not None
+    assert model.network.columns is not None and model.network.between is not None and model.network.beams is not None
     assert model.generate(1, steps=1)[0].shape == (64, 1024)
 
 

@@ -198,6 +198,7 @@ def default() -> Experiment:
             guide_channels=32,
             column_channels=256,
             between_channels=64,
+            beam_channels=56,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
         training=Training(

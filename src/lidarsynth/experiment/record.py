@@ -51,6 +51,7 @@ class Model:
     guide_channels: int = within(0, 0, 8192)  # cascade: width of the network that guides the coarse one, 0 = none
     column_channels: int = within(0, 0, 8192)  # cascade: width of the transformer that draws grids, 0 = none
     between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none
+    beam_channels: int = within(0, 0, 8192)  # cascade: width of what draws the beams between those, 0 = none
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):

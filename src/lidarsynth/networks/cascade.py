@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.column_transformer import ColumnTransformer
@@ -25,6 +26,7 @@ class Cascade(nn.Module):
            it is where grids are likelier (autoguidance, Karras et al. 2024)
     columns  draws such a grid column by column, for generation; `coarse` alone can go around what is known
     between  draws the columns between those, twice over
+    beams    draws the beams between those, then, twice over
     """
 
     def __init__(
@@ -34,9 +36,11 @@ class Cascade(nn.Module):
         guide: CoarseUNet | None = None,
         columns: ColumnTransformer | None = None,
         between: BetweenColumns | None = None,
+        beams: BetweenBeams | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
+        self.beams = beams
 
     def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         """What `coarse` answers, led away from the guide's answer."""

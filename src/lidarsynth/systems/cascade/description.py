@@ -14,6 +14,7 @@ def _details(experiment: Experiment) -> dict[str, str]:
     model = experiment.model
     layout = "column by column, and " if model.column_channels else ""
     between = "; 512 columns by what is drawn between them" if model.between_channels else ""
+    between += ", then up to 61 beams" if model.beam_channels else ""
     grid = f"a grid of 16 beams x 128 columns, {layout}by flow matching{between}"
     return {"layout": f"{grid}; all pixels are filled in one step"}
 

@@ -14,7 +14,8 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.corruption import every_beam, without_columns, without_rectangle
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.between_beams import with_between
+from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
@@ -22,6 +23,7 @@ from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
 
+TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
@@ -40,12 +42,12 @@ class Crops(NamedTuple):
 
 
 class Grids(NamedTuple):
-    """Whole turns at the coarse stage, of C columns."""
+    """Turns at the coarse stage, of R beams, 16 where nothing else is said, and C columns."""
 
-    metres: Tensor  # (b, 16, C)
+    metres: Tensor  # (b, R, C)
     reflectance: Tensor
-    rays: Tensor  # (b, 8, 16, C)
-    standing: Tensor  # (b, 16, C) radians
+    rays: Tensor  # (b, 8, R, C)
+    standing: Tensor  # (b, R, C) radians
 
 
 class CascadeBatch(NamedTuple):
@@ -54,6 +56,7 @@ class CascadeBatch(NamedTuple):
     crops: Crops
     grids: Grids  # of 128 columns
     finer: Grids  # of 256 or, every second step, 512, where the sensors have so many
+    taller: Grids  # of 31 beams and 160 columns, see `taller`
 
 
 def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> CascadeBatch:
@@ -67,12 +70,15 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     grids = [grid(image, rng) for image, rng in zip(taken, rngs, strict=True)]
     wide = 4 * COLUMNS if step % 2 and min(image.shape[1] for image in taken) >= 4 * COLUMNS else 2 * COLUMNS
     finer = [grid(image, np.random.default_rng((n, wide)), wide) for image, n in zip(taken, seeds, strict=True)]
+    tall = [
+        taller(image, np.random.default_rng((n, TALL)), step % 2 == 1) for image, n in zip(taken, seeds, strict=True)
+    ]
     known, truth = ([torch.cat(part) for part in zip(*(c[i] for c in crops), strict=True)] for i in (0, 2))
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
     return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
-        *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer)),
+        *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer, tall)),
     )
 
 
@@ -206,13 +212,41 @@ def grid(image: RangeImage, rng: np.random.Generator, count: int = COLUMNS) -> t
     Reflectance as beams that are all alike would read it.
     """
     rows, columns = grid_rows(image.shape[0], rng.random()), grid_columns(image.shape[1], rng.random(), count)
-    rays, standing = grid_rays(image.sensor, hidden(image.sensor), rows, columns)
-    at = np.ix_(rows, columns)
+    return _grid(image, rows, columns, grid_rays(image.sensor, hidden(image.sensor), rows, columns), rng)
+
+
+def taller(image: RangeImage, rng: np.random.Generator, fine: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`grid` of 31 beams, of which every second one is half-way between two others, and 160 of 512 columns in a row.
+
+    The beams of the grid and those between, or `fine`, of those and what is between them again. A sensor that has no 31
+    such beams or 512 columns gives a grid of blocked rays, which teaches nothing.
+    """
+    (height, width), first = image.shape, rng.random()
+    rows = grid_rows(height, first) if height >= ROWS else np.zeros(ROWS, int)
+    for _ in range(1 + fine):
+        rows = with_between(rows) if np.diff(rows).min() > 1 else rows
+    if len(rows) < TALL or width < 4 * COLUMNS:
+        none, rays = torch.zeros(TALL, WIDE), torch.zeros(RAY_CHANNELS, TALL, WIDE)
+        rays[6] = 1
+        return none, none, rays, none
+    start, turn = 2 * int(rng.integers((len(rows) - TALL) // 2 + 1)), int(rng.integers(4 * COLUMNS))
+    rows = rows[start : start + TALL]
+    columns = grid_columns(width, rng.random(), 4 * COLUMNS)[(turn + np.arange(WIDE)) % (4 * COLUMNS)]
+    each = [grid_rays(image.sensor, hidden(image.sensor), rows[k::2], columns) for k in (0, 1)]
+    order = np.argsort(np.r_[0:TALL:2, 1:TALL:2])  # their places in one after the other
+    rays, standing = (torch.cat(pair, -2)[..., order, :] for pair in zip(*each, strict=True))
+    return _grid(image, rows, columns, (rays, standing), rng)
+
+
+def _grid(
+    image: RangeImage, rows: np.ndarray, columns: np.ndarray, told: tuple[Tensor, Tensor], rng: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`grid` of these rows and columns, with what is told of their rays."""
+    (rays, standing), at = told, np.ix_(rows, columns)
     metres = torch.from_numpy(np.where(image.range[at] < 250, image.range[at], 0).astype(np.float32))
     even = (image.reflectance[at] + unevenness(image.sensor)[rows]) * (image.range[at] > 0)
     reflectance = torch.from_numpy(even.astype(np.float32))
     if rng.random() < 0.5:
         metres, reflectance, rays, standing = (part.flip(-1) for part in (metres, reflectance, rays, standing))
         rays[4] *= -1  # the sine of the azimuth
-    assert metres.shape == (ROWS, count)
     return metres, reflectance, rays, standing

@@ -7,6 +7,7 @@ from torch import nn
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet
@@ -34,7 +35,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     fill = FillUNet((width, width * 3 // 2, width * 2, width * 5 // 2), classes=model.classes)
     columns = ColumnTransformer(model.column_channels) if model.column_channels else None
     between = BetweenColumns(model.between_channels) if model.between_channels else None
-    return Cascade(coarse, fill, guide, columns, between)
+    beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
+    return Cascade(coarse, fill, guide, columns, between, beams)
 
 
 def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
@@ -46,7 +48,7 @@ def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
 def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str) -> None:
     """All weights, of equally wide networks; the sensor may differ, and what not all have starts fresh."""
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide", "columns", "between"):
+    for part in ("coarse", "fill", "guide", "columns", "between", "beams"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
 

@@ -32,9 +32,9 @@ class Grain(NamedTuple):
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 # Metres, standard deviation along the ray by class, of the STRAYING share of rays that miss the surface the fill has
 # drawn, for a leaf, a stalk or a branch before or behind it. Chosen by street-2 (docs/training-default.md).
-STRAYING = 1 / 3
+STRAYING = 0.45
 ROUGH = np.zeros(len(CLASSES), np.float32)
-for _name, _metres in {"vegetation": 0.14, "trunk": 0.035, "terrain": 0.05}.items():
+for _name, _metres in {"vegetation": 0.105, "trunk": 0.026, "terrain": 0.0375}.items():
     ROUGH[CLASS_NUMBER[_name]] = _metres
 # What gives a class its speckle, and what gives it to all others.
 _MADE_OF = {"road": "road", "parking": "parking", "sidewalk": "sidewalk", "building": "wall", "fence": "fence",

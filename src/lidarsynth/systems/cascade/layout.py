@@ -12,19 +12,23 @@ from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.between_beams import draw_beams, interleaved, with_between
 from lidarsynth.networks.between_columns import draw_between, joined
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
-from lidarsynth.networks.column_neighbours import Grid, known_grid
+from lidarsynth.networks.column_neighbours import Grid, known_grid, levelled, nearness
 from lidarsynth.networks.column_transformer import draw
-from lidarsynth.networks.rays import decode_range
+from lidarsynth.networks.rays import decode_range, encode_range
 from lidarsynth.streets.hdl64e import unevenness
 from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
 
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT = 16
-FINEST = 4 * COLUMNS  # of the columns between
+SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
+FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion
+# Rows, columns -> what is told of their rays (B, 8, R, C), and their standing elevations (B, R, C).
+RaysOf = Callable[[np.ndarray, np.ndarray], tuple[Tensor, Tensor]]
 
 
 def sampling(network: Cascade, steps: int | None, sampler: str | None) -> tuple[str, int]:
@@ -70,51 +74,94 @@ def grids(
     sensor: Sensor,
     rows: np.ndarray,
     columns: np.ndarray,
-    rays_of: Callable[[np.ndarray], tuple[Tensor, Tensor]],
+    rays_of: RaysOf,
     rng: list[torch.Generator],
     how: tuple[str, int],
     on_step: Callable[[], None],
-) -> tuple[Tensor, Tensor, np.ndarray]:
-    """Metres, 0 for no return, and reflectance, each (B, 16, C), of these rows, and the columns (C,) that were drawn:
+) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
+    """Metres, 0 for no return, and reflectance, each (B, R, C), and the rows (R,) and columns (C,) that were drawn:
     those given, and what is between them where the network draws them.
 
-    rays_of  columns -> what is told of their rays (B, 8, 16, C), and their standing elevations
-    how      as `sampling` says; on_step  called after each
+    how  as `sampling` says; on_step  called after each
     """
-    (told, standing), (sampler, steps) = rays_of(columns), how
-    dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
+    (told, standing), (sampler, steps) = rays_of(rows, columns), how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
         grid = _straight(draw(network.columns, told, rng, on_step), rows, sensor)
-        grid, told, columns = _finer(network, grid, told, columns, rays_of, sensor.width, rng)
-        metres, shade = _metres(grid), evened(grid, told)
-        metres = metres if len(columns) == COLUMNS else along_rings(metres)
-        order = np.argsort(columns)
-        return metres[..., order], ((shade - dim).clamp(0, 1) * grid.returned)[..., order], columns[order]
+        grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
+        grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
+        if len(rows) > ROWS:
+            grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
+        shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
+        dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
+        parts = (_metres(grid), (shade - dim).clamp(0, 1) * grid.returned)
+        return parts[0][..., order], parts[1][..., order], rows, columns[order]
+    dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
     for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
         x_0 = state.x_s
         on_step()
     metres, shade = network.coarse.decode(network.settled(x_0, told), standing, dim)
-    return straightened(metres, rows, sensor), shade, columns
+    return straightened(metres, rows, sensor), shade, rows, columns
 
 
 def _finer(
     network: Cascade,
     grid: Grid,
-    told: Tensor,
+    rows: np.ndarray,
     columns: np.ndarray,
-    rays_of: Callable[[np.ndarray], tuple[Tensor, Tensor]],
+    rays_of: RaysOf,
     width: int,
     rng: list[torch.Generator],
-) -> tuple[Grid, Tensor, np.ndarray]:
+) -> tuple[Grid, np.ndarray]:
     """The grid with twice and four times the columns, as far as a sensor of so many has them, in their order."""
-    while network.between is not None and 2 * len(columns) <= min(FINEST, width):
+    if network.between is None or 2 * len(columns) > width:
+        return grid, columns
+    while 2 * len(columns) <= min(FINEST, width):
         half = (columns + (np.roll(columns, -1) - columns) % width // 2) % width
-        grid = joined(grid, draw_between(network.between, grid, told, rays_of(half)[0], rng))
+        told, between = rays_of(rows, columns)[0], rays_of(rows, half)[0]
+        grid = joined(grid, draw_between(network.between, grid, told, between, rng))
         columns = np.stack([columns, half], 1).ravel()
-        told = rays_of(columns)[0]
-    return grid, told, columns
+    return known_grid(along_rings(_metres(grid)), grid.shade), columns
+
+
+def _taller(
+    network: Cascade,
+    grid: Grid,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    rays_of: RaysOf,
+    rng: list[torch.Generator],
+) -> tuple[Grid, np.ndarray]:
+    """The grid with the beams between its own, twice over, as far as the sensor has one between each two."""
+    while network.beams is not None and len(columns) == FINEST and len(rows) < TALLEST and np.diff(rows).min() > 1:
+        told, rows = rays_of(rows, columns)[0], with_between(rows)
+        grid = interleaved(grid, draw_beams(network.beams, grid, told, rays_of(rows[1::2], columns)[0], rng))
+    return grid, rows
+
+
+def _whole(grid: Grid, rows: np.ndarray, columns: np.ndarray, rays_of: RaysOf, height: int) -> tuple[Grid, np.ndarray]:
+    """The grid with the few beams above its first and below its last, which go on with the planes of the next two."""
+    ends = np.arange(rows[0]), np.arange(rows[-1] + 1, height)
+    ends_of = [beyond(grid, rays_of(rows, columns)[0], rays_of(end, columns)[0], side)
+              for end, side in zip(ends, ((0, 1), (-1, -2)), strict=True)]  # fmt: skip
+    parts = zip(ends_of[0], grid, ends_of[1], strict=True)
+    return Grid(*(torch.cat(part, 1) for part in parts)), np.concatenate([ends[0], rows, ends[1]])
+
+
+def beyond(grid: Grid, rays: Tensor, new: Tensor, side: tuple[int, int]) -> Grid:
+    """Beams of rays (B, 8, E, C) beyond those at `side` of a grid and its rays, the next one and the one behind it.
+
+    On the plane of both where they are of one, else upright on the next one; what returns there, returns.
+    """
+    (near, near2), (slope, slope2) = ([part[:, i : i + 1] if i >= 0 else part[:, i, None] for i in side]
+        for part in (nearness(grid.code, grid.returned, rays), (rays[:, 0] / 3).tan()))  # fmt: skip
+    far = near + (near - near2) * ((new[:, 0] / 3).tan() - slope) / (slope - slope2)
+    plane = (near2 > 0) & ((near / near2.clamp_min(1e-6)).log().abs() < SMOOTH) & (far > 0.3 * near)
+    metres = 1 / (torch.where(plane, far, near).clamp_min(1e-4) * levelled(new))
+    back = grid.returned[:, side[0], None] & (new[:, 6] < 0.5)
+    code = torch.where(back, encode_range(metres), 0)
+    return Grid(code, grid.shade[:, side[0], None] * back, back)
 
 
 def _straight(grid: Grid, rows: np.ndarray, sensor: Sensor) -> Grid:

@@ -20,7 +20,7 @@ from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.coarse_unet import grid_rays
+from lidarsynth.networks.coarse_unet import ROWS, grid_rays
 from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_coherent, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, padded
 from lidarsynth.streets.hdl64e import hidden, written_out
@@ -140,12 +140,12 @@ class CascadeModel(ScanModel):
             raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
         (rows, columns), tell, size = grid_of(self.sensor), on_step or (lambda: None), self.at_once(batch_size)
         count = max(size, block(how))
-        rays_of = partial(self._grid_rays, rows, count=count)
+        rays_of = partial(self._grid_rays, count=count)
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
             grid = grids(self.network, self.sensor, rows, columns, rays_of, rng, how, times(len(wanted), tell))
             for part in wanted:
-                yield from self._filled_grids(grid[0][part], grid[1][part], rows, grid[2], rng[part])
+                yield from self._filled_grids(grid[0][part], grid[1][part], *grid[2:], rng[part])
                 tell()
 
     def resolved(self, how: Filling) -> Filling:
@@ -265,34 +265,34 @@ class CascadeModel(ScanModel):
         return word if word == BY_COLUMNS else sampler
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
-        told, standing = grid_rays(self.sensor, self._blocked, rows, columns)
-        told, standing = (part.to(self._device).expand(count, *part.shape) for part in (told, standing))
-        return told, standing
+        told, standing = (part.to(self._device) for part in grid_rays(self.sensor, self._blocked, rows, columns))
+        return told.expand(count, *told.shape), standing.expand(count, *standing.shape)
 
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
-        """Grids (B, 16, C) as samples of whole images: first the grid's beams, then all between them.
+        """Grids (B, R, C) as whole images. Reflectances are the likeliest, then get the speckle of their class.
 
-        At once, most pixels would know nothing above or below. Reflectances are the likeliest ones, of each beam and
-        then between them, for speckle that is told would go on as stripes; in the end they get that of their class.
+        Of 16 beams, first these are filled, then all between: at once, most would know nothing above or below.
         """
         own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
-        beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
-        drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
-        drawn = agreed(drawn, calm, told[0], columns)
-        shades = shades_of(drawn, calm)
-        if len(rows) < self.sensor.height:
-            told, every = (np.stack([a.range for a in drawn]), shades), np.arange(self.sensor.width)
+        if len(rows) > ROWS:  # little is left to say
+            own = replace(own, labelled=bool(self.experiment.model.classes))
+            drawn = calm = own._between(*told, rows, columns, None)
+        else:
+            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
+            drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
+            drawn = agreed(drawn, calm, told[0], columns)
+        if len(rows) == ROWS < self.sensor.height:
+            told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
             drawn, calm = (own._between(*told, rows, every, noise) for noise in (rng, None))
-            shades = shades_of(drawn, calm)
+        shades = shades_of(drawn, calm)
         read = map(as_read, drawn, shades, rng)
         return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
 
     def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
         """A sample with its sensor's noise, without the labels that nobody asked for."""
-        image = noisy(image, rng)
-        return image if self.labelled else replace(image, label=None)
+        return replace(noisy(image, rng), label=image.label if self.labelled else None)
 
     def _between(
         self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: list | None

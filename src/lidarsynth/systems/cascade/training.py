@@ -13,6 +13,7 @@ from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
@@ -71,7 +72,7 @@ class FillObjective(nn.Module):
 class CoarseObjective(nn.Module):
     """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N);
     `guide`, that of the network that guides; `columns`, negative log-likelihoods of half of the columns; `between`, of
-    every second column of finer grids; of what there is."""
+    every second column of finer grids; `beams`, of every second beam of taller ones; of what there is."""
 
     def __init__(
         self,
@@ -79,9 +80,10 @@ class CoarseObjective(nn.Module):
         guide: CoarseUNet | None = None,
         columns: ColumnTransformer | None = None,
         between: BetweenColumns | None = None,
+        beams: BetweenBeams | None = None,
     ):
         super().__init__()
-        self.network, self.guide, self.columns, self.between = network, guide, columns, between
+        self.network, self.guide, self.columns, self.between, self.beams = network, guide, columns, between, beams
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         metres, reflectance, rays, standing = batch.grids
@@ -102,6 +104,11 @@ class CoarseObjective(nn.Module):
             whole, rays = known_grid(batch.finer.metres, batch.finer.reflectance), batch.finer.rays
             known, hidden = (Grid(*(part[..., k::2] for part in whole)) for k in (0, 1))
             losses["between"] = self.between(known, rays[..., ::2], hidden, rays[..., 1::2]).sum(1)
+        if self.beams is not None:
+            whole, rays = known_grid(batch.taller.metres, batch.taller.reflectance), batch.taller.rays
+            known, hidden = (Grid(*(part[:, k::2] for part in whole)) for k in (0, 1))
+            judged = torch.arange(SEAM, rays.shape[-1] - SEAM, device=rays.device)
+            losses["beams"] = self.beams(known, rays[:, :, ::2], hidden, rays[:, :, 1::2], judged).sum(1)
         return losses
 
 
@@ -226,7 +233,7 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
     if network.guide is not None:
         network.guide.standard.copy_(network.coarse.standard)
     return Phase(FillObjective(network.fill), "fill"), Phase(
-        CoarseObjective(network.coarse, network.guide, network.columns, network.between), "coarse"
+        CoarseObjective(network.coarse, network.guide, network.columns, network.between, network.beams), "coarse"
     )
 
 
@@ -234,8 +241,8 @@ def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.op
     """AdamW for each stage; the coarse one, with all but the fill, at half the rate."""
     assert isinstance(network, Cascade)
     training = experiment.training
-    parts = [part for part in (network.coarse, network.guide, network.columns, network.between) if part is not None]
-    stage = [parameter for part in parts for parameter in part.parameters()]
+    parts = (network.coarse, network.guide, network.columns, network.between, network.beams)
+    stage = [parameter for part in parts if part is not None for parameter in part.parameters()]
     coarse = {"params": stage, "factor": 0.5}
     options = {"lr": training.learning_rate, "betas": training.betas, "weight_decay": 0.01}
     return {"fill": torch.optim.AdamW(network.fill.parameters(), **options),
@@ -268,7 +275,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "layout", "guide", "columns", "between"),
+    parts=("sample", "median", "layout", "guide", "columns", "between", "beams"),
     draw=draw,
     phases=phases,
     judge=judge,

@@ -1,0 +1,202 @@
+"""What draws the beams between those of a grid: told what is known and drawn before, it draws what it says."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.between_beams import STRIDES, BetweenBeams, draw_beams, interleaved, phases, with_between
+from lidarsynth.networks.between_columns import BetweenColumns
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import ROWS, CoarseUNet, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.column_neighbours import Grid, known_grid
+from lidarsynth.networks.column_transformer import ColumnTransformer
+from lidarsynth.networks.fill_unet import FillUNet
+from lidarsynth.networks.pixel_mixture import CODES, TONES, picked
+from lidarsynth.systems.cascade.examples import TALL, WIDE, taller
+from lidarsynth.systems.cascade.layout import beyond, grids
+
+WIDTH = 64
+SENSOR = Sensor("thirty-one", tuple(np.linspace(6, -24, TALL).tolist()), WIDTH, 0.5, 120.0, mount=1.8)
+BLOCKED = np.zeros((TALL, WIDTH), bool)
+BLOCKED[24:, 40:50] = True
+
+
+@pytest.fixture(scope="module")
+def network() -> BetweenBeams:
+    torch.manual_seed(0)
+    return BetweenBeams(14, layers=1, blocks=1).eval()
+
+
+def rays(first: int) -> torch.Tensor:
+    """Of every second beam, two alike."""
+    told, _ = grid_rays(SENSOR, BLOCKED, np.arange(first, TALL, 2), np.arange(WIDTH))
+    return told.expand(2, -1, -1, -1)
+
+
+def seen(normal: tuple[float, float, float], level: float) -> Grid:
+    """The grid (2, 31, 64) of the plane normal . p = level, half of the rays beyond 60 m missed."""
+    nearer = (SENSOR.directions() @ np.array(normal)) / level
+    metres = np.where(nearer > 1 / 60, 1 / np.maximum(nearer, 1 / 60), 0) * ~BLOCKED
+    return known_grid(torch.from_numpy(metres).float().expand(2, -1, -1), torch.full((2, *metres.shape), 0.3))
+
+
+def every_second(grid: Grid, first: int) -> Grid:
+    return Grid(*(part[:, first::2] for part in grid))
+
+
+@pytest.fixture(scope="module")
+def known() -> Grid:
+    return every_second(seen((1.0, 0.4, -0.2), 9.0), 0)
+
+
+def rngs() -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(k) for k in range(2)]
+
+
+@pytest.fixture(scope="module")
+def drawn(network: BetweenBeams, known: Grid) -> Grid:
+    return draw_beams(network, known, rays(0), rays(1), rngs(), sharp=0.5, heats=(1.0, 1.0, 1.0))
+
+
+def test_every_column_is_drawn_once_after_those_it_is_told_of():
+    order = phases(WIDTH)
+    assert [len(part) for part in order] == [8, 8, 16, 32] and len(order) == len(STRIDES)
+    assert torch.cat(order).sort().values.tolist() == list(range(WIDTH))
+
+
+@torch.inference_mode()
+def test_new_beams_are_drawn_as_the_network_says_of_the_whole(network: BetweenBeams, known: Grid, drawn: Grid):
+    chance = torch.stack([torch.rand(5, ROWS - 1, WIDTH, generator=one) for one in rngs()]).clamp(0.001, 0.999)
+    u = chance.permute(0, 2, 3, 1).flatten(0, 2)
+    said, hypotheses, *copies = network.said(known, rays(0), drawn, rays(1), torch.arange(WIDTH))
+    shades = network.shades(said, drawn.code, hypotheses, *copies)
+    returns, choice, centre, scale = (part.flatten(0, 2) for part in said[:4])
+    back = (u[:, 0] < returns.sigmoid()) & (rays(1)[:, 6] < 0.5).flatten()
+    assert (back == drawn.returned.flatten()).all() and 300 < back.sum() < back.numel()
+    assert_close(picked(choice, centre, scale, u[:, 1:3], 0.5, 1, CODES)[back], drawn.code.flatten()[back])
+    shade = picked(*(part.flatten(0, 2) for part in shades), u[:, 3:5], 1, 1, TONES)
+    assert_close(shade[back], drawn.shade.flatten()[back], atol=1e-3, rtol=0)
+    assert not drawn.code[~drawn.returned].any() and not drawn.returned[:, 12:, 40:50].any()
+
+
+@torch.inference_mode()
+def test_a_new_pixel_knows_the_known_ones_and_those_of_earlier_phases_alone(
+    network: BetweenBeams, known: Grid, drawn: Grid
+):
+    def changes(other: Grid, hidden: Grid) -> torch.Tensor:
+        columns = torch.arange(WIDTH)
+        pairs = ((network.said(k, rays(0), h, rays(1), columns)[0]) for k, h in ((known, drawn), (other, hidden)))
+        return torch.stack([(a - b).abs().reshape(2, ROWS - 1, WIDTH, -1).amax((0, 3))
+                            for a, b in zip(*(pair[:4] for pair in pairs), strict=True)]).amax(0) > 1e-5  # fmt: skip
+
+    def changed(grid: Grid, column: int) -> Grid:
+        other = Grid(*(part.clone() for part in grid))
+        other.code[:, 7, column], other.shade[:, 7, column], other.returned[:, 7, column] = 0.3, 0.7, True
+        return other
+
+    for column, told in ((16, {12, 20, 14, 18, 15, 17}), (20, {18, 22, 19, 21}), (22, {21, 23}), (23, set())):
+        after = changes(known, changed(drawn, column))
+        assert set(after[7].nonzero()[:, 0].tolist()) == told and after.sum() == after[7].sum()
+    around = changes(changed(known, 20), drawn)
+    assert around[6:8, 18:23].any() and not around[:, :9].any() and not around[:, 31:].any()
+
+
+@pytest.mark.parametrize(
+    ("normal", "level", "which"),
+    [((0.0, 0.0, 1.0), -1.8, (0, 3, 4, 5)), ((0.03, 0.02, 1.0), -1.8, (3, 4, 5, 9)), ((1.0, 0.4, 0.0), 9.0, (1, 2, 3))],
+)
+def test_hypotheses_of_surfaces_are_exact(
+    network: BetweenBeams, normal: tuple[float, float, float], level: float, which: tuple[int, ...]
+):
+    whole = seen(normal, level)
+    known, hidden = every_second(whole, 0), every_second(whole, 1)
+    said = network.said(known, rays(0), hidden, rays(1), torch.arange(WIDTH))[1]
+    judged = hidden.returned & (hidden.code < 0.4)
+    judged[:, -4:] = False  # those below are known, and none of them blocked
+    for one in which:
+        off = (said[..., one] - hidden.code).abs()[judged]
+        assert off.numel() > 50 and float(off.median()) < 1e-3, one
+
+
+def test_the_mean_likelihood_is_of_what_is_free_and_judged(network: BetweenBeams, known: Grid, drawn: Grid):
+    one = network(known, rays(0), drawn, rays(1))
+    assert one.shape == (2, 3) and torch.isfinite(one).all()
+    hidden = Grid(*(part.clone() for part in drawn))
+    hidden.code[:, 12:, 40:50] = 0.5  # blocked: no return, and never told
+    assert_close(network(known, rays(0), hidden, rays(1)), one)
+    halves = [network(known, rays(0), drawn, rays(1), torch.arange(k, WIDTH, 2)) for k in (0, 1)]
+    assert_close((halves[0] + halves[1])[:, 0] / 2, one[:, 0], rtol=1e-2, atol=0)
+
+
+def test_what_is_between_is_in_its_place(known: Grid, drawn: Grid):
+    both = interleaved(known, drawn)
+    assert torch.equal(both.code[:, ::2], known.code) and torch.equal(both.returned[:, 1::2], drawn.returned)
+    assert with_between(np.array([2, 6, 11])).tolist() == [2, 4, 6, 8, 11]
+
+
+@pytest.mark.parametrize(
+    ("beams", "width", "shape"),
+    [(16, 520, (16, 512)), (30, 520, (16, 512)), (31, 520, (31, 512)), (32, 520, (32, 512)), (40, 520, (33, 512)),
+     (64, 520, (64, 512)), (128, 520, (68, 512)), (64, 300, (16, 256))],
+)  # fmt: skip
+def test_grids_are_as_tall_as_the_sensor_has_beams(
+    network: BetweenBeams, beams: int, width: int, shape: tuple[int, int]
+):
+    """All of 31, 32 or 64 beams; of 40, 31 and the two beyond them; of 128, 61 and seven; of fewer, 16."""
+    torch.manual_seed(1)
+    sensor = Sensor("any", tuple(np.linspace(6, -24, beams).tolist()), width, 0.5, 120.0, mount=1.8)
+    blocked, rows, columns = np.zeros((beams, width), bool), grid_rows(beams), grid_columns(width)
+    blocked[-1, 30:90] = True
+    between = BetweenColumns(16, layers=1, blocks=1).eval()
+    columns_first = ColumnTransformer(16, layers=1, pixel=16, blocks=1).eval()
+    coarse, fill = CoarseUNet(16, (1, 1, 1, 1), 1).eval(), FillUNet((16, 16), (1, 1)).eval()
+
+    def rays_of(chosen: np.ndarray, which: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        told, standing = grid_rays(sensor, blocked, chosen, which)
+        return told.expand(2, -1, -1, -1), standing.expand(2, -1, -1)
+
+    drawn = partial(grids, sensor=sensor, rows=rows, columns=columns, rays_of=rays_of, how=("columns", 128))
+    parts = (coarse, fill, None, columns_first, between)
+    tall = drawn(Cascade(*parts, network), rng=rngs(), on_step=lambda: None)
+    plain = drawn(Cascade(*parts), rng=rngs(), on_step=lambda: None)
+    metres, shade, chosen, places = tall
+    assert metres.shape == shade.shape == (2, *shape) and (len(chosen), len(places)) == shape
+    assert chosen.tolist() == sorted(set(chosen.tolist())) and set(rows) <= set(chosen)
+    kept = np.isin(chosen, rows)
+    assert torch.equal(metres[:, kept], plain[0])
+    assert torch.isfinite(metres).all() and not shade[metres == 0].any()
+    assert not metres[:, np.ix_(chosen, places)[0][:, 0] == beams - 1][..., blocked[-1, places]].any()
+
+
+def test_what_is_beyond_goes_on_with_the_plane_or_stands_upright():
+    for normal, level in (((0.0, 0.0, 1.0), -1.8), ((1.0, 0.4, 0.0), 9.0)):
+        whole = seen(normal, level)
+        told = grid_rays(SENSOR, BLOCKED, np.arange(TALL), np.arange(WIDTH))[0].expand(2, -1, -1, -1)
+        for inner, outer, side in ((slice(2, None), slice(0, 2), (0, 1)), (slice(None, 29), slice(29, None), (-1, -2))):
+            grid, truth = (Grid(*(part[:, rows] for part in whole)) for rows in (inner, outer))
+            found = beyond(grid, told[:, :, inner], told[:, :, outer], side)
+            both = found.returned & truth.returned & (truth.code < 0.4)
+            assert (found.returned == truth.returned)[..., 10:14].all()
+            assert not both.any() or float((found.code - truth.code).abs()[both].max()) < 2e-3
+
+
+def test_taller_grids_of_training_have_each_beam_with_its_own_rays():
+    sensor = Sensor("any", tuple(np.linspace(6, -24, 64).tolist()), 1024, 0.5, 120.0, mount=1.8)
+    metres = np.repeat(np.arange(1.0, 65)[:, None], 1024, 1)
+    image = RangeImage(metres, np.full(metres.shape, 0.5), np.ones(metres.shape, bool), sensor)
+    for fine, step in ((False, 2), (True, 1)):
+        found, shade, told, standing = taller(image, np.random.default_rng(2), fine)
+        assert found.shape == shade.shape == standing.shape == (TALL, WIDE)
+        rows = found[:, 0].numpy().astype(int) - 1
+        assert (np.diff(rows) == step).all()
+        elevations = np.radians(np.asarray(sensor.elevations)[rows])
+        assert np.allclose(told[0, :, 0].numpy() / 3, elevations, atol=1e-5)
+    few = Sensor("few", tuple(np.linspace(6, -24, 16).tolist()), 1024, 0.5, 120.0, mount=1.8)
+    image = RangeImage(metres[:16], np.full((16, 1024), 0.5), np.ones((16, 1024), bool), few)
+    found, _, told, _ = taller(image, np.random.default_rng(2), True)
+    assert not found.any() and (told[6] == 1).all()
