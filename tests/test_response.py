@@ -125,7 +125,7 @@ def test_known_reflectances_are_calm_on_their_own_surface():
     found, lit = calm(image.reflectance, image, known), known & mask
     assert not found[~lit].any()
     others = lit & (np.arange(64) != 10)
-    assert np.abs(found - even)[others].mean() < 0.6 * np.abs(shades - even)[others].mean()
+    assert np.abs(found - even)[others].mean() < 0.8 * np.abs(shades - even)[others].mean()
     assert np.allclose(found[lit & (np.arange(64) == 10)], 0.9)
     assert np.abs(found - even)[others].max() < 0.2
 

@@ -46,7 +46,7 @@ from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, sp
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, STEPS_DEFAULT, block, grids, sampling, times, velocity
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
-from lidarsynth.systems.cascade.speckle import calm
+from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -185,13 +185,13 @@ class CascadeModel(ScanModel):
             metres, reflectance, told = own._holes(metres, reflectance, told, rng, how, on_step)
         noise = None if how.method == "conditional" else rng
         if noise is None:
-            reflectance, rays = calm(reflectance, image, known), own.response.told(rays_told(self.sensor))
+            reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
+            rays = own.response.told(rays_told(self.sensor))
             own = replace(own, response=tried(own.response, self.network.fill, image, known, reflectance, rays))
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
         filled = filled if noise is None else self._recorded(filled, rng[0])
-        if on_step is not None:
-            on_step()
+        (on_step or (lambda: None))()
         return with_known(filled, image, known, keep_reflectance=lit)
 
     def upsample(

@@ -12,21 +12,22 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.networks.fill_unet import ring
 
 # Columns to either side, the natural logarithm of ranges that differ as on one surface, and how far of the way to the
-# median: chosen on streets of other sensors and real training scans (docs/training-default.md).
-REACH, ALIKE, SHARE = 4, 0.2, 0.7
+# median, for a sensor whose beams are measured and for others: chosen on streets of other sensors and real training
+# scans. More errs less, but classes are read worse from it (docs/training-default.md).
+REACH, ALIKE, SHARE, ELSEWHERE = 4, 0.2, 0.35, 0.7
 
 
-def calm(reflectance: np.ndarray, image: RangeImage, known: np.ndarray) -> np.ndarray:
+def calm(reflectance: np.ndarray, image: RangeImage, known: np.ndarray, share: float = SHARE) -> np.ndarray:
     """`calmed` reflectances (H, W) of an image's known returns, known (H, W) bool; others are 0."""
     lit = known & image.mask
     rows = lit.any(1)
     parts = (torch.from_numpy(part[rows])[None, None] for part in (reflectance, image.range, lit))
     calmer = np.zeros_like(reflectance)
-    calmer[rows] = calmed(*parts)[0, 0].numpy()
+    calmer[rows] = calmed(*parts, share)[0, 0].numpy()
     return calmer
 
 
-def calmed(reflectance: Tensor, metres: Tensor, lit: Tensor) -> Tensor:
+def calmed(reflectance: Tensor, metres: Tensor, lit: Tensor, share: float = SHARE) -> Tensor:
     """(B, 1, H, W) reflectances of returns `lit`, each nearer to the median of those around it on its ring that are
     about as far, so that its own speckle does not go on to the beams between; others are 0."""
     width = reflectance.shape[-1]
@@ -40,4 +41,4 @@ def calmed(reflectance: Tensor, metres: Tensor, lit: Tensor) -> Tensor:
     ranked = torch.where(there, values, math.inf).sort(0).values
     middle = ((there.sum(0) - 1) // 2).clamp_min(0)
     median = ranked.gather(0, middle[None])[0]
-    return torch.where(lit, torch.lerp(reflectance, torch.where(lit, median, 0.0), SHARE), 0.0)
+    return torch.where(lit, torch.lerp(reflectance, torch.where(lit, median, 0.0), share), 0.0)
