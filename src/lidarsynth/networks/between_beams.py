@@ -102,7 +102,7 @@ def draw_beams(
     chance = chance.to(rays.device).clamp(0.001, 0.999).permute(0, 2, 3, 1)  # (B, R - 1, C, 5)
     around = network.context(known, rays)
     hidden = Grid(*(torch.zeros(shape, dtype=part.dtype, device=rays.device) for part in known))
-    for columns in phases(shape[2]):
+    for columns in (part.to(rays.device) for part in phases(shape[2])):
         told, u, ray = told_of(known, rays, hidden, between, columns), chance[:, :, columns], between[..., columns]
         drawn = network.pixel(told.features, around[:, :, columns], told.ranges, told.valid)
         code = one_of((drawn.choice, drawn.centre, drawn.scale), u[..., 1:3], sharp, heats[0], CODES)

@@ -154,8 +154,8 @@ def beyond(grid: Grid, rays: Tensor, new: Tensor, side: tuple[int, int]) -> Grid
 
     On the plane of both where they are of one, else upright on the next one; what returns there, returns.
     """
-    (near, near2), (slope, slope2) = ([part[:, i : i + 1] if i >= 0 else part[:, i, None] for i in side]
-        for part in (nearness(grid.code, grid.returned, rays), (rays[:, 0] / 3).tan()))  # fmt: skip
+    told = nearness(grid.code, grid.returned, rays), (rays[:, 0] / 3).tan()
+    (near, near2), (slope, slope2) = ([part[:, i, None] for i in side] for part in told)
     far = near + (near - near2) * ((new[:, 0] / 3).tan() - slope) / (slope - slope2)
     plane = (near2 > 0) & ((near / near2.clamp_min(1e-6)).log().abs() < SMOOTH) & (far > 0.3 * near)
     metres = 1 / (torch.where(plane, far, near).clamp_min(1e-4) * levelled(new))

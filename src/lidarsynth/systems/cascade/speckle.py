@@ -23,7 +23,7 @@ def calm(reflectance: np.ndarray, image: RangeImage, known: np.ndarray, share: f
     rows = lit.any(1)
     parts = (torch.from_numpy(part[rows])[None, None] for part in (reflectance, image.range, lit))
     calmer = np.zeros_like(reflectance)
-    calmer[rows] = calmed(*parts, share)[0, 0].numpy()
+    calmer[rows] = calmed(*parts, share=share)[0, 0].numpy()
     return calmer
 
 
