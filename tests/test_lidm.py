@@ -124,7 +124,9 @@ def test_a_scan_drawn_twice_loses_what_the_published_functions_lose(scan64: byte
     once = corner_image(points)
     twice = corner_image(drawn_and_coded(points))
     kept = (once > 0) & (twice > 0) & (np.abs(once - twice) < 1e-2)
-    assert ((once > 0).sum(), (twice > 0).sum(), kept.sum()) == (52679, 49670, 45905)
+    # The codes' last bit is numpy's log2 and exp2, which round otherwise with AVX-512 (the first) than without.
+    counts = int((once > 0).sum()), int((twice > 0).sum()), int(kept.sum())
+    assert counts in ((52679, 49670, 45905), (52679, 50122, 47082))
 
 
 def test_pixels_ranges_and_gates_of_the_corner_grid():
