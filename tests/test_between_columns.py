@@ -5,13 +5,14 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from planes import plane_grid
 from torch.testing import assert_close
 
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_columns import BetweenColumns, draw_between, joined
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, CoarseUNet, grid_columns, grid_rays
-from lidarsynth.networks.column_neighbours import Grid, known_grid
+from lidarsynth.networks.column_neighbours import Grid
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
 from lidarsynth.networks.pixel_mixture import CODES, TONES, picked
@@ -35,10 +36,7 @@ def rays(first: int) -> torch.Tensor:
 
 
 def seen(normal: tuple[float, float, float], level: float) -> Grid:
-    """The grid (2, 16, 256) of the plane normal . p = level, half of the rays beyond 60 m missed."""
-    nearer = (SENSOR.directions() @ np.array(normal)) / level
-    metres = np.where(nearer > 1 / 60, 1 / np.maximum(nearer, 1 / 60), 0) * ~BLOCKED
-    return known_grid(torch.from_numpy(metres).float().expand(2, -1, -1), torch.full((2, *metres.shape), 0.3))
+    return plane_grid(SENSOR, BLOCKED, normal, level)
 
 
 def every_second(grid: Grid, first: int) -> Grid:

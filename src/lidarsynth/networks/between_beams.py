@@ -127,14 +127,14 @@ def interleaved(known: Grid, hidden: Grid) -> Grid:
 
 
 def strides(columns: Tensor) -> Tensor:
-    """How far from each of these columns those are that are drawn before it, 0 for the first."""
+    """(n,): how many columns from each of these (n,) to those drawn before it on either side, 0 for the first."""
     place = columns % 8
     stride = torch.where(place % 2 == 1, 1, torch.where(place % 4 == 2, 2, 4))
     return torch.where(place == 0, 0, stride)
 
 
 def phases(count: int) -> list[Tensor]:
-    """The columns of `count` that are drawn together, one after the other."""
+    """Indices of the columns, of `count`, that are drawn together: four tensors, one after the other."""
     columns = torch.arange(count)
     return [columns[strides(columns) == stride] for stride in STRIDES]
 
