@@ -2,10 +2,11 @@
 
 python benchmarks/street_classes.py --why FOLDER          real scans with one thing made as the streets have it
 python benchmarks/street_classes.py --confusion FOLDER    what each class is taken for
-python benchmarks/street_classes.py --scans 960 --minutes 35 --geometry --judge FOLDER... --unlabelled FOLDER
+python benchmarks/street_classes.py --scans 2400 --minutes 65 --geometry --judge FOLDER... --unlabelled FOLDER
 
 The third goes on training the network of street-1 on streets as recorded on many days (`streets/recordings.py`), with
-`--geometry` told what a pixel's neighbours say of its surface (`street_geometry.py`). No real label is learned from;
+`--geometry` told what a pixel's neighbours say of its surface (`street_geometry.py`). `--keep FILE` writes the weights,
+and goes on from them where the file is there, best with another `--seed` of streets. No real label is learned from;
 `--unlabelled` gives the batch normalisations the statistics of real scans without labels (AdaBN). `--scans 0` trains
 nothing. Folders are read as `benchmarks/street.py --classes` reads them.
 """
@@ -209,7 +210,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=0, help="of streets to learn from")
     parser.add_argument("--minutes", type=float, default=15)
+    parser.add_argument("--seed", type=int, default=31, help="of these streets")
     parser.add_argument("--geometry", action="store_true")
+    parser.add_argument("--keep", type=Path, help="weights to go on from, and to write")
     parser.add_argument("--why", type=Path, help="folder of labelled scans")
     parser.add_argument("--confusion", type=Path, help="folder of labelled scans")
     parser.add_argument("--judge", type=Path, nargs="+", default=[])
@@ -223,8 +226,12 @@ def main() -> None:
                 *(taken_for(network, args.confusion) if args.confusion else ())]:  # fmt: skip
         print(row, flush=True)
     reader = Reader(args.geometry).eval()
+    if args.keep and args.keep.exists():
+        reader.load_state_dict(torch.load(args.keep, weights_only=True))
     if args.scans:
-        reader = trained(reader, list(varied(31, args.scans)), args.minutes)
+        reader = trained(reader, list(varied(args.seed, args.scans)), args.minutes)
+    if args.keep:
+        torch.save(reader.state_dict(), args.keep)
     print(judged(reader, args.judge), flush=True)
     if args.unlabelled:
         reader = adapted(reader, reader.inputs(unlabelled(args.unlabelled)))

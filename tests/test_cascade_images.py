@@ -38,6 +38,12 @@ def test_rays_between_two_that_agree_do_as_they_do():
     assert (lit.range[:, 22:39:2] == 7).all() and (lit.reflectance[:, 22:39:2] == np.float32(0.7)).all()
     (dark,) = agreed([everything], [nothing], metres, every, columns)
     assert dark.mask[:, 20:41].all() and dark.mask.sum() == 16 * 21
+    known = replace(
+        nothing, range=np.repeat(metres[0], 2, 1), reflectance=full / 20, mask=np.repeat(metres[0] > 0, 2, 1)
+    )
+    known.range[:, ::2], known.mask[:, ::2] = 0, False
+    (beside,) = agreed([known], [nothing], metres, every, columns)  # nobody knows better than the one to the left
+    assert (beside.range[:, 21:40] == 9).all() and np.allclose(beside.reflectance[:, 22:39:2], 0.35)
     (half,) = agreed([everything], [nothing], metres[:, ::2], every[::2], columns)
     assert np.array_equal(half.mask[::2], dark.mask[::2]) and half.mask[1::2].all()  # beams between are as they were
     sparse = metres[..., ::2]

@@ -104,7 +104,7 @@ def agreed(
     metres         (B, R, C), 0 for no return, of rows (R,) and columns (C,), which rise; where these are only 128, too
                    much may be between them
 
-    A ray between two that return has the likeliest range, where the sample has none.
+    A ray between two that return has the likeliest range, where the sample has none, or that to the left.
     """
     if len(columns) <= COLUMNS:
         return drawn
@@ -114,10 +114,10 @@ def agreed(
     for sample, likely, known in zip(drawn, calm, metres > 0, strict=True):
         both, either = np.zeros(sample.shape, bool), np.ones(sample.shape, bool)
         both[rows], either[rows] = known[:, left] & known[:, right], known[:, left] | known[:, right]
-        lost = both & ~sample.mask & likely.mask
+        lost = both & ~sample.mask
         mask = (sample.mask | lost) & either
         pairs = zip((sample.range, sample.reflectance), (likely.range, likely.reflectance), strict=True)
-        ranges, shades = (np.where(lost, b, a) * mask for a, b in pairs)
+        ranges, shades = (np.where(lost, np.where(likely.mask, b, a[:, columns[left]]), a) * mask for a, b in pairs)
         images.append(replace(sample, range=ranges, reflectance=shades, mask=mask))
     return images
 
