@@ -68,24 +68,17 @@ class ColumnTransformer(PixelDrawer):
         """columns  (n,) indices of those that are judged, for less work; None = all
         seen     what is told of pixels drawn before, None = what they are: see `spoilt`
         """
-        return self.judged(grid, rays, columns, seen)[0]
-
-    def judged(
-        self, grid: Grid, rays: Tensor, columns: Tensor | None = None, seen: Grid | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """What `forward` says, (B, 4), and of each pixel that is judged how likely the like of it is, (B, 16, n): the
-        log chance to draw it, as far within 3 %."""
         here, seen = slice(None) if columns is None else columns, seen or grid
         plan = openness(grid)
         around = self.context(seen, rays, plan)[:, None, here]  # (B, 1, 128, D)
         expected = ranges_expected(seen, rays)
         features = told(seen, rays, *expected, plan)[:, :, here]  # (B, 16, 128, F)
         hypotheses, valid, copies, copied = (part[:, :, here] for part in (*expected, *shades_expected(seen)))
-        part, free = Grid(*(part[:, :, here] for part in grid)), rays[:, 6, :, here] < 0.5
+        grid, free = Grid(*(part[:, :, here] for part in grid)), rays[:, 6, :, here] < 0.5
         drawn = self.pixel(features, around, hypotheses, valid)
-        mean = self.unlikelihood(drawn, part, hypotheses, copies, copied, free)
+        mean = self.unlikelihood(drawn, grid, hypotheses, copies, copied, free)
         entropy = F.cross_entropy(self.levels(plan, rays).transpose(1, 2), plan, reduction="none")
-        return torch.cat([mean, 0.1 * entropy.mean(1, keepdim=True)], 1), self.alike(drawn, part, free)
+        return torch.cat([mean, 0.1 * entropy.mean(1, keepdim=True)], 1)
 
     def levels(self, plan: Tensor, rays: Tensor) -> Tensor:
         """(B, 16, 24) logits of each sector's level, by the levels (B, 16) of those before it."""

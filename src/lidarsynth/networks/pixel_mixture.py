@@ -14,7 +14,6 @@ from lidarsynth.networks.column_neighbours import Grid
 
 # Lowest, highest, and how many bins between them: of the range code (8 % of the range each) and of reflectance.
 CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
-NEAR = 0.01  # of the code, 3 % of a range: a draw so near to another is like it
 SHARPEST, SHARPEST_SHADE = 0.0005, 0.003  # scales of logistic distributions, of code (2 cm at 10 m) and reflectance
 
 
@@ -80,12 +79,6 @@ class PixelDrawer(nn.Module, ABC):
         parts = (back * free, torch.where(returned, far, 0), torch.where(returned, lit, 0))
         return torch.stack([part.sum((1, 2)) for part in parts], 1) / free.sum((1, 2)).clamp_min(1)[:, None]
 
-    def alike(self, drawn: Drawn, grid: Grid, free: Tensor) -> Tensor:
-        """(B, H, W): log chance to draw what the grid has, returning or not, as far within NEAR; 0 where not `free`."""
-        back = -F.binary_cross_entropy_with_logits(drawn.returns, grid.returned.float(), reduction="none")
-        far = chance_near(grid.code, drawn.choice, drawn.centre, drawn.scale, CODES)
-        return back * free + torch.where(grid.returned & free, far, 0)
-
 
 def _among(choice: Tensor, valid: Tensor) -> Tensor:
     """Log shares of scores (..., H + bins), of which the hypotheses that say something (..., H) count."""
@@ -113,16 +106,6 @@ def mixture(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tupl
     place = ((x - low) / (high - low) * bins).long().clamp(0, bins - 1)
     free = choice[..., centre.shape[-1] :].gather(-1, place[..., None]) + math.log(bins / (high - low))
     return torch.cat([named, free], -1).logsumexp(-1)
-
-
-def chance_near(x: Tensor, choice: Tensor, centre: Tensor, scale: Tensor, span: tuple[float, float, int]) -> Tensor:
-    """Log chance (...) that a draw of `mixture` is within NEAR of x (...), a bin's share being even around it."""
-    low, high, bins = span
-    z, reach = (x[..., None] - centre) / scale, NEAR / scale
-    within = (torch.sigmoid(z + reach) - torch.sigmoid(z - reach)).clamp_min(1e-8)
-    place = ((x - low) / (high - low) * bins).long().clamp(0, bins - 1)
-    free = choice[..., centre.shape[-1] :].gather(-1, place[..., None]) + math.log(2 * NEAR * bins / (high - low))
-    return torch.cat([choice[..., : centre.shape[-1]] + within.log(), free], -1).logsumexp(-1)
 
 
 def picked(

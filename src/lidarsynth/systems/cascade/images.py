@@ -97,14 +97,14 @@ def weighted(
 
 
 def agreed(
-    drawn: list[RangeImage], calm: list[RangeImage], metres: np.ndarray, rows: np.ndarray, columns: np.ndarray
+    drawn: list[RangeImage], calm: list[RangeImage], metres: np.ndarray, columns: np.ndarray
 ) -> list[RangeImage]:
     """Samples whose rays between two known ones of a beam that agree whether they return, do as they do.
 
-    metres         (B, R, C), 0 for no return, of rows (R,) and columns (C,), which rise; where these are only 128, too
-                   much may be between them
+    metres   (B, H, C), 0 for no return, of these columns; where they are only 128, too much may be between them
+    columns  (C,), rising
 
-    A ray between two that return has the likeliest range, where the sample has none, or that to the left.
+    A ray between two that return has the likeliest range, where the sample has none.
     """
     if len(columns) <= COLUMNS:
         return drawn
@@ -112,13 +112,11 @@ def agreed(
     right = np.where(np.isin(np.arange(len(left)), columns), left, (left + 1) % len(columns))
     images = []
     for sample, likely, known in zip(drawn, calm, metres > 0, strict=True):
-        both, either = np.zeros(sample.shape, bool), np.ones(sample.shape, bool)
-        both[rows], either[rows] = known[:, left] & known[:, right], known[:, left] | known[:, right]
-        lost = both & ~sample.mask
-        mask = (sample.mask | lost) & either
-        pairs = zip((sample.range, sample.reflectance), (likely.range, likely.reflectance), strict=True)
-        ranges, shades = (np.where(lost, np.where(likely.mask, b, a[:, columns[left]]), a) * mask for a, b in pairs)
-        images.append(replace(sample, range=ranges, reflectance=shades, mask=mask))
+        lost = known[:, left] & known[:, right] & ~sample.mask & likely.mask
+        mask = (sample.mask | lost) & (known[:, left] | known[:, right])
+        both = zip((sample.range, sample.reflectance), (likely.range, likely.reflectance), strict=True)
+        metres, shades = (np.where(lost, b, a) * mask for a, b in both)
+        images.append(replace(sample, range=metres, reflectance=shades, mask=mask))
     return images
 
 

@@ -278,16 +278,16 @@ class CascadeModel(ScanModel):
         own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
         if len(rows) > ROWS:  # little is left to say
             own = replace(own, labelled=bool(self.experiment.model.classes))
-            calm = own._between(*told, rows, columns, None)
-            drawn = agreed(calm, calm, told[0], rows, columns)
+            drawn = calm = own._between(*told, rows, columns, None)
         else:
-            beams, every = replace(own, sensor=own.sensor.rows(rows.tolist())), np.arange(len(rows))
-            drawn, calm = (beams._between(*told, every, columns, noise) for noise in (rng, None))
-            drawn = agreed(drawn, calm, told[0], every, columns)
+            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
+            drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
+            drawn = agreed(drawn, calm, told[0], columns)
         if len(rows) == ROWS < self.sensor.height:
             told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
             drawn, calm = (own._between(*told, rows, every, noise) for noise in (rng, None))
-        read = map(as_read, drawn, shades_of(drawn, calm), rng)
+        shades = shades_of(drawn, calm)
+        read = map(as_read, drawn, shades, rng)
         return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
 
     def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
