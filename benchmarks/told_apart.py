@@ -67,7 +67,7 @@ class Judge(nn.Module):
 
 
 def both(cascade: Cascade, count: int) -> tuple[Grid, Grid, Tensor]:
-    """`count` true grids, as many drawn ones, and their rays."""
+    """`count` true grids (B, 16, 128), as many drawn ones, and their rays (B, 8, 16, 128)."""
     assert cascade.columns is not None
     streets, rng, drawn = VirtualStreets(SEED, 1 << 40), np.random.default_rng(SEED), []
     metres, reflectance, rays = map(
@@ -80,12 +80,13 @@ def both(cascade: Cascade, count: int) -> tuple[Grid, Grid, Tensor]:
     return true, Grid(*(torch.cat(part).clone() for part in zip(*drawn, strict=True))), rays
 
 
-def taken(whole: Grid, chosen: Tensor) -> Grid:
+def taken(whole: Grid, chosen: Tensor | slice) -> Grid:
+    """Some of the grids."""
     return Grid(*(part[chosen] for part in whole))
 
 
 def learned(true: Grid, drawn: Grid, rays: Tensor, steps: int) -> Judge:
-    """A judge of these grids."""
+    """A judge of these grids (B, 16, 128), after so many steps of BATCH of either kind."""
     judge, rng = Judge(), torch.Generator().manual_seed(0)
     optimizer = torch.optim.AdamW(judge.parameters(), RATE, weight_decay=0.01)
     for step in range(steps):
