@@ -1,5 +1,6 @@
 """The cascade: rays and candidates by closed forms, what is known stays, any sensor goes in and out."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -518,3 +519,18 @@ def test_a_scan_is_the_same_bit_by_bit_whatever_the_count_and_the_start(
     for one, other in zip(three, four, strict=False):
         np.testing.assert_array_equal(one.range, other.range)
         np.testing.assert_array_equal(one.reflectance, other.reflectance)
+
+
+def test_completion_asks_the_fill_of_least_error_and_generation_the_other(model: CascadeModel):
+    streets = SyntheticStreets(5, 1, SMALL)
+    image = streets.image(0)
+    known = corrupt(image, "beams:4")
+    network = copy.copy(model.network)
+    network._modules = dict(model.network._modules)
+    network.likeliest = FillUNet((16, 16, 16, 16)).eval()
+    torch.nn.init.normal_(network.likeliest.out.weight, std=0.02)
+    other = replace(model, network=network)
+    plain, likely = (one.complete(image.keep(known), known) for one in (model, other))
+    assert np.abs(plain.range - likely.range)[~known].max() > 0.01
+    a, b = (one.complete(image.keep(known), known, method="sample", seed=1) for one in (model, other))
+    np.testing.assert_array_equal(a.range, b.range)

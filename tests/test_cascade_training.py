@@ -1,10 +1,12 @@
 """The cascade's training: proper scores, patterns, standards, and a run of the command line's own loop."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch.testing import assert_close
 
 from lidarsynth.experiment.presets import preset
@@ -17,8 +19,8 @@ from lidarsynth.networks.fill_unet import Filled, Known
 from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import training as cascade_training
-from lidarsynth.systems.cascade.examples import crop, pattern
-from lidarsynth.systems.cascade.training import absolute_errors, energy_score, fit_standard, misnamed
+from lidarsynth.systems.cascade.examples import crop, mixed, pattern
+from lidarsynth.systems.cascade.training import absolute_errors, energy_score, expected_errors, fit_standard, misnamed
 from lidarsynth.training import monitor
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
@@ -64,6 +66,43 @@ def test_absolute_errors_count_hidden_returns_of_the_sensor_alone():
     assert_close(absolute_errors(filled, known, rays, metres, metres / 50), torch.zeros(1), atol=1e-5, rtol=0)
     code[:, :, 8, 30] += 0.1
     assert absolute_errors(Filled(code, *filled[1:]), known, rays, metres, metres / 50).item() > 0
+
+
+def test_expected_errors_are_those_of_the_result_where_the_answer_is_sure():
+    sensor = SENSORS["vlp-16"]
+    rays = rays_of(sensor, sensor.blocked_rays(), np.arange(64))
+    shape = rays.elevation.shape
+    metres, none = torch.full(shape, 10.0), torch.zeros(shape, dtype=torch.bool)
+    metres[..., 32:] = 0
+    known = Known(torch.zeros(shape), torch.zeros(shape), none, none, none)
+    sure = torch.where(metres > 0, 50.0, -50.0)
+
+    def errors(logit: torch.Tensor, off: float = 0.0) -> float:
+        filled = Filled(encode_range(torch.full(shape, 10.0 + off)), torch.full(shape, 0.5), logit)
+        return expected_errors(filled, known, rays, metres, 0.5 * (metres > 0)).item()
+
+    assert errors(sure) == pytest.approx(0, abs=1e-4)
+    step = 1.5 * (np.log2(12) - np.log2(11)) / 4
+    assert errors(sure, 1.0) == pytest.approx(0.25 * 0.5 + step, rel=1e-3)  # half of the pixels return
+    assert errors(-sure) > 0.25 * 10 + 4 * 0.5  # all are wrong, by 10 m and by the reflectance
+
+
+def test_an_arc_of_another_scan_of_the_same_sensor_is_mixed_in():
+    class Pair(list):
+        def take(self, indices):
+            return [self[i] for i in indices]
+
+    one, other = (RangeImage(np.full((4, 1024), r, np.float32), np.full((4, 1024), r / 9, np.float32),
+                             np.ones((4, 1024), bool), SENSORS["vlp-16"].rows(range(4)))
+                  for r in (1, 2))  # fmt: skip
+    rng = np.random.default_rng(0)
+    found = [mixed(one, Pair([other]), 0.5, rng) for _ in range(40)]
+    shares = [float((image.range == 2).mean()) for image in found]
+    assert 8 < sum(share > 0 for share in shares) < 32 and max(shares) <= 0.5
+    assert all(((image.range == 2) == (image.reflectance > 0.2)).all() for image in found)
+    assert (one.range == 1).all()
+    elsewhere = replace(other, sensor=replace(other.sensor, mount=9.0))
+    assert mixed(one, Pair([elsewhere]), 1.0, rng) is one and mixed(one, Pair([other]), 0.0, rng) is one
 
 
 STREETS = VirtualStreets(6, 32)  # holds its world, so that it is built once
@@ -147,13 +186,30 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
     for progress in run(TINY, "virtual", tmp_path / "run", options=Options(workers=0)):
         before = before or progress
     losses = progress.losses
-    assert {"sample", "median", "layout", "guide", "columns", "between", "beams"} <= losses.keys()
+    assert {"sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams"} <= losses.keys()
     assert all(np.isfinite(value) for value in losses.values())
     from lidarsynth import load
 
     model = load(tmp_path / "run")
     assert model.network.columns is not None and model.network.between is not None and model.network.beams is not None
     assert model.generate(1, steps=1)[0].shape == (64, 1024)
+
+
+@pytest.mark.slow
+def test_with_a_base_the_fill_of_least_error_alone_is_learned_and_kept(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    from lidarsynth import load
+
+    monkeypatch.setattr(monitor, "IMAGES", 1)
+    few = {"training.batch_size": 2, "training.steps": 2, "training.warmup": 0}
+    for progress in run(
+        with_fields(preset("kitti"), few), "virtual", tmp_path / "run", "default", options=Options(workers=0)
+    ):
+        assert progress.step == 0 or set(progress.losses) == {"loss", "likeliest"}
+    kept = load_file(tmp_path / "run" / "model.safetensors")
+    assert kept and all(name.startswith("likeliest.") for name in kept)
+    before, after = (load(source).network.state_dict() for source in ("default", tmp_path / "run"))
+    changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"likeliest"}
 
 
 def test_what_columns_are_told_of_their_neighbours_is_spoilt_at_times_and_never_what_they_learn():

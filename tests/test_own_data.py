@@ -24,7 +24,7 @@ from lidarsynth.systems.table import load_folder as load
 DOC = REPO_ROOT / "docs" / "own-data.md"
 SHOWN = blocks(DOC.read_text())
 SMALLER = (  # besides those of the README
-    (r"train default --from default", "train tiny --from start"),
+    (r"train tuned --from default", "train tiny --from start"),
     (r"training\.steps=\d+", "training.steps=2"),
     (r"(train .*)", r"\1 --threads 1 --workers 0 --sample-every 2"),
     (r"(data files .*)", r"\1 --workers 0"),
@@ -69,7 +69,7 @@ def test_the_walk_through_walks(folder: Path, monkeypatch: pytest.MonkeyPatch, c
     assert "found 32 rings from +15.0 to -25.0 degrees" in said["info scans/000000.pcd"]
     assert CachedImages(folder / "cache/mine").sensor == read_sensor(folder / "my-lidar.toml")
     experiment, _ = load(folder / "runs/mine")
-    assert (experiment.data.height, experiment.data.width, experiment.data.roll) == (32, 64, True)
+    assert (experiment.data.height, experiment.data.width) == (32, 64)
     assert "4 images of files" in experiment.card.data and str(folder) not in str(experiment)
     assert len(read(folder / "generated/000000.pcd")) > 100 and (folder / "generated/000000.png").exists()
     assert len(read(folder / "dense.pcd")) >= len(read(folder / "scans/000000.pcd"))

@@ -86,9 +86,10 @@ def test_a_card_tells_its_own_family(name: str):
 
 
 def test_all_of_the_augmentation_is_told():
+    changes = {"data.roll": True, "data.mirror": True, "data.scale": 0.15, "data.mix": 0.8}
     assert (
         "| augmentation | roll, mirror, worlds up to 15% larger or smaller, a sector of another scan in 80% of those "
-        "to be completed |" in card_of(preset("kitti"))
+        "to be completed |" in card_of(with_fields(preset("kitti-streets"), changes))
     )
 
 

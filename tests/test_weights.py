@@ -259,7 +259,7 @@ def test_shipped_words_come_first_and_a_path_is_still_reachable(tmp_path, monkey
     experiment = preset("tiny")
     network = build_network(experiment)
     save(tmp_path / "package" / "shipped" / "tiny", experiment, network, half=True)
-    monkeypatch.setattr(weights, "files", lambda package: tmp_path / "package")
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "package" / "shipped")
     assert shipped() == {"tiny": tmp_path / "package" / "shipped" / "tiny"}
     assert load_parts("tiny")[0] == experiment
     monkeypatch.chdir(tmp_path)
@@ -421,3 +421,11 @@ def test_the_cache_is_the_users_and_the_names_are_the_paper_rows(monkeypatch, tm
     (tmp_path / ".cache" / "lidarsynth").mkdir(parents=True)
     assert cache_folder() == tmp_path / ".cache" / "lidarsynth", "what earlier versions downloaded is found"
     assert {"r2dm-a-kitti360", "r2dm-h-kitti360", "r2dm-h-kittiraw"} <= set(RELEASES)
+
+
+@pytest.mark.parametrize("base", ["nobody", "kitti", "../shipped/default", "/etc"])
+def test_a_base_is_of_the_shipped_weights_that_have_none(tmp_path, base):
+    experiment, network = load_parts("kitti")
+    save(tmp_path / "m", replace(experiment, base=base), network, half=True)
+    with pytest.raises(ValueError, match=r"expected a base of shipped weights that have none, found"):
+        load_parts(tmp_path / "m")

@@ -14,16 +14,21 @@ from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import whole_file
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
+OWN = "likeliest."  # how the weights are called that a model with a base does not share with it
 
 
 def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
-    """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete."""
+    """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete.
+
+    Of an experiment with a `base`, the weights that are not the base's.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     dtype = torch.float16 if half else torch.float32
     # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
     exact = {name for name, _ in network.named_buffers()}
-    weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in network.state_dict().items()}
+    own = {k: v for k, v in network.state_dict().items() if not experiment.base or k.startswith(OWN)}
+    weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in own.items()}
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
         file.write_bytes(serialized(weights))  # save_file would hide it from other users

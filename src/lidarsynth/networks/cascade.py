@@ -27,6 +27,7 @@ class Cascade(nn.Module):
     columns  draws such a grid column by column, for generation; `coarse` alone can go around what is known
     between  draws the columns between those, twice over
     beams    draws the beams between those, then, twice over
+    likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
     """
 
     def __init__(
@@ -37,10 +38,16 @@ class Cascade(nn.Module):
         columns: ColumnTransformer | None = None,
         between: BetweenColumns | None = None,
         beams: BetweenBeams | None = None,
+        likeliest: FillUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
-        self.beams = beams
+        self.beams, self.likeliest = beams, likeliest
+
+    @property
+    def surest(self) -> FillUNet:
+        """The fill for the image of least error: `likeliest` where there is one."""
+        return self.fill if self.likeliest is None else self.likeliest
 
     def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         """What `coarse` answers, led away from the guide's answer."""

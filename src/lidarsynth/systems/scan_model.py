@@ -264,6 +264,11 @@ class ScanModel(ABC):
         """`fill` of a scan of `sensor_in`, drawn into `sparse`; here without a look at its own beams."""
         return self.fill(sparse, known, how, on_step)
 
+    @property
+    def tuned(self) -> bool:
+        """Whether the network saw real scans of this very sensor last."""
+        return self.experiment.card.sensor == self.sensor.name
+
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""
         name = sensor if isinstance(sensor, str) else sensor.name

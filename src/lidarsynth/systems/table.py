@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 
-from lidarsynth.experiment.folder import RECORD, WEIGHTS, read_experiment
+from lidarsynth.experiment.folder import OWN, RECORD, WEIGHTS, read_experiment
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
@@ -27,6 +28,8 @@ from lidarsynth.systems.segmentation.family import RANGENET
 from lidarsynth.systems.system import Official, System
 from lidarsynth.systems.upsampling.family import ILN_SYSTEM, LIDAR_SR, LIIF_SYSTEM
 from lidarsynth.training.task import Task
+
+SHIPPED = Path(str(files("lidarsynth") / "shipped"))  # folders of the weights inside the package
 
 SYSTEMS: dict[str, System] = {
     "cascade": CASCADE,
@@ -119,8 +122,12 @@ def official_readers() -> dict[str, Official]:
 
 
 def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
-    """A saved model: its experiment and its network. Raises ValueError when either file is not as it should be."""
+    """A saved model: its experiment and its network. Raises ValueError when either file is not as it should be.
+
+    Of one with a `base`, the weights that it shares are read from that, which must be shipped and have no base itself.
+    """
     experiment, path = read_experiment(folder), Path(folder) / WEIGHTS
+    shared = _shared(experiment, str(folder))
     with Undrawn():
         network = build_network(experiment)
     try:
@@ -130,5 +137,16 @@ def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
         raise ValueError(f"{folder}: expected {WEIGHTS} beside {RECORD}, found none") from None
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: expected safetensors weights, found {error}") from None
-    load_weights(network, weights, str(path))
+    load_weights(network, {**shared, **weights}, str(path))
     return experiment, network
+
+
+def _shared(experiment: Experiment, folder: str) -> dict[str, Tensor]:
+    """The weights that an experiment has from its base, by name."""
+    if not experiment.base:
+        return {}
+    bases = {home.name: home for home in SHIPPED.iterdir() if (home / RECORD).is_file()}
+    own = bases.get(experiment.base)
+    if own is None or read_experiment(own).base:
+        raise ValueError(f"{folder}: expected a base of shipped weights that have none, found {experiment.base!r:.60}")
+    return {name: value for name, value in load_file(own / WEIGHTS).items() if not name.startswith(OWN)}

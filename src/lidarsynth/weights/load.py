@@ -6,7 +6,6 @@ R2DM's format is dict(cfg, weights, ema_weights, optimizer, lr_scheduler, global
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
 from lidarsynth.systems.hub import fetch, is_repository
 from lidarsynth.systems.scan_model import ScanModel
-from lidarsynth.systems.table import assemble, build_network, load_folder
+from lidarsynth.systems.table import SHIPPED, assemble, build_network, load_folder
 from lidarsynth.weights.download import OnBytes, cache_folder, download
 from lidarsynth.weights.official import read_official
 
@@ -72,8 +71,7 @@ def _load_release(word: str, ema: bool, on_bytes: OnBytes | None) -> tuple[Exper
 
 def shipped() -> dict[str, Path]:
     """Word -> folder of the weights inside the package."""
-    folder = Path(str(files("lidarsynth") / "shipped"))
-    return {path.parent.name: path.parent for path in sorted(folder.glob(f"*/{RECORD}"))}
+    return {path.parent.name: path.parent for path in sorted(SHIPPED.glob(f"*/{RECORD}"))}
 
 
 def _unknown(source: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sized
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -65,8 +66,10 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     samples = generation_count(experiment.training, step)
     seeds = tuple(sample_seed(seed, step, position) for position in positions)
     rngs = [np.random.default_rng(number) for number in seeds]
-    pairs = zip(taken, rngs, positions, strict=True)
-    crops = [crop(image, rng, position < samples) for image, rng, position in pairs]
+    crops = []
+    for image, rng, position in zip(taken, rngs, positions, strict=True):
+        shown = image if position < samples else mixed(image, images, experiment.data.mix, rng)
+        crops.append(crop(shown, rng, position < samples, experiment.training.upsampling_share))
     grids = [grid(image, rng) for image, rng in zip(taken, rngs, strict=True)]
     wide = 4 * COLUMNS if step % 2 and min(image.shape[1] for image in taken) >= 4 * COLUMNS else 2 * COLUMNS
     finer = [grid(image, np.random.default_rng((n, wide)), wide) for image, n in zip(taken, seeds, strict=True)]
@@ -82,12 +85,31 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     )
 
 
-def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Known, Rays, tuple[Tensor, ...]]:
+def mixed(image: RangeImage, images: Images, share: float, rng: np.random.Generator) -> RangeImage:
+    """The image; with the chance `share`, an arc of it is that of another one of the same sensor (PolarMix, Xiao et al.
+    2022), anywhere in the turn. Streets, which have no number, are not mixed."""
+    if not share or not isinstance(images, Sized) or rng.random() >= share:
+        return image
+    other = images.take([int(rng.integers(len(images)))])[0]
+    if other.sensor != image.sensor:
+        return image
+    width = image.shape[1]
+    arc = (int(rng.integers(width)) + np.arange(int(rng.integers(1, width // 2 + 1)))) % width
+    parts = [part.copy() for part in (image.range, image.reflectance, image.mask)]
+    for part, others in zip(parts, (other.range, other.reflectance, other.mask), strict=True):
+        part[:, arc] = others[:, arc]
+    return RangeImage(*parts, image.sensor)
+
+
+def crop(
+    image: RangeImage, rng: np.random.Generator, sampled: bool, upsampling: float = 0.0
+) -> tuple[Known, Rays, tuple[Tensor, ...]]:
     """Known pixels, rays, and the truth (metres, reflectance, class), each (1, 1, 64, 256), of a part of an image.
 
     A world somewhat larger or smaller, seen in a mirror half of the time, with reflectances of another response; the
     carrier is unknown at times, and the tilt and the beams' dimness, since users do not know theirs either. At times
     all surfaces are known but not which of them return, as in a simulator's scan; or everything is, for the classes.
+    A share `upsampling` of what is not `sampled` knows every fourth beam instead.
     """
     first = sampled and rng.random() < FIRST
     sensor, rows = _window(image.sensor, rng, first)
@@ -107,6 +129,8 @@ def crop(image: RangeImage, rng: np.random.Generator, sampled: bool) -> tuple[Kn
     surface, kind = image.surface, rng.random()
     perfect = surface is not None and not first and kind < (0.2 if sampled else 0.1)
     told[:] = ~np.bool_(perfect) & (told | (not sampled and kind > 0.94))
+    if upsampling and not sampled and rng.random() < upsampling:
+        told, perfect = every_beam(metres.shape, 4, int(rng.integers(4))), False
     if rng.random() < 0.4 and kind <= 0.94:
         told &= metres > 0
     told = told & ~hole if unaware else told | hole

@@ -33,7 +33,7 @@ class FillGraph(nn.Module):
     def __init__(self, model: CascadeModel, open_columns: bool):
         super().__init__()
         self.model, self.open_columns, sensor = model, open_columns, model.sensor
-        self.fill = model.network.fill
+        self.fill = model.network.surest
         blocked = hidden(sensor)
         rays = rays_of(sensor, blocked, dimness=dimness(sensor))
         if open_columns:
@@ -59,7 +59,7 @@ class FillGraph(nn.Module):
         metres = decode_range(filled.code)[:, :, : sensor.height, : range.shape[3]]
         answers = filled.logit[:, :, : sensor.height, : range.shape[3]] > 0
         answers = answers & (metres <= sensor.max_range) & (metres >= sensor.min_range) & ~self._buffer("closed")
-        shade = AS_STREETS._replace(plain=MEASURED).mixed(filled)
+        shade = AS_STREETS._replace(plain=0.0 if self.model.tuned else MEASURED).mixed(filled)
         shade = shade[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
         answers = returned | (answers & ~told)
         full = torch.where(answers, torch.where(returned, range, metres), 0.0)

@@ -186,8 +186,8 @@ class CascadeModel(ScanModel):
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
-            rays = own.response.told(rays_told(self.sensor))
-            own = replace(own, response=tried(own.response, self.network.fill, image, known, reflectance, rays))
+            rays, fill = own.response.told(rays_told(self.sensor)), self.network.surest
+            own = replace(own, response=tried(own.response, fill, image, known, reflectance, rays, self.tuned))
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
         filled = filled if noise is None else self._recorded(filled, rng[0])
@@ -272,12 +272,11 @@ class CascadeModel(ScanModel):
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
         """Grids (B, R, C) as whole images. Reflectances are the likeliest, then get the speckle of their class.
-
         Of 16 beams, first these are filled, then all between: at once, most would know nothing above or below.
         """
-        own, told = replace(self, sensor=written_out(self.sensor)), (metres.cpu().numpy(), reflectance.cpu().numpy())
+        own = replace(self, sensor=written_out(self.sensor), labelled=bool(self.experiment.model.classes))
+        told = metres.cpu().numpy(), reflectance.cpu().numpy()
         if len(rows) > ROWS:  # little is left to say
-            own = replace(own, labelled=bool(self.experiment.model.classes))
             drawn = calm = own._between(*told, rows, columns, None)
         else:
             beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
@@ -389,7 +388,8 @@ class CascadeModel(ScanModel):
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-            return self.network.fill(known, rays, noise.to(device), classify, doubt, reach, lost), rays
+            fill = self.network.fill if classify or rng is not None else self.network.surest
+            return fill(known, rays, noise.to(device), classify, doubt, reach, lost), rays
 
     @property
     def _blocked(self) -> np.ndarray:

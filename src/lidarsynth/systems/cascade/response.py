@@ -95,16 +95,23 @@ def response_of(image: RangeImage, known: np.ndarray) -> Response:
 
 
 def tried(
-    response: Response, fill: FillUNet, image: RangeImage, told: np.ndarray, reflectance: np.ndarray, rays: Rays
+    response: Response,
+    fill: FillUNet,
+    image: RangeImage,
+    told: np.ndarray,
+    reflectance: np.ndarray,
+    rays: Rays,
+    tuned: bool = False,
 ) -> Response:
     """The response with a share of the mean: half of the way from the usual one to that which suits the scan. Every
     second known beam of a part of the turn, ahead, is hidden and filled, and the share taken that errs least.
 
     told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. Of a sensor whose
-    beams are measured, and where fewer than four beams return enough, 1/4; where no reflectance is known, none.
+    beams are measured, and where fewer than four beams return enough, 1/4, without which classes are read worse; where
+    no reflectance is known, and for a fill that was `tuned` to scans of the sensor, none.
     """
     returned = told & image.mask
-    if not image.reflectance[returned].any():
+    if tuned or not image.reflectance[returned].any():
         return response
     rows = np.flatnonzero(returned.sum(1) >= ENOUGH)
     hidden = np.zeros_like(told)

@@ -19,12 +19,13 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
 from lidarsynth.networks.column_neighbours import Grid, known_grid, spoilt
 from lidarsynth.networks.column_transformer import ColumnTransformer
-from lidarsynth.networks.fill_unet import Filled, FillUNet, Known, draw_noise
+from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, decode_range, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import CascadeBatch, Crops, draw, grid
 from lidarsynth.systems.cascade.layout import BOUND
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.speckle import calmed
 from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
 from lidarsynth.training.task import Phase, Task
@@ -67,6 +68,22 @@ class FillObjective(nn.Module):
         filled = self.network(known, rays, noise, classify=learns)
         errors = absolute_errors(filled, known, rays, metres, reflectance)
         return errors + 0.2 * misnamed(filled, rays, classes) if learns else errors
+
+
+class LikeliestObjective(nn.Module):
+    """`objective(batch)` -> `likeliest` (n,): `expected_errors` of the crops that are not drawn."""
+
+    def __init__(self, network: FillUNet):
+        super().__init__()
+        self.network = network
+
+    def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
+        known, rays, metres, reflectance, _ = _part(batch.crops, slice(batch.crops.samples, None))
+        if not len(metres):
+            return {"likeliest": metres[:, 0, 0, 0]}
+        known = known._replace(reflectance=calmed(known.reflectance, known.metres, known.lit))
+        filled = self.network(known, rays, metres.new_zeros(len(metres), NOISES, *metres.shape[2:]))
+        return {"likeliest": expected_errors(filled, known, rays, metres, reflectance)}
 
 
 class CoarseObjective(nn.Module):
@@ -130,6 +147,24 @@ def absolute_errors(filled: Filled, known: Known, rays: Rays, metres: Tensor, re
     shade = _mean((filled.reflectance - _dark(reflectance, returned)).abs(), ~known.lit & inside & returned)
     drop = _mean(F.binary_cross_entropy_with_logits(filled.logit, returned.float(), reduction="none"), hidden)
     return 2 * code + 0.1 * far + 6 * shade + 0.5 * drop
+
+
+def expected_errors(filled: Filled, known: Known, rays: Rays, metres: Tensor, reflectance: Tensor) -> Tensor:
+    """(b,): errors of hidden pixels as they are judged, where an empty one counts as 0 m and reflects nothing, by the
+    chance of returning; with those of `absolute_errors`, less of each.
+
+    So what may as well be empty is nearer, and is empty where that errs less.
+    """
+    inside, returned = rays.inside > 0, metres > 0
+    hidden = ~known.told & ~known.returned & inside
+    chance, far = torch.sigmoid(2 * filled.logit), decode_range(filled.code)
+    off = torch.where(returned, chance * (far - metres).abs() + (1 - chance) * metres, chance * far)
+    dark = (filled.reflectance - reflectance).abs()
+    shade = torch.where(returned, chance * dark + (1 - chance) * reflectance, chance * filled.reflectance.abs())
+    code = _mean((filled.code - encode_range(metres)).abs(), hidden & returned)
+    lit = _mean(dark, ~known.lit & inside & returned)
+    drop = _mean(F.binary_cross_entropy_with_logits(filled.logit, returned.float(), reduction="none"), hidden)
+    return 1.5 * code + 0.25 * _mean(off, hidden) + 4 * _mean(shade, hidden) + 3 * lit + 0.35 * drop
 
 
 def _dark(reflectance: Tensor, returned: Tensor) -> Tensor:
@@ -225,28 +260,41 @@ def fit_standard(network: CoarseUNet, images: Sequence[RangeImage]) -> None:
 
 
 def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
-    """The fill's part and the coarse stage's; the standards of a fresh coarse stage are measured on virtual streets."""
+    """The fills' parts and the coarse stage's; the standards of a fresh coarse stage are measured on virtual streets.
+
+    With a base, the part alone of what is not shared with it.
+    """
     assert isinstance(network, Cascade)
+    likeliest = () if network.likeliest is None else (Phase(LikeliestObjective(network.likeliest), "likeliest"),)
+    if experiment.base:
+        return likeliest
     if bool((network.coarse.standard[1] == 1).all()):
         streets = VirtualStreets(experiment.training.seed + 1, FITTED)
         fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
     if network.guide is not None:
         network.guide.standard.copy_(network.coarse.standard)
-    return Phase(FillObjective(network.fill), "fill"), Phase(
-        CoarseObjective(network.coarse, network.guide, network.columns, network.between, network.beams), "coarse"
-    )
+    parts = (network.coarse, network.guide, network.columns, network.between, network.beams)
+    return Phase(FillObjective(network.fill), "fill"), Phase(CoarseObjective(*parts), "coarse"), *likeliest
 
 
 def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.optim.Optimizer]:
-    """AdamW for each stage; the coarse one, with all but the fill, at half the rate."""
+    """AdamW for each stage; the coarse one, with all but the fills, at half the rate.
+
+    With a base, for what is not shared with it.
+    """
     assert isinstance(network, Cascade)
     training = experiment.training
     parts = (network.coarse, network.guide, network.columns, network.between, network.beams)
     stage = [parameter for part in parts if part is not None for parameter in part.parameters()]
     coarse = {"params": stage, "factor": 0.5}
     options = {"lr": training.learning_rate, "betas": training.betas, "weight_decay": 0.01}
-    return {"fill": torch.optim.AdamW(network.fill.parameters(), **options),
-            "coarse": torch.optim.AdamW([coarse], **options)}  # fmt: skip
+    learned: dict[str, torch.optim.Optimizer] = {}
+    if not experiment.base:
+        learned["fill"] = torch.optim.AdamW(network.fill.parameters(), **options)
+        learned["coarse"] = torch.optim.AdamW([coarse], **options)
+    if network.likeliest is not None:
+        learned["likeliest"] = torch.optim.AdamW(network.likeliest.parameters(), **options)
+    return learned
 
 
 @torch.no_grad()
@@ -275,7 +323,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "layout", "guide", "columns", "between", "beams"),
+    parts=("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams"),
     draw=draw,
     phases=phases,
     judge=judge,
