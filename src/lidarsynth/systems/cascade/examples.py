@@ -95,10 +95,13 @@ def mixed(image: RangeImage, images: Images, share: float, rng: np.random.Genera
         return image
     width = image.shape[1]
     arc = (int(rng.integers(width)) + np.arange(int(rng.integers(1, width // 2 + 1)))) % width
-    parts = [part.copy() for part in (image.range, image.reflectance, image.mask)]
-    for part, others in zip(parts, (other.range, other.reflectance, other.mask), strict=True):
-        part[:, arc] = others[:, arc]
-    return RangeImage(*parts, image.sensor)
+    taken = np.isin(np.arange(width), arc)
+    return RangeImage(
+        np.where(taken, other.range, image.range),
+        np.where(taken, other.reflectance, image.reflectance),
+        np.where(taken, other.mask, image.mask),
+        image.sensor,
+    )
 
 
 def crop(
