@@ -553,7 +553,7 @@ def test_the_examples_run(kind: str, data: Path, tmp_path: Path):
     table_of = benchmark(kind, written(tmp_path / "b.toml", text), tmp_path / "out", ls.load, data=shown)
     names = [row[0] for row in cells(table_of, "## ")]
     assert {"upsampling": "kitti-streets, 1 step", "generation": "default by flow matching, 1 step"}[kind] in names
-    assert len(names) == {"upsampling": 8, "generation": 5}[kind]
+    assert len(names) == {"upsampling": 9, "generation": 5}[kind]
 
 
 def test_the_commands_of_the_results_name_files_that_are_there():
