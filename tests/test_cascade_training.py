@@ -201,9 +201,7 @@ def test_with_a_base_the_fill_of_least_error_alone_is_learned_and_kept(tmp_path,
 
     monkeypatch.setattr(monitor, "IMAGES", 1)
     few = {"training.batch_size": 2, "training.steps": 2, "training.warmup": 0}
-    for progress in run(
-        with_fields(preset("kitti"), few), "virtual", tmp_path / "run", "default", options=Options(workers=0)
-    ):
+    for progress in run(with_fields(preset("kitti"), few), "virtual", tmp_path / "run", options=Options(workers=0)):
         assert progress.step == 0 or set(progress.losses) == {"loss", "likeliest"}
     kept = load_file(tmp_path / "run" / "model.safetensors")
     assert kept and all(name.startswith("likeliest.") for name in kept)

@@ -24,7 +24,7 @@ from lidarsynth.systems.table import load_folder as load
 DOC = REPO_ROOT / "docs" / "own-data.md"
 SHOWN = blocks(DOC.read_text())
 SMALLER = (  # besides those of the README
-    (r"train tuned --from default", "train tiny --from start"),
+    (r"train tuned", "train tiny --from start"),
     (r"training\.steps=\d+", "training.steps=2"),
     (r"(train .*)", r"\1 --threads 1 --workers 0 --sample-every 2"),
     (r"(data files .*)", r"\1 --workers 0"),

@@ -216,7 +216,7 @@ def default() -> Experiment:
 
 
 def tuned() -> Experiment:
-    """The shipped `default` for scans of one's own (`--from default`): its fill of least error goes on alone."""
+    """The shipped `default` for scans of one's own: its fill of least error goes on alone."""
     start = default()
     return replace(
         start,

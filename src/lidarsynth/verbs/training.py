@@ -81,7 +81,8 @@ def run(
 
     The first yield says where the run stands: at 0, or at the step of the newest checkpoint; that is continued exactly,
     or, with more `training.steps`, extended: behind the checkpoint the learning rate is that of the longer run.
-    weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet
+    weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet; where the
+                experiment has a base, from that
     validation  cache of images that are not trained on
     resume      insist that there is a checkpoint
 
@@ -148,6 +149,7 @@ def _begin(
     saved, note = newest_whole(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
+    weights = weights or experiment.base
     if weights and not saved:
         source, trained = load_parts(weights)
         transfer(network, experiment, trained, source, weights)
