@@ -13,7 +13,7 @@ from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks import fill_unet
-from lidarsynth.networks.candidates import candidates
+from lidarsynth.networks.candidates import BEND, candidates
 from lidarsynth.networks.cascade import GUIDANCE, Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet, grid_columns, grid_rays, grid_rows, left_filled
 from lidarsynth.networks.column_transformer import ColumnTransformer
@@ -113,6 +113,13 @@ def test_what_stands_beside_is_one_surface_where_it_goes_on_straight_and_two_at_
         assert_close(codes[5:7, column], metres[0, 0, 12, column].expand(2), rtol=2e-3, atol=0)
     edge = [metres[0, 0, 12, column] for column in (100, 104)]
     assert_close(codes[5:7, 102], torch.stack(edge), rtol=1e-5, atol=0)
+    step = torch.where(torch.arange(256) < 102, 10.0, 11.0).expand(metres.shape)  # a mean errs least, a draw is no mean
+    both = (
+        decode_range(candidates(step, torch.zeros_like(step), told, told, rays, bend).code) for bend in (BEND, BEND / 2)
+    )
+    mean, drawn = (codes[0, 5:7, 12, 102] for codes in both)
+    assert (mean > 10.3).all() and (mean < 10.7).all()
+    assert_close(drawn, torch.tensor([10.0, 11.0]), rtol=1e-4, atol=0)
 
 
 def test_generated_grids_get_flat_ground_and_upright_walls_and_keep_their_edges():

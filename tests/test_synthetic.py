@@ -15,6 +15,7 @@ from lidarsynth.streets.objects import library
 from lidarsynth.streets.raycast import one_by_one
 from lidarsynth.streets.reader import SyntheticStreets, Worlds
 from lidarsynth.streets.turn import attitudes, world_rays
+from lidarsynth.streets.varied import VariedStreets
 from lidarsynth.streets.virtual import WIDEST, VirtualStreets
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
@@ -188,6 +189,20 @@ def test_a_pair_is_the_perfect_scan_and_todays_image():
         assert np.median(apart) < 0.04 and (apart < 0.5).mean() > 0.97
         assert (perfect.label == seen.label)[both].mean() > 0.97
         assert not perfect.mask[hdl64e.hidden(seen.sensor)].any()
+
+
+def test_varied_streets_differ_in_density_and_roughness_and_depend_on_their_number_alone():
+    streets, again = VariedStreets(6, 400), VariedStreets(6, 400)
+    green = {streets.density(number).vegetation for number in range(24)}
+    kerbs = [streets.density(number).kerbs for number in range(24)]
+    rough = [streets.sensor(index).optics.rough for index in range(0, 96, 4)]
+    assert green == {1, 2, 3} and min(kerbs) < 0.5 < max(kerbs) and 1 in kerbs
+    assert min(rough) < 0.4 and rough.count(1.0) in range(2, 16)
+    kitti = [s for s in (streets.sensor(index) for index in range(0, 400, 4)) if s.sensor.name == "hdl-64e-kitti"]
+    assert any(s.sensor.elevations != SENSORS["hdl-64e-kitti"].elevations for s in kitti)
+    late = again.image(33)  # another world than that of 2
+    np.testing.assert_array_equal(streets.image(2).range, again.image(2).range)
+    np.testing.assert_array_equal(streets.image(33).range, late.range)
 
 
 def test_packets_meet_what_single_rays_meet():

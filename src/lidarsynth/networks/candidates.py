@@ -19,7 +19,8 @@ SHIFTS = (0, -1, 1, -2, 2)  # rows in which the nearest value at all is sought, 
 NOWHERE = 1 << 30  # eighths of squared pixels
 STEEPEST = 1e-3  # cosine of an elevation: a dome's beam may look straight up
 # One surface to the left and right: how much 1 / range changes from one to the other at most, and how far from straight
-# it goes on to the next known pixel on either side, as a share of that change and of 1 / range. Chosen on streets.
+# it goes on to the next known pixel on either side, as a share of that change and of 1 / range. Chosen on streets: an
+# edge bends by all of the change, and there the mean errs least; what is drawn is one or the other, by half of BEND.
 STEEP, BEND, LEAST = 0.2, 1.0, 0.01
 
 
@@ -35,7 +36,9 @@ class Candidates(NamedTuple):
 
 
 @torch.no_grad()
-def candidates(metres: Tensor, reflectance: Tensor, returned: Tensor, lit: Tensor, rays: Rays) -> Candidates:
+def candidates(
+    metres: Tensor, reflectance: Tensor, returned: Tensor, lit: Tensor, rays: Rays, bend: float = BEND
+) -> Candidates:
     """Hypotheses from the known returns.
 
     metres, reflectance (B, 1, H, W), looked at where `returned` and `lit` (B, 1, H, W) bool: a known return, and one
@@ -43,7 +46,7 @@ def candidates(metres: Tensor, reflectance: Tensor, returned: Tensor, lit: Tenso
     known pixel's are what is known: the work is done for the others.
     """
     around = _nearest(returned)
-    codes = _laid(_codes(metres, around, rays), encode_range(metres), returned, around.place)
+    codes = _laid(_codes(metres, around, rays, bend), encode_range(metres), returned, around.place)
     near = _laid(around.found / (1 + around.distance), torch.ones_like(metres), returned, around.place)
     around = around if _same(lit, returned) else _nearest(lit)
     return Candidates(codes, _laid(_reflectances(reflectance, around), reflectance, lit, around.place), near)
@@ -66,7 +69,7 @@ class _Around(NamedTuple):
     sides: _Sides
 
 
-def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
+def _codes(metres: Tensor, around: _Around, rays: Rays, bend: float) -> Tensor:
     """(10, N) range codes."""
     found, distance, source = around.found, around.distance, around.source
     r, tilt = metres.flatten()[source], rays.elevation.expand_as(metres).flatten()
@@ -91,21 +94,24 @@ def _codes(metres: Tensor, around: _Around, rays: Rays) -> Tensor:
     grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
     nearest = torch.where(around.some, encode_range(metres.flatten()[around.nearest]), sides[2])
     if torch.compiler.is_exporting() or bool((found[2] & found[3]).any()):
-        flat = _one_surface(metres, around)  # there all that is taken over from the side would make steps
+        flat = _one_surface(metres, around, bend)  # there all that is taken over from the side would make steps
         sides = torch.cat([sides[:2], torch.where(flat, beside, sides[2:])])
         nearest = torch.where(flat, beside, nearest)
     return torch.cat([torch.stack([cross, column, plane]), sides, grounds, nearest[None]])
 
 
-def _one_surface(metres: Tensor, around: _Around) -> Tensor:
-    """(N,) bool: whether the pixels to the left and right lie on one plane, along which 1 / range is straight."""
+def _one_surface(metres: Tensor, around: _Around, most: float) -> Tensor:
+    """(N,) bool: whether the pixels to the left and right lie on one plane, along which 1 / range is straight.
+
+    most  how far from straight, as a share of the change from left to right
+    """
     beyond, apart = _beyond(around)
     left, right, before, after = (1 / metres.flatten()[torch.cat([around.source[2:], beyond])]).clamp(max=10)
     between = (around.distance[2] + around.distance[3]).clamp_min(1)
     step = right - left
     bends = ((left - before) / apart[0] * between - step, (after - right) / apart[1] * between - step)
     bend = torch.minimum(bends[0].abs(), bends[1].abs())
-    straight = (step.abs() < STEEP * left) & (bend < BEND * step.abs() + LEAST * left)
+    straight = (step.abs() < STEEP * left) & (bend < most * step.abs() + LEAST * left)
     return around.found[2] & around.found[3] & straight
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarsynth.networks.candidates import RANGE_CANDIDATES, REFLECTANCE_CANDIDATES, Candidates, candidates
+from lidarsynth.networks.candidates import BEND, RANGE_CANDIDATES, REFLECTANCE_CANDIDATES, Candidates, candidates
 from lidarsynth.networks.rays import Rays, decode_range, encode_range
 
 STEM = (4, 2)  # rows, columns of the patches that become channels
@@ -103,7 +103,8 @@ class FillUNet(nn.Module):
     """`forward(known, rays, noise) -> Filled`, for any number of beams in multiples of 32 and columns of 16.
 
     noise (B, NOISES, H, W): zeros for the most likely image, which errs least; `draw_noise` for a sample, which has
-    the grain of a recorded scan; lost: the noise of returning, where it is another. For each pixel the network chooses
+    the grain of a recorded scan; lost: the noise of returning, where it is another;
+    bend: of `candidates`. For each pixel the network chooses
     among `candidates` by a softmax, corrects the choice, and says whether the ray returns at all; and, if it has
     learned `classes`, of which class the surface is.
     In use, not in training, a choice closer than `reach` (of the code) to a candidate is that candidate, and ranges
@@ -144,10 +145,11 @@ class FillUNet(nn.Module):
         doubt: bool = False,
         reach: float = SNAP,
         lost: Tensor | None = None,
+        bend: float = BEND,
     ) -> Filled:
         with torch.no_grad():
             even = (known.reflectance + rays.dimness) * known.lit
-            guesses = candidates(known.metres, even, known.returned, known.lit, rays)
+            guesses = candidates(known.metres, even, known.returned, known.lit, rays, bend)
             x = _to_patches(inputs(known, rays, guesses, noise))
         top = h = self.stem(x)
         kept = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -30,12 +31,14 @@ class Grain(NamedTuple):
 # Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
 # `realise`'s.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
-# Metres, standard deviation along the ray by class, of the STRAYING share of rays that miss the surface the fill has
-# drawn, for a leaf, a stalk or a branch before or behind it. Chosen by street-2 (docs/training-default.md).
-STRAYING = 0.45
-ROUGH = np.zeros(len(CLASSES), np.float32)
-for _name, _metres in {"vegetation": 0.105, "trunk": 0.026, "terrain": 0.0375}.items():
-    ROUGH[CLASS_NUMBER[_name]] = _metres
+# Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
+# before or behind it: of some rays, of a few more, as a crown is deep, and of the others none. Chosen by street-2
+# (docs/training-default.md), where streets have 0.08, 0.035 and 0.02 for all of them.
+STRAYING = {"vegetation": ((0.72, 0.08), (0.03, 0.4)), "terrain": ((1.0, 0.035),), "trunk": ((1.0, 0.02),)}
+ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about are drawn alike: things are whole
+# The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it
+# has: so there is as much terrain and fence as in streets, while labels are right more often.
+TEXTURE = 64
 # What gives a class its speckle, and what gives it to all others.
 _MADE_OF = {"road": "road", "parking": "parking", "sidewalk": "sidewalk", "building": "wall", "fence": "fence",
             "vegetation": "leaves", "trunk": "bark", "terrain": "grass", "car": "paint", "truck": "paint",
@@ -78,12 +81,45 @@ def placed(
 
 def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
     """The image with a sensor's range noise and each beam's own error, as streets have them; by its labels, if any,
-    also with the roughness of what grows."""
+    also with the roughness of what grows, and then with the likeliest class alone."""
     noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(image.sensor)
     if image.label is not None:
-        strays = torch.rand(image.shape, generator=rng).numpy() < STRAYING
-        noise = noise + torch.randn(image.shape, generator=rng).numpy() * strays * ROUGH[image.label]
-    return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask)
+        noise = noise + torch.randn(image.shape, generator=rng).numpy() * _straying(texture(image.label), rng)
+    label = None if image.label is None else image.label % TEXTURE
+    return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask, label=label)
+
+
+def texture(label: np.ndarray) -> np.ndarray:
+    """(H, W) classes whose texture a sample in the making has."""
+    return np.where(label < TEXTURE, label, label // TEXTURE)
+
+
+def _straying(label: np.ndarray, rng: torch.Generator) -> np.ndarray:
+    """(H, W) metres: how far each ray strays from what is of a class (H, W), standard deviation."""
+    chance, metres = torch.rand(label.shape, generator=rng).numpy(), np.zeros(label.shape, np.float32)
+    for name, some in STRAYING.items():
+        before, here = 0.0, label == CLASS_NUMBER[name]
+        for share, rough in some:
+            metres[here & (before <= chance) & (chance < before + share)] = rough
+            before += share
+    return metres
+
+
+def with_doubts(logits: Tensor | None, rng: list[torch.Generator] | None) -> Tensor | None:
+    """Logits of classes (B, C, H, W) whose greatest is one drawn by their softmax, with a generator for each image;
+    None without.
+
+    They get Gumbel noise, whose quantiles are those of Gaussians that change slowly around the turn: what stands side
+    by side is of one class.
+    """
+    if logits is None or rng is None:
+        return None
+    classes, width = logits.shape[1], logits.shape[3]
+    place = torch.arange(width) * (ALIKE / width)
+    first, turned = place.long(), (place - place.floor()) * (math.pi / 2)
+    steps = torch.stack([torch.randn(classes, 1, ALIKE, generator=one) for one in rng])
+    smooth = steps[..., first] * turned.cos() + steps.roll(-1, -1)[..., first] * turned.sin()
+    return logits - torch.special.ndtr(smooth).clamp(1e-6, 1 - 1e-6).log().neg().log().to(logits.device)
 
 
 def weighted(
@@ -128,7 +164,7 @@ def shades_of(drawn: list[RangeImage], calm: list[RangeImage]) -> np.ndarray:
 def as_read(image: RangeImage, even: np.ndarray, rng: torch.Generator) -> RangeImage:
     """The image with reflectances that are `even` (H, W) on average, and the speckle of what it meets, by its labels if
     any, as streets have it."""
-    spread = SPREAD[np.zeros(image.shape, int) if image.label is None else image.label]
+    spread = SPREAD[np.zeros(image.shape, int) if image.label is None else texture(image.label)]
     shades = speckled(even, spread, torch.randn(2, *image.shape, generator=rng).numpy())
     return replace(image, reflectance=shades * image.mask)
 
@@ -140,12 +176,15 @@ def answered(
     reflectance: Tensor,
     logit: Tensor,
     classes: Tensor | None,
+    drawn: Tensor | None,
     sure: Tensor | None,
 ) -> RangeImage:
-    """The image of what the fill says: metres (H, W), outputs (1, H, W) and (C, H, W), and chances (1, H, W)."""
+    """The image of what the fill says: metres (H, W), outputs (1, H, W) and (C, H, W), those `with_doubts`, and chances
+    (1, H, W)."""
     mask = (logit[0] > 0).numpy() & (distance <= sensor.max_range) & (distance >= sensor.min_range) & ~blocked
     shade = reflectance[0].clamp(0, 1).numpy()
-    label = None if classes is None else classes[1:].argmax(0).numpy() + 1  # 0, unlabeled, is no answer
+    likeliest, kind = (None if part is None else part[1:].argmax(0).numpy() + 1 for part in (classes, drawn))
+    label = likeliest if kind is None else likeliest + TEXTURE * kind  # 0, unlabeled, is no answer
     chance = None if sure is None else sure.reshape(distance.shape).numpy()
     # The label is that of all rays: what is known may return.
     return RangeImage(distance * mask, shade * mask, mask, sensor, label, confidence=chance)

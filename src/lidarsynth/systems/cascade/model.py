@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.diffusion import repaint
 from lidarsynth.diffusion.samplers import generators
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
@@ -19,6 +18,7 @@ from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS, grid_rays
 from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_coherent, draw_noise
@@ -41,10 +41,12 @@ from lidarsynth.systems.cascade.images import (
     placed,
     shades_of,
     weighted,
+    with_doubts,
 )
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
-from lidarsynth.systems.cascade.layout import BY_COLUMNS, STEPS_DEFAULT, block, grids, sampling, times, velocity
+from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times, velocity
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
+from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.cascade.surfaces import straightened
@@ -54,8 +56,6 @@ from lidarsynth.systems.known_pixels import sensor_that_made, with_known
 from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
 
-METHODS = ("auto", "conditional", "sample", "repaint")
-RESAMPLES_DEFAULT = 10
 TIMES = 4  # as many beams
 
 
@@ -157,23 +157,11 @@ class CascadeModel(ScanModel):
 
         Raises ValueError for other words, and for what the method would ignore.
         """
-        name = self.experiment.name
-        if how.method not in METHODS:
-            raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, found {how.method!r}")
-        how.at_least_one().without("sampler", reason="since repaint takes ancestral steps and the fill is one")
-        if how.method == "repaint":
-            return replace(how, steps=how.steps or STEPS_DEFAULT, resamples=how.resamples or RESAMPLES_DEFAULT)
-        how.without("resamples", reason="which only repaint has")
-        if how.steps not in (None, 1):
-            raise ValueError(f"{name}: expected 1 step, for the fill is one, found {how.steps}")
-        return replace(how, method="conditional" if how.method == "auto" else how.method, steps=1)
+        return resolved(how, self.experiment.name)
 
     def calls(self, how: Filling) -> int:
         """How many network evaluations a resolved request takes."""
-        if how.method != "repaint":
-            return 1
-        assert how.steps is not None and how.resamples is not None
-        return 1 + repaint.evaluations(how.steps, how.resamples)
+        return calls(how)
 
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
@@ -271,34 +259,40 @@ class CascadeModel(ScanModel):
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
-        """Grids (B, R, C) as whole images. Reflectances are the likeliest, then get the speckle of their class.
-        Of 16 beams, first these are filled, then all between: at once, most would know nothing above or below.
-        """
+        """Grids (B, R, C) as whole images. Reflectances are the likeliest, then get the speckle of their class. Of 16
+        beams, first these are filled, then all between: at once, most would know nothing above or below."""
         own = replace(self, sensor=written_out(self.sensor), labelled=bool(self.experiment.model.classes))
         told = metres.cpu().numpy(), reflectance.cpu().numpy()
         if len(rows) > ROWS:  # little is left to say
-            drawn = calm = own._between(*told, rows, columns, None)
+            drawn = calm = own._between(*told, rows, columns, None, rng)
         else:
             beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
-            drawn, calm = (beams._between(*told, np.arange(len(rows)), columns, noise) for noise in (rng, None))
+            drawn, calm = (beams._between(*told, np.arange(ROWS), columns, noise, rng) for noise in (rng, None))
             drawn = agreed(drawn, calm, told[0], columns)
         if len(rows) == ROWS < self.sensor.height:
             told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
-            drawn, calm = (own._between(*told, rows, every, noise) for noise in (rng, None))
+            drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
         shades = shades_of(drawn, calm)
         read = map(as_read, drawn, shades, rng)
         return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
 
     def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
         """A sample with its sensor's noise, without the labels that nobody asked for."""
-        return replace(noisy(image, rng), label=image.label if self.labelled else None)
+        image = noisy(image, rng)
+        return image if self.labelled else replace(image, label=None)
 
     def _between(
-        self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: list | None
+        self,
+        metres: np.ndarray,
+        reflectance: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        rng: list | None,
+        kinds: list,
     ) -> list[RangeImage]:
         """Samples of whole images, told metres (B, R, C), 0 for no return, and reflectance of rows and columns."""
         ranges, shades, told = placed(metres, reflectance, rows, columns, self.sensor, self._blocked)
-        samples = zip(self._fill(ranges, shades, told, True, rng), ranges, shades, told, strict=True)
+        samples = zip(self._fill(ranges, shades, told, True, rng, kinds), ranges, shades, told, strict=True)
         return [with_known(a, RangeImage(r, f, r > 0, self.sensor), t, keep_reflectance=True) for a, r, f, t in samples]
 
     def _holes(
@@ -340,12 +334,16 @@ class CascadeModel(ScanModel):
         told: np.ndarray,
         lit: bool,
         rng: list[torch.Generator] | None,
+        kinds: list[torch.Generator] | None = None,
     ) -> list[RangeImage]:
-        """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples."""
-        return self._answers(known_of(metres, reflectance, told, lit, padded(self.sensor)), rng)
+        """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples.
+
+        kinds  generators that draw classes, and edges as one draws them; None = those of samples
+        """
+        return self._answers(known_of(metres, reflectance, told, lit, padded(self.sensor)), rng, kinds=kinds or rng)
 
     def _answers(
-        self, known: Known, rng: list[torch.Generator] | None, surely: np.ndarray | None = None
+        self, known: Known, rng: list | None, surely: np.ndarray | None = None, kinds: list | None = None
     ) -> list[RangeImage]:
         """Images of (B, 1, H', W') padded pixels.
 
@@ -354,13 +352,14 @@ class CascadeModel(ScanModel):
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
         drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
         grain, reach = (self.grain, ANYHOW) if drawn else (REALISED, SNAP)
-        classify = self.labelled or (drawn and bool(self.experiment.model.classes))
-        filled, rays = self._network(known, rng, weights is not None, classify, grain, reach)
+        classify = self.labelled or (kinds is not None and bool(self.experiment.model.classes))
+        bend = BEND if kinds is None else BEND / 2
+        filled, rays = self._network(known, rng, weights is not None, classify, grain, reach, bend)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
         sure = None if weights is None else confidence(filled, rays, weights)
-        parts = (self.response.mixed(filled), logit, filled.classes, sure)
+        parts = (self.response.mixed(filled), logit, filled.classes, with_doubts(filled.classes, kinds), sure)
         cut = [[None] * len(metres) if part is None else part[..., :height, :width].cpu() for part in parts]
         return [
             answered(self.sensor, self._blocked, *of_one)
@@ -376,6 +375,7 @@ class CascadeModel(ScanModel):
         classify: bool = False,
         grain: Grain = GENERATED,
         reach: float = SNAP,
+        bend: float = BEND,
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
         count, _, height, width = known.told.shape
@@ -389,7 +389,7 @@ class CascadeModel(ScanModel):
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             fill = self.network.fill if classify or rng is not None else self.network.surest
-            return fill(known, rays, noise.to(device), classify, doubt, reach, lost), rays
+            return fill(known, rays, noise.to(device), classify, doubt, reach, lost, bend), rays
 
     @property
     def _blocked(self) -> np.ndarray:

@@ -9,10 +9,12 @@ from torch import Tensor
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.column_neighbours import Grid
 
-# Rounds; the share of the range within which a return is of its neighbours' surface, and from beam to beam, where the
-# foot of a wall is no slope; all chosen by street-2 (docs/training-default.md). A step between beams that is less than
-# GROUND of flat ground's is none of the ground.
-ROUNDS, NEAR, CORNER, GROUND = 4, 0.04, 0.03, 0.3
+# Rounds; the share of the range within which a return is of its neighbours' surface, between what was drawn between
+# columns that are straight already, and from beam to beam, where the foot of a wall is no slope; all chosen by street-2
+# (docs/training-default.md). A step between beams that is less than GROUND of flat ground's is none of the ground.
+ROUNDS, NEAR, FINE, CORNER, GROUND = 4, 0.04, 0.01, 0.03, 0.3
+# A return at an edge is farther from one neighbour than this share of its nearness, and a third as far from the other.
+EDGE, ONE_SIDED = 0.03, 1 / 3
 # Of `evened`: differences of reflectance that are speckle, on the ground and elsewhere; of the range code, on flat
 # ground and to the neighbours along a ring.
 ALIKE, FLAT, BESIDE = (0.04, 0.08), 0.02, 0.1
@@ -22,8 +24,8 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
     """(B, R, C) metres of these rows, 0 for no return, straight along rings, between beams, and upright on walls.
 
     Each return goes half of the way to where its two neighbours would have it, all of this where that is near, less and
-    less up to twice as far. On a plane, 1 / range is straight along a ring, and from beam to beam against the tangent
-    of the elevation.
+    less up to twice as far; one at an edge stays, else what stands before a wall would melt into it. On a plane,
+    1 / range is straight along a ring, and from beam to beam against the tangent of the elevation.
     """
     elevation = metres.new_tensor(np.radians(np.asarray(sensor.elevations)[rows]))[None, :, None]
     height = elevation.tan()
@@ -31,7 +33,7 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
     returned = metres > 0
     inverse = returned / metres.clamp_min(0.1)
     for _ in range(ROUNDS):
-        inverse = _nearer(inverse, inverse.roll(1, 2), inverse.roll(-1, 2), 0.5, NEAR)
+        inverse = _along_ring(inverse, NEAR)
         inner = _nearer(inverse[:, 1:-1], inverse[:, :-2], inverse[:, 2:], above, CORNER)
         inverse = torch.cat([inverse[:, :1], inner, inverse[:, -1:]], 1)
     cosine = elevation.cos().clamp_min(1e-3)  # a beam may look straight up
@@ -44,7 +46,7 @@ def along_rings(metres: Tensor) -> Tensor:
     returned = metres > 0
     inverse = returned / metres.clamp_min(0.1)
     for _ in range(ROUNDS):
-        inverse = _nearer(inverse, inverse.roll(1, 2), inverse.roll(-1, 2), 0.5, NEAR)
+        inverse = _along_ring(inverse, FINE)
     return torch.where(returned, 1 / inverse.clamp_min(1e-6), 0)
 
 
@@ -69,6 +71,14 @@ def evened(grid: Grid, rays: Tensor) -> Tensor:
             total, weights = total + weight * other, weights + weight
         shade = total / weights
     return shade
+
+
+def _along_ring(inverse: Tensor, near: float) -> Tensor:
+    """1 / range, 0 for no return, nearer to the line between its two neighbours on the ring, but at an edge."""
+    left, right = inverse.roll(1, 2), inverse.roll(-1, 2)
+    away = torch.stack([(left - inverse).abs(), (right - inverse).abs()])
+    edge = (away.amax(0) > EDGE * inverse) & (away.amin(0) < ONE_SIDED * away.amax(0))
+    return torch.where(edge, inverse, _nearer(inverse, left, right, 0.5, near))
 
 
 def _nearer(inverse: Tensor, one: Tensor, other: Tensor, share: Tensor | float, near: float) -> Tensor:
