@@ -98,6 +98,7 @@ class Counted:
     reflectance: bool = True
     stop_at: int = -1
     calls: list[int] = field(default_factory=list)  # seeds
+    together: int = 1
 
     @property
     def network(self) -> torch.nn.Module:
@@ -403,6 +404,19 @@ def test_generation_ranks_the_floor_the_model_and_noise(generation: Path, tiny: 
     benchmark("generation", more, tmp_path / "out", lambda word: model)
     assert model.calls[calls:] == [3, 4, 3, 4, 3, 4], "more scans are added to those that are there"
     assert benchmark("generation", generation, tmp_path / "out", lambda word: model) == text, "and fewer are fewer"
+
+
+def test_models_whose_scans_come_in_blocks_make_whole_blocks(generation: Path, tiny: Path, tmp_path: Path):
+    one, blocks = (Counted(ls.load(tiny), together=size) for size in (1, 2))
+    texts = [
+        benchmark("generation", generation, tmp_path / str(m.together), lambda word, m=m: m) for m in (one, blocks)
+    ]
+    assert one.calls[:3] == [0, 1, 2] and blocks.calls[:2] == [0, 2] and len(blocks.calls) == 6
+    rows = [{name: row["reports"]["bev-1"]["values"] for name, row in results(tmp_path / k).items()} for k in "12"]
+    for name in rows[0]:
+        measured = [{key: value["value"] for key, value in row[name].items()} for row in rows]
+        assert measured[0] == pytest.approx(measured[1], rel=1e-4, nan_ok=True), name
+    assert all("tiny, 2 steps" in text for text in texts)
 
 
 def test_samples_of_others_compete_and_other_sizes_are_told(generation: Path, data: Path, tiny: Path, tmp_path: Path):

@@ -73,7 +73,8 @@ def generation_row(
     else:
         try:
             evaluations, _ = timed(lambda: generation_evaluations(model, method) if model else None)
-            _make(setup, method, drawer(method, model, sensor), store, count, config.seed)
+            batch = setup.batch_size if setup.device != "cpu" else model.together if model else 1
+            _make(setup, method, drawer(method, model, sensor), store, count, config.seed, batch)
         except Declined as reason:
             return replace(row, reason=str(reason))
         samples = store.folder
@@ -89,13 +90,12 @@ def generation_row(
     )
 
 
-def _make(setup: Setup, method: GenerationMethod, draw: Draw, store: Store, count: int, seed: int) -> None:
+def _make(setup: Setup, method: GenerationMethod, draw: Draw, store: Store, count: int, seed: int, batch: int) -> None:
     """Scans of any number depend on seed + number only, so that more of them go on where fewer ended."""
 
     def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
         return timed(lambda: draw(seed + numbers.start, len(numbers)))
 
-    batch = 1 if setup.device == "cpu" else setup.batch_size  # on a CPU larger ones are no faster
     fill_store(store, dict.fromkeys(range(count), ""), make, batch, setup.progress(method.name, count))
 
 

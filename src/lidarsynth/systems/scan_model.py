@@ -48,6 +48,7 @@ class ScanModel(ABC):
     description: ClassVar[Description]  # what a card says of it
     kind: ClassVar[str] = "one that completes scans"  # said of those that generate nothing
     any_sensor: ClassVar[bool] = False  # whether `into` takes any
+    together: ClassVar[int] = 1  # scans that a CPU generates in hardly more time than one
 
     def to(self, device: str | torch.device) -> Self:
         """The same model with its network on another device."""

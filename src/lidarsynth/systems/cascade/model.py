@@ -83,6 +83,7 @@ class CascadeModel(ScanModel):
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     any_sensor: ClassVar[bool] = True
+    together: ClassVar[int] = 16
 
     def into(self, sensor: Sensor | str) -> CascadeModel:
         """The same model with images of another sensor."""
@@ -132,8 +133,7 @@ class CascadeModel(ScanModel):
         sampler  of the grid: columns | ddpm | ddim | dpmpp-2m | heun; default columns, dpmpp-2m where steps are given
         steps    of diffusion, default 16; the fill takes one more
 
-        Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor of fewer than 16 beams
-        or 128 columns.
+        Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """
         how = sampling(self.network, steps, sampler)
         if min(n, how[1], batch_size) < 1:
