@@ -165,7 +165,7 @@ def beyond(grid: Grid, rays: Tensor, new: Tensor, side: tuple[int, int]) -> Grid
 
 
 def _straight(grid: Grid, rows: np.ndarray, sensor: Sensor) -> Grid:
-    return known_grid(straightened(_metres(grid), rows, sensor), grid.shade)
+    return known_grid(straightened(_metres(grid), rows, sensor, edges=True), grid.shade)
 
 
 def _metres(grid: Grid) -> Tensor:

@@ -20,12 +20,14 @@ EDGE, ONE_SIDED = 0.03, 1 / 3
 ALIKE, FLAT, BESIDE = (0.04, 0.08), 0.02, 0.1
 
 
-def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
+def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor, edges: bool = False) -> Tensor:
     """(B, R, C) metres of these rows, 0 for no return, straight along rings, between beams, and upright on walls.
 
     Each return goes half of the way to where its two neighbours would have it, all of this where that is near, less and
-    less up to twice as far; one at an edge stays, else what stands before a wall would melt into it. On a plane,
-    1 / range is straight along a ring, and from beam to beam against the tangent of the elevation.
+    less up to twice as far. On a plane, 1 / range is straight along a ring, and from beam to beam against the tangent
+    of the elevation.
+
+    edges  those along a ring stay, else what stands before a wall melts into it: for grids without much noise
     """
     elevation = metres.new_tensor(np.radians(np.asarray(sensor.elevations)[rows]))[None, :, None]
     height = elevation.tan()
@@ -33,7 +35,7 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
     returned = metres > 0
     inverse = returned / metres.clamp_min(0.1)
     for _ in range(ROUNDS):
-        inverse = _along_ring(inverse, NEAR)
+        inverse = _along_ring(inverse, NEAR, edges)
         inner = _nearer(inverse[:, 1:-1], inverse[:, :-2], inverse[:, 2:], above, CORNER)
         inverse = torch.cat([inverse[:, :1], inner, inverse[:, -1:]], 1)
     cosine = elevation.cos().clamp_min(1e-3)  # a beam may look straight up
@@ -73,9 +75,11 @@ def evened(grid: Grid, rays: Tensor) -> Tensor:
     return shade
 
 
-def _along_ring(inverse: Tensor, near: float) -> Tensor:
-    """1 / range, 0 for no return, nearer to the line between its two neighbours on the ring, but at an edge."""
+def _along_ring(inverse: Tensor, near: float, edges: bool = True) -> Tensor:
+    """1 / range, 0 for no return, nearer to the line between two neighbours on the ring; with `edges`, but there."""
     left, right = inverse.roll(1, 2), inverse.roll(-1, 2)
+    if not edges:
+        return _nearer(inverse, left, right, 0.5, near)
     away = torch.stack([(left - inverse).abs(), (right - inverse).abs()])
     edge = (away.amax(0) > EDGE * inverse) & (away.amin(0) < ONE_SIDED * away.amax(0))
     return torch.where(edge, inverse, _nearer(inverse, left, right, 0.5, near))
