@@ -11,7 +11,8 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import draw_coherent, draw_noise
-from lidarsynth.networks.rays import encode_range
+from lidarsynth.networks.rays import decode_range, encode_range
+from lidarsynth.systems.cascade.hanging import connected, landed
 from lidarsynth.systems.cascade.images import TEXTURE, agreed, as_read, noisy, with_doubts
 from lidarsynth.systems.cascade.surfaces import along_rings, evened
 
@@ -118,3 +119,38 @@ def test_a_sample_has_the_texture_of_the_class_that_was_drawn_and_the_likeliest_
     assert 0.025 < rough < 0.04 and smooth < 0.5 * rough
     read = as_read(image, image.reflectance, rng(0)).reflectance
     assert read[:, 256:].std() > 1.5 * read[:, :256].std()
+
+
+def test_cells_are_connected_through_others():
+    least = connected(np.array([5, 3, 8, 1]), np.array([3, 2, 9, 0]), 10)
+    assert least.tolist() == [0, 0, 2, 2, 4, 2, 6, 7, 8, 8]
+    chain = np.random.default_rng(0).permutation(999)
+    assert not connected(chain, chain + 1, 1000).any()
+
+
+def test_half_of_what_hangs_is_taken_away_and_what_stands_stays():
+    metres, shade = np.full((1, 32, 256), 20.0, np.float32), np.full((1, 32, 256), 0.3, np.float32)
+    metres[:, 24:] = 8  # ground, nearer than the wall
+    metres[0, 10:24, 40:44] = 7.5  # a post that stands on it
+    metres[0, :6, 200:] = 0  # sky
+    for k in range(12):
+        metres[0, 12:15, 60 + 10 * k : 64 + 10 * k] = 10 + 0.1 * k
+        shade[0, 12:15, 60 + 10 * k : 64 + 10 * k] = 0.9
+    metres[0, 12:15, [255, 0]] = 11  # across the seam
+    parts = torch.from_numpy(metres), torch.from_numpy(shade)
+    left = []
+    for seed in range(30):
+        grid = landed(known_grid(*parts), [rng(seed)])
+        found = (decode_range(grid.code) * grid.returned)[0].numpy()
+        there = [found[13, 61 + 10 * k] < 15 for k in range(12)] + [found[13, 0] < 15]
+        assert there[-1] == (found[13, 255] < 15)
+        left.append(np.mean(there))
+        for k, stays in enumerate(there[:12]):
+            place = np.s_[12:15, 60 + 10 * k : 64 + 10 * k]
+            np.testing.assert_allclose(found[place], 10 + 0.1 * k if stays else 20, rtol=1e-3)
+            assert_close(grid.shade[0][place], torch.full((3, 4), 0.9 if stays else 0.3))
+        rest = np.ones(found.shape, bool)
+        rest[12:15] = False
+        np.testing.assert_allclose(found[rest], metres[0][rest], rtol=1e-4)
+        np.testing.assert_allclose(found[12:15, 40:44], 7.5, rtol=1e-4)
+    assert 0.35 < np.mean(left) < 0.65 and min(left) < 0.5 < max(left)

@@ -20,6 +20,7 @@ from lidarsynth.networks.column_neighbours import Grid, known_grid, levelled, ne
 from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.rays import decode_range, encode_range
 from lidarsynth.streets.hdl64e import unevenness
+from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
 
 BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
@@ -92,6 +93,7 @@ def grids(
         grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
         if len(rows) > ROWS:
             grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
+        grid = landed(grid, rng)
         shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
         dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
         parts = (_metres(grid), (shade - dim).clamp(0, 1) * grid.returned)
