@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.streets.areas import Density
 from lidarsynth.streets.hdl64e import NAME
@@ -23,7 +24,7 @@ USUAL = 0.25  # share of worlds and of sensors that are as `VirtualStreets` has 
 
 class VariedStreets(VirtualStreets):
     """As `VirtualStreets`, but three in four worlds differ in density and kerbs, three in four sensors see surfaces
-    less rough, and KITTI's own is that of another day (`draw_recording`), though it is told as the usual one."""
+    less rough, some of them farther, and KITTI's own is that of another day (`draw_recording`)."""
 
     def __init__(self, seed: int = 0, length: int = 1000):
         super().__init__(seed, length)
@@ -39,6 +40,14 @@ class VariedStreets(VirtualStreets):
             return draw_recording(rng)
         strength = float(rng.uniform(0.0, 0.3)) if rng.random() < 0.4 else seen.optics.strength
         return replace(seen, optics=replace(seen.optics, rough=float(rng.uniform(0.15, 0.9)), strength=strength))
+
+    def pair(self, index: int) -> tuple[RangeImage, RangeImage]:
+        """`(perfect, seen)` of scan `index`, as `SyntheticStreets.pair`; of KITTI's sensor on whatever day, as its own
+        rays, which is all that users can say of theirs."""
+        perfect, seen = super().pair(index)
+        if seen.sensor.name != NAME:
+            return perfect, seen
+        return replace(perfect, sensor=SENSORS[NAME]), replace(seen, sensor=SENSORS[NAME])
 
     def density(self, number: int) -> Density:
         """How much there is of all in the world of that number."""

@@ -24,15 +24,16 @@ from lidarsynth.training.task import Draw
 
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
 VIRTUAL = "virtual"  # the same, by virtual sensors that are drawn too
+VARIED = "varied"  # by virtual sensors too, in worlds of many densities
 RECORDINGS = "recordings"  # the same, by KITTI's sensor as it is on other days
-ENDLESS = (SYNTHETIC, VIRTUAL, RECORDINGS)
+ENDLESS = (SYNTHETIC, VIRTUAL, VARIED, RECORDINGS)
 
 
 class Streets:
     """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
 
-    word  of ENDLESS: seen by `sensor`, by sensors drawn from the seed (`VirtualStreets`), or by KITTI's on many days
-          (`RecordedStreets`)
+    word  of ENDLESS: seen by `sensor`, by ones drawn from the seed (`VirtualStreets`, `VariedStreets`), or by KITTI's
+          on many days (`RecordedStreets`)
 
     Raises ImportError naming the extra when the ray caster is missing.
     """
@@ -65,11 +66,13 @@ class Streets:
     def _reader(self) -> Any:
         from lidarsynth.streets.reader import SyntheticStreets
         from lidarsynth.streets.recordings import RecordedStreets
+        from lidarsynth.streets.varied import VariedStreets
         from lidarsynth.streets.virtual import VirtualStreets
 
-        if self.source["name"] == SYNTHETIC:
+        word = self.source["name"]
+        if word == SYNTHETIC:
             return SyntheticStreets(self.seed, 1 << 62, self.sensor)
-        return (VirtualStreets if self.source["name"] == VIRTUAL else RecordedStreets)(self.seed, 1 << 62)
+        return {VIRTUAL: VirtualStreets, VARIED: VariedStreets, RECORDINGS: RecordedStreets}[word](self.seed, 1 << 62)
 
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]."""

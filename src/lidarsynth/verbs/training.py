@@ -20,7 +20,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import VIRTUAL, Streets, TrainingImages, open_images
+from lidarsynth.training.examples import VARIED, VIRTUAL, Streets, TrainingImages, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
@@ -144,7 +144,7 @@ def _begin(
                          f"found {found.height} x {found.width}")  # fmt: skip
     with fixed_randomness(experiment.training.seed):
         network = build_network(experiment)
-    sensor = "" if images.source["name"] == VIRTUAL else images.sensor.name
+    sensor = "" if images.source["name"] in (VARIED, VIRTUAL) else images.sensor.name
     card = replace(experiment.card, data=_learned_from(images), sensor=sensor)
     saved, note = newest_whole(out)
     if resume and not saved:
