@@ -50,6 +50,22 @@ def test_a_copy_of_the_truth_scores_nothing():
     assert_close(energy_score(truth, truth, truth), torch.zeros(2), atol=3e-3, rtol=0)
 
 
+def test_beams_of_crops_answer_each_in_its_own_way_but_in_samples():
+    sensor = SENSORS["vlp-16"].resized(width=1024)
+    full = np.full((16, 1024), 10.0, np.float32)
+    image = RangeImage(full, full / 25, full > 0, sensor)
+    apart = {}
+    for seed in range(60):
+        known, _, (metres, reflectance, _) = crop(image, np.random.default_rng(seed), seed % 2 == 0)
+        assert_close(known.reflectance, reflectance * known.lit)
+        assert (reflectance[metres == 0] == 0).all()
+        beams = reflectance[0, 0, :16].median(1).values
+        apart.setdefault(seed % 2 == 0, []).append(float(beams.std()))
+    assert max(apart[True]) < 1e-6
+    uneven = np.array(apart[False]) > 1e-3
+    assert 0.5 < uneven.mean() < 0.9 and max(apart[False]) > 0.05
+
+
 def test_absolute_errors_count_hidden_returns_of_the_sensor_alone():
     sensor = SENSORS["vlp-16"]
     rays = rays_of(sensor, sensor.blocked_rays(), np.arange(64))

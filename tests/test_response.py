@@ -14,7 +14,6 @@ from lidarsynth.networks.rays import padded, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.response import (
     AS_STREETS,
-    MEASURED,
     SHARES,
     USUAL,
     Response,
@@ -105,10 +104,10 @@ def test_the_share_of_the_mean_is_what_suits_the_scan(street: RangeImage, offset
     found = tried(response, fill, street, told, shades, rays)  # type: ignore[arg-type]
     assert found.plain == (USUAL + share) / 2
     assert share in SHARES
-    assert tried(AS_STREETS, fill, street, told, shades, rays) == Response(plain=MEASURED)  # type: ignore[arg-type]
+    assert tried(AS_STREETS, fill, street, told, shades, rays) == Response(plain=USUAL)  # type: ignore[arg-type]
     assert tried(AS_STREETS, fill, street, told, shades, rays, tuned=True) == AS_STREETS  # type: ignore[arg-type]
     few = told & (np.arange(len(told)) < 3)[:, None]
-    assert tried(response, fill, street, few, shades, rays).plain == MEASURED  # type: ignore[arg-type]
+    assert tried(response, fill, street, few, shades, rays).plain == USUAL  # type: ignore[arg-type]
     dark = replace(street, reflectance=0 * street.reflectance)
     assert tried(AS_STREETS, fill, dark, told, shades, rays) == AS_STREETS  # type: ignore[arg-type]
 
