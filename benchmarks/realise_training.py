@@ -50,8 +50,8 @@ def places(count: int) -> dict[str, list[RangeImage]]:
 
 def generated(count: int) -> list[RangeImage]:
     """Scans of the default model with the classes that it sees there, in KITTI's beams."""
-    model = load("default").into(SENSOR)
-    return [replace(model.generate(1, seed=SEED + k, labels=True)[0], xyz=None) for k in range(count)]
+    made = load("default").into(SENSOR).generate(count, seed=SEED, labels=True)
+    return [replace(image, xyz=None) for image in made]
 
 
 def dark(image: RangeImage) -> RangeImage:
