@@ -363,9 +363,13 @@ def test_train_takes_every_field_of_an_experiment(run: Run):
     assert (found["training"]["steps"], found["training"]["learning_rate"], found["training"]["seed"]) == (7, 0.5, 3)
     assert found["data"]["roll"] is True and found["card"]["licence"] == "x=y"
     assert found == json.loads(run("train", "tiny", *fields, "--dry-run", "--seed", "3").out)
+    sets = ("--set", "training.steps=7", "--dry-run", "--set=training.learning_rate=0.5", "--seed", "3",
+            "--set", "data.roll=true", "card.licence=x=y")  # fmt: skip
+    assert found == json.loads(run("train", "tiny", *sets).out)  # a later one adds to what stands before it
     refused(run("train", "tiny", "--dry-run", "--training.stepps", "7"), "'training.stepps'")
     refused(run("train", "tiny", "--dry-run", "--training.steps", "x"), "training.steps")
     refused(run("train", "tiny", "--dry-run", "--training.steps"), "--training.steps")
+    refused(run("train", "tiny", "--dry-run", "--set", "training.steps=7", "--set", "training.stepps=7"), "stepps")
 
 
 def test_demo_runs_and_lists_what_it_made(run: Run, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

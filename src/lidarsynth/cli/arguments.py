@@ -76,18 +76,19 @@ SensorWord = Annotated[
 
 
 def fields_joined(argv: list[str]) -> list[str]:
-    """A command line whose `--group.field value` and `--group.field=value` stand behind one `--set` instead."""
-    rest, found = [], []
+    """A command line whose `--group.field value`, `--group.field=value` and every `--set` stand behind one `--set`."""
+    rest, found, of_set = [], [], False
     words = iter(argv)
     for word in words:
         path, equals, value = word.partition("=")
-        if not re.fullmatch(r"--[a-z_]+\.[a-z0-9_-]+", path):
-            rest.append(word)
-        elif equals or (value := next(words, None)) is not None:
+        if path == "--set":
+            found += [value] if equals else []
+        elif re.fullmatch(r"--[a-z_]+\.[a-z0-9_-]+", path) and (equals or (value := next(words, None)) is not None):
             found.append(f"{path[2:].replace('-', '_')}={value}")
+        elif of_set and not word.startswith("-"):
+            found.append(word)
+            continue
         else:
-            rest.append(word)  # without a value: let the parser complain
-    if not found:
-        return rest
-    before, after = (rest[: rest.index("--set")], rest[rest.index("--set") + 1 :]) if "--set" in rest else (rest, [])
-    return [*before, "--set", *found, *after]
+            rest.append(word)  # a field without a value too: let the parser complain
+        of_set = path == "--set" and not equals
+    return [*rest, "--set", *found] if found else rest
