@@ -356,6 +356,12 @@ def test_info_knows_scans_models_presets_and_sensors(run: Run, tiny: Path, scan:
         assert word in answer.out
 
 
+def test_a_recipe_that_stands_twice_is_refused(run: Run, scan: Path, tmp_path: Path):
+    recipes = ("--corrupt", "beams:4", "--out", str(tmp_path / "a.ply"), "--corrupt=sector:90")
+    refused(run("complete", str(scan), *recipes), "expected --corrupt once", "joined by +", "found it 2 times")
+    assert not list(tmp_path.iterdir())
+
+
 def test_train_takes_every_field_of_an_experiment(run: Run):
     fields = ("--training.steps", "7", "--set", "data.roll=true", "--training.learning-rate=0.5", "--card.licence=x=y")
     answer = run("train", "tiny", "--seed", "3", *fields, "--dry-run")

@@ -30,6 +30,7 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
     """
     word = argv[0] if argv else "--help"
     if word in verbs:
+        _one_recipe(argv[1:])
         with _refusals(f"--{name.replace('_', '-')}" for name in inspect.signature(verbs[word]).parameters):
             return tyro.cli(_later(verbs[word]), prog=f"lidarsynth {word}", args=argv[1:])
     if not word.startswith("-"):
@@ -43,6 +44,16 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
             description="Generate, complete and judge LiDAR scans.",
             args=argv or ["--help"],
         )
+
+
+def _one_recipe(words: list[str]) -> None:
+    """Raises ValueError where a recipe stands twice: the first would be lost unseen, and errors be those of the last.
+
+    Of other options the last one counts, as in any script that goes on with "$@".
+    """
+    count = sum(word.partition("=")[0] == "--corrupt" for word in words)
+    if count > 1:
+        raise ValueError(f"expected --corrupt once, several recipes joined by +, found it {count} times")
 
 
 @dataclass
