@@ -102,6 +102,12 @@ def test_points_that_a_named_sensor_could_not_see():
     assert "outside its view of -30.7 to +10.7" in str(misfit(raised, SENSORS["hdl-32e"]))
     level = scan.xyz[np.abs(scan.xyz[:, 2]) < 0.1 * np.hypot(scan.xyz[:, 0], scan.xyz[:, 1])]
     assert "lowest beams of 32" in str(misfit(level, SENSORS["hdl-32e"]))
+    ring = np.arange(len(scan)) % 32
+    assert misfit(scan.xyz, SENSORS["hdl-32e"], ring) is None
+    ring[:4] = 40  # a few wrong numbers are no other sensor
+    assert misfit(scan.xyz, SENSORS["hdl-32e"], ring) is None
+    two = np.concatenate([scan.xyz, scan.xyz]), np.concatenate([ring, ring + 64])
+    assert "on 64 rings, more than its 32 beams" in str(misfit(two[0], SENSORS["hdl-32e"], two[1]))
 
 
 def test_points_on_no_beams_have_no_stand():

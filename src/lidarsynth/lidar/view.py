@@ -1,4 +1,4 @@
-"""Whether a scan's points can be of the sensor that is named: within its view, and down to its lower beams."""
+"""Whether a scan's points can be of the sensor that is named: on its rings, in its view, down to its lower beams."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ MARGIN = 1.0  # degrees
 # degrees 8 %; and none has a beam below all points.
 OUTSIDE, BELOW = 0.04, 0.25
 LOWEST = 0.002  # of the points are left out to find the lowest
+FEW = 5  # points: a ring that has fewer is a wrong number
 
 
-def misfit(xyz: np.ndarray, sensor: Sensor) -> str | None:
-    """What points (N, 3) beyond 3 m have that the sensor's could not, in words, or None."""
+def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> str | None:
+    """What points (N, 3) beyond 3 m, of rings (N,) where these are said, have that the sensor's could not, in words,
+    or None."""
+    rings = 0 if ring is None else int((np.unique(ring, return_counts=True)[1] >= FEW).sum())
+    if rings > sensor.height:
+        return f"them on {rings} rings, more than its {sensor.height} beams (two sensors in one file?)"
     lift = float(np.mean(sensor.offsets)) if sensor.offsets else 0.0
     far = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR] - np.array([0, 0, lift], np.float32)
     if len(far) < 100:

@@ -169,7 +169,7 @@ def _misfit(scan: Scan, job: Job) -> str | None:
     if job.sensor is None or job.verb not in ("complete", "upsample"):
         return None
     sensor = get_sensor(job.sensor)
-    found = misfit(scan.xyz, sensor)
+    found = misfit(scan.xyz, sensor, scan.ring)
     return found and f"expected points of {sensor.name}, found {found}: is it another sensor, or another frame " \
                      "(--transform, --mount)?"  # fmt: skip
 
