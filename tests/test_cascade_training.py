@@ -20,7 +20,8 @@ from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import training as cascade_training
 from lidarsynth.systems.cascade.examples import crop, mixed, pattern
-from lidarsynth.systems.cascade.training import absolute_errors, energy_score, expected_errors, fit_standard, misnamed
+from lidarsynth.systems.cascade.scores import absolute_errors, energy_score, expected_errors, misnamed
+from lidarsynth.systems.cascade.training import fit_standard
 from lidarsynth.training import monitor
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
@@ -212,15 +213,16 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_with_a_base_the_fill_of_least_error_alone_is_learned_and_kept(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_with_a_base_the_fills_of_one_sensor_alone_are_learned_and_kept(tmp_path, monkeypatch: pytest.MonkeyPatch):
     from lidarsynth import load
 
     monkeypatch.setattr(monitor, "IMAGES", 1)
     few = {"training.batch_size": 2, "training.steps": 2, "training.warmup": 0}
     for progress in run(with_fields(preset("kitti"), few), "virtual", tmp_path / "run", options=Options(workers=0)):
-        assert progress.step == 0 or set(progress.losses) == {"loss", "likeliest"}
+        parts = {"likeliest", "observed"} if progress.step == 1 else {"likeliest"}  # every second step
+        assert progress.step == 0 or set(progress.losses) == {"loss", *parts}
     kept = load_file(tmp_path / "run" / "model.safetensors")
-    assert kept and all(name.startswith("likeliest.") for name in kept)
+    assert kept and {name.split(".")[0] for name in kept} == {"likeliest", "observer"}
     before, after = (load(source).network.state_dict() for source in ("default", tmp_path / "run"))
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert changed == {"likeliest"}

@@ -14,7 +14,7 @@ from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import whole_file
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
-OWN = "likeliest."  # how the weights are called that a model with a base does not share with it
+OWN = ("likeliest.", "observer.")  # how the weights begin that a model with a base does not share with it
 
 
 def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:

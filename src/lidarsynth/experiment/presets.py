@@ -242,6 +242,7 @@ def kitti() -> Experiment:
     return replace(
         start,
         name="kitti",
+        model=replace(start.model, observer=True),
         training=replace(start.training, steps=11_600),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",

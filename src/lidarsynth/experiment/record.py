@@ -53,6 +53,7 @@ class Model:
     between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none
     beam_channels: int = within(0, 0, 8192)  # cascade: width of what draws the beams between those, 0 = none
     likeliest: bool = False  # cascade: a fill of its own for the image of least error; samples are by the other
+    observer: bool = False  # cascade: a fill of its own that says what the sensor it was tuned to reports of surfaces
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):
@@ -210,7 +211,7 @@ class Experiment:
     model: Model = field(default_factory=Model)
     diffusion: Diffusion = field(default_factory=Diffusion)
     training: Training = field(default_factory=Training)
-    base: str = ""  # cascade: shipped weights that it shares all but `likeliest` with, "" = none
+    base: str = ""  # cascade: shipped weights that it shares all but `likeliest` and `observer` with, "" = none
     card: Card = field(default_factory=Card)
     score: Score | None = None  # of networks trained by score matching
     upsampling: Upsampling | None = None  # of networks that put beams between known ones

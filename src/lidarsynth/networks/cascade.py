@@ -28,6 +28,7 @@ class Cascade(nn.Module):
     between  draws the columns between those, twice over
     beams    draws the beams between those, then, twice over
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
+    observer   a fill that has learned from real scans what one sensor reports of surfaces, which `realise` gives
     """
 
     def __init__(
@@ -39,10 +40,11 @@ class Cascade(nn.Module):
         between: BetweenColumns | None = None,
         beams: BetweenBeams | None = None,
         likeliest: FillUNet | None = None,
+        observer: FillUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
-        self.beams, self.likeliest = beams, likeliest
+        self.beams, self.likeliest, self.observer = beams, likeliest, observer
 
     @property
     def surest(self) -> FillUNet:

@@ -27,6 +27,8 @@ from lidarsynth.training.task import Images
 TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
+FARTHEST = 250.0  # metres
+AS_FAR = (0.3, 0.03)  # metres, and share of the range, by which what was measured is of a surface and not behind it
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -51,6 +53,15 @@ class Grids(NamedTuple):
     standing: Tensor  # (b, R, C) radians
 
 
+class Seen(NamedTuple):
+    """b crops as a sensor reports them, of which nothing is hidden, (b, 1, H, W)."""
+
+    rays: Rays
+    metres: Tensor  # 0 where nothing returned
+    reflectance: Tensor
+    surface: Tensor  # metres of what rays meet, of streets cast perfectly; 0 everywhere of other crops
+
+
 class CascadeBatch(NamedTuple):
     """One process's share of one pass."""
 
@@ -58,6 +69,7 @@ class CascadeBatch(NamedTuple):
     grids: Grids  # of 128 columns
     finer: Grids  # of 256 or, every second step, 512, where the sensors have so many
     taller: Grids  # of 31 beams and 160 columns, see `taller`
+    seen: Seen | None = None  # for an observer
 
 
 def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> CascadeBatch:
@@ -82,7 +94,15 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
         *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer, tall)),
+        _all_seen(experiment, images, taken, seeds) if experiment.model.observer else None,
     )
+
+
+def _all_seen(experiment: Experiment, images: Images, taken: list[RangeImage], seeds: tuple[int, ...]) -> Seen:
+    rngs = [np.random.default_rng((number, 4)) for number in seeds]
+    each = [seen(mixed(a, images, experiment.data.mix, rng), rng) for a, rng in zip(taken, rngs, strict=True)]
+    arrays = (torch.cat(part) for part in zip(*(part for _, *part in each), strict=True))
+    return Seen(stacked([rays for rays, *_ in each]), *arrays)
 
 
 def mixed(image: RangeImage, images: Images, share: float, rng: np.random.Generator) -> RangeImage:
@@ -128,7 +148,7 @@ def crop(
     dim = tuple(dim) if rng.random() < 0.6 else ()
     rays = rays_of(told_sensor, np.zeros_like(blocked) if unaware else blocked, columns, dim)
     hole = blocked[:, columns]
-    metres = np.where(metres < 250, metres, np.float32(0))
+    metres = np.where(metres < FARTHEST, metres, np.float32(0))
     told = every_column(metres.shape, sensor.width, rng) if first else pattern(metres.shape, sensor.width, rng, sampled)
     surface, kind = image.surface, rng.random()
     perfect = surface is not None and not first and kind < (0.2 if sampled else 0.1)
@@ -143,9 +163,9 @@ def crop(
     if perfect:
         assert surface is not None
         near = surface[rows][:, columns] * np.float32(scale)
-        near = np.where(near < 250, near, np.float32(0))
+        near = np.where(near < FARTHEST, near, np.float32(0))
         returned = near > 0
-        metres = np.where((metres > 0) & (np.abs(metres - near) < 0.3 + 0.03 * near), near, np.float32(0))
+        metres = np.where((metres > 0) & (np.abs(metres - near) < AS_FAR[0] + AS_FAR[1] * near), near, np.float32(0))
     label = np.zeros(metres.shape) if image.label is None else image.label[rows][:, columns]
     arrays = [metres, reflectance * (metres > 0), told, returned, lit & (metres > 0), near, label]
     below = HEIGHT - len(metres)
@@ -158,6 +178,23 @@ def crop(
     )
     rays = Rays(*(_to_height(part, below) for part in rays))
     return Known(near * returned, f * lit, told, returned, lit), rays, (r, f, label.long())
+
+
+def seen(image: RangeImage, rng: np.random.Generator) -> tuple[Rays, Tensor, Tensor, Tensor]:
+    """`Seen` of a part of an image, as its sensor reports it: somewhat larger or smaller, mirrored half of the time."""
+    sensor, rows = _window(image.sensor, rng)
+    columns = (int(rng.integers(sensor.width)) + np.arange(WIDTH)) % sensor.width
+    scale = np.float32(math.exp(rng.uniform(-SCALE, SCALE))) if rng.random() < 0.5 else np.float32(1)
+    dim, blocked = unevenness(image.sensor)[rows][:, 0], hidden(image.sensor)[rows]
+    rays = rays_of(sensor, blocked, columns, tuple(dim))
+    surface = np.zeros(image.shape, np.float32) if image.surface is None else image.surface
+    arrays = [part[rows][:, columns] for part in (image.range * scale, image.reflectance * image.mask, surface * scale)]
+    below = HEIGHT - len(rows)
+    arrays = [np.pad(np.where(blocked[:, columns], 0, part), ((0, below), (0, 0))) for part in arrays]
+    if rng.random() < 0.5:
+        arrays, rays = [part[:, ::-1] for part in arrays], Rays(*(part.flip(3) for part in rays))
+    metres, reflectance, surface = (torch.from_numpy(np.ascontiguousarray(a, np.float32))[None, None] for a in arrays)
+    return Rays(*(_to_height(part, below) for part in rays)), metres, reflectance, surface
 
 
 def _to_height(part: Tensor, below: int) -> Tensor:
@@ -282,7 +319,7 @@ def _grid(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`grid` of these rows and columns, with what is told of their rays."""
     (rays, standing), at = told, np.ix_(rows, columns)
-    metres = torch.from_numpy(np.where(image.range[at] < 250, image.range[at], 0).astype(np.float32))
+    metres = torch.from_numpy(np.where(image.range[at] < FARTHEST, image.range[at], 0).astype(np.float32))
     even = (image.reflectance[at] + unevenness(image.sensor)[rows]) * (image.range[at] > 0)
     reflectance = torch.from_numpy(even.astype(np.float32))
     if rng.random() < 0.5:

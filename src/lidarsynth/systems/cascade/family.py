@@ -33,11 +33,12 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     )
     assert coarse is not None
     widths = (width, width * 3 // 2, width * 2, width * 5 // 2)
-    fill, likeliest = FillUNet(widths, classes=model.classes), FillUNet(widths) if model.likeliest else None
+    fill = FillUNet(widths, classes=model.classes)
+    likeliest, observer = (FillUNet(widths) if asked else None for asked in (model.likeliest, model.observer))
     columns = ColumnTransformer(model.column_channels) if model.column_channels else None
     between = BetweenColumns(model.between_channels) if model.between_channels else None
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
-    return Cascade(coarse, fill, guide, columns, between, beams, likeliest)
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer)
 
 
 def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
@@ -49,15 +50,16 @@ def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
 def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str) -> None:
     """All weights, of equally wide networks; the sensor may differ, and what not all have starts fresh.
 
-    A fill for the least error, where the weights have none of its own, starts as their only one.
+    A fill for the least error, and an observer, where the weights have none of their own, start as their only one.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
     for part in ("coarse", "fill", "guide", "columns", "between", "beams"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
-    if network.likeliest is not None:
-        learned = weights.surest.state_dict()
-        load_weights(network.likeliest, {key: learned[key] for key in learned if not key.startswith("classes")}, name)
+    for own, source in ((network.likeliest, weights.surest), (network.observer, weights.observer or weights.fill)):
+        if own is not None:
+            learned = source.state_dict()
+            load_weights(own, {key: learned[key] for key in learned if not key.startswith("classes")}, name)
 
 
 CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer, graph=fill_graph)

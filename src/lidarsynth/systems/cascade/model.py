@@ -29,7 +29,6 @@ from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import repainted, with_grid
 from lidarsynth.systems.cascade.images import (
     GENERATED,
-    REALISED,
     SPECKLE,
     Grain,
     agreed,
@@ -45,7 +44,7 @@ from lidarsynth.systems.cascade.images import (
 )
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times, velocity
-from lidarsynth.systems.cascade.perfect import fitting, logistic, observed
+from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
@@ -236,6 +235,8 @@ class CascadeModel(ScanModel):
         scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
         model = self.suited_to(scan) if sensor is None else self.into(sensor)
         model = model.into(fitting(scan, model.sensor, projection))
+        network, grain = observing(self.network, model.tuned)
+        model = replace(model, network=network, grain=grain, labelled=False)
         image = project(scan, model.sensor, projection).keep(~model._blocked)
         if not image.mask.any():
             raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
@@ -351,10 +352,10 @@ class CascadeModel(ScanModel):
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
         drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
-        grain, reach = (self.grain, ANYHOW) if drawn else (REALISED, SNAP)
+        reach = ANYHOW if drawn else SNAP
         classify = self.labelled or (kinds is not None and bool(self.experiment.model.classes))
         bend = BEND if kinds is None else BEND / 2
-        filled, rays = self._network(known, rng, weights is not None, classify, grain, reach, bend)
+        filled, rays = self._network(known, rng, weights is not None, classify, reach, bend)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
@@ -373,7 +374,6 @@ class CascadeModel(ScanModel):
         rng: list | None,
         doubt: bool = False,
         classify: bool = False,
-        grain: Grain = GENERATED,
         reach: float = SNAP,
         bend: float = BEND,
     ) -> tuple[Filled, Rays]:
@@ -382,9 +382,9 @@ class CascadeModel(ScanModel):
         rays = self.response.told(rays_told(self.sensor))
         noise, lost, device = torch.zeros(count, NOISES, height, width), None, self._device
         if rng is not None:
-            noise = weighted(draw_noise, grain.noise, (height, width), rng).to(device)
-            if grain.returning is not None:
-                lost = weighted(draw_coherent, grain.returning, (height, width), rng).to(device)
+            noise = weighted(draw_noise, self.grain.noise, (height, width), rng).to(device)
+            if self.grain.returning is not None:
+                lost = weighted(draw_coherent, self.grain.returning, (height, width), rng).to(device)
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):

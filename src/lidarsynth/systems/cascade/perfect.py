@@ -11,6 +11,8 @@ from torch import Tensor
 from lidarsynth.lidar.projection import pixel_of_points, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.systems.cascade.images import OBSERVED, REALISED, Grain
 
 ALIKE = 1.33  # a scan with so many times the sensor's columns, or so many times fewer, has its own
 COLUMNS = (128, 4096)
@@ -24,6 +26,14 @@ def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
     if sensor.width / ALIKE <= full <= sensor.width * ALIKE:
         return sensor
     return sensor.resized(width=int(np.clip(full, *COLUMNS)))
+
+
+def observing(network: Cascade, tuned: bool) -> tuple[Cascade, Grain]:
+    """The networks whose fill says what a sensor reports, and the noise it takes: of the sensor that they were `tuned`
+    to, the observer, where there is one."""
+    if network.observer is None or not tuned:
+        return network, REALISED
+    return Cascade(network.coarse, network.observer), OBSERVED
 
 
 def logistic(logit: Tensor, rng: list[torch.Generator]) -> Tensor:

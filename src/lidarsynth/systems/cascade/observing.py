@@ -1,0 +1,66 @@
+"""How an observer learns what one sensor reports of surfaces: from its real scans, whose holes are closed first."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
+from lidarsynth.networks.rays import decode_range
+from lidarsynth.systems.cascade.examples import AS_FAR, FARTHEST, CascadeBatch, Seen
+from lidarsynth.systems.cascade.scores import energy_score, joined, mean_of, truth
+from lidarsynth.training.randomness import sample_rng
+
+
+class ObserverObjective(nn.Module):
+    """`objective(batch)` -> `observed` (n,): energy scores of two draws, with the cross-entropy of returning and the
+    error of the mean reflectance.
+
+    Surfaces are those of streets cast perfectly where a crop has them: these teach which rays return, not how bright
+    they are. Of all other crops the holes are closed by `closing`, which does not learn here.
+    """
+
+    def __init__(self, network: FillUNet, closing: FillUNet):
+        super().__init__()
+        self.network, self._close = network, closing.forward
+
+    def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
+        seen, count, seeds = batch.seen, len(batch.crops.seeds), batch.crops.seeds
+        assert seen is not None
+        known, lit = self._surfaces(seen)
+        shape = (1, *seen.metres.shape[2:])
+        noise = torch.cat([draw_noise(shape, sample_rng(seed, 3, k)) for k in (0, 1) for seed in seeds])
+        twice = (type(part)(*(torch.cat([t, t]) for t in part)) for part in (known, seen.rays))
+        filled = self.network(*twice, noise.to(seen.metres))
+        judged = torch.cat([torch.ones_like(lit), torch.ones_like(lit), lit], 1)
+        first, second = (
+            judged * joined(Filled(*(p[h] for p in filled[:3])), known, seen.rays)
+            for h in (slice(None, count), slice(count, None))
+        )
+        returned = on_surface(seen.metres, known.metres)
+        metres, reflectance = known.metres * returned, seen.reflectance * returned
+        score = energy_score(first, second, judged * truth(metres, reflectance, seen.rays))
+        chance = F.binary_cross_entropy_with_logits(filled.logit[:count], returned.float(), reduction="none")
+        middle = (filled.reflectance[:count] + filled.reflectance[count:]) / 2
+        error = mean_of((middle - reflectance).abs(), returned & (lit > 0))
+        return {"observed": score + 0.5 * mean_of(chance, known.returned) + error}
+
+    @torch.no_grad()
+    def _surfaces(self, seen: Seen) -> tuple[Known, Tensor]:
+        """What rays meet, and nothing else; and 1 where it is told how bright that is, 0 elsewhere, (b, 1, 1, 1)."""
+        returned, nothing = seen.metres > 0, torch.zeros_like(seen.metres, dtype=torch.bool)
+        told = returned | (seen.rays.blocked > 0)
+        noise = seen.metres.new_zeros(len(told), NOISES, *told.shape[2:])
+        filled = self._close(Known(seen.metres, seen.reflectance, told, returned, returned), seen.rays, noise)
+        closed = torch.where(returned, seen.metres, decode_range(filled.code) * ((filled.logit > 0) & ~told))
+        cast = (seen.surface > 0).flatten(1).any(1)[:, None, None, None]
+        metres = torch.where(cast, seen.surface, closed)
+        metres = metres * (metres < FARTHEST)
+        return Known(metres, torch.zeros_like(metres), nothing, metres > 0, nothing), (~cast).float()
+
+
+def on_surface(measured: Tensor, surface: Tensor) -> Tensor:
+    """Where what was measured, metres, is of the surface that the ray meets, and not of something behind a pane."""
+    near, share = AS_FAR
+    return (measured > 0) & (surface > 0) & ((measured - surface).abs() < near + share * surface)

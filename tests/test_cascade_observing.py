@@ -1,0 +1,126 @@
+"""The observer: what it is shown of real scans and of streets, what it learns, and for which sensor it answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lidarsynth.experiment.presets import preset
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.coarse_unet import CoarseUNet
+from lidarsynth.networks.fill_unet import NOISES, OUTPUTS, FillUNet, draw_noise
+from lidarsynth.systems.cascade.examples import CascadeBatch, Crops, Seen, seen
+from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.observing import ObserverObjective, on_surface
+
+SENSOR = SENSORS["vlp-16"].resized(width=512)
+WIDTHS = (16, 16, 16, 16)
+
+
+def image_of(surface: bool = False) -> RangeImage:
+    """A wall 10 m around, of whose rays two in three are lost, as bright as its column says."""
+    full = np.full(SENSOR.directions().shape[:2], 10.0, np.float32)
+    mask = np.arange(512)[None] % 3 == 0
+    mask = np.broadcast_to(mask, full.shape)
+    light = np.broadcast_to(np.linspace(0.1, 0.9, 512, dtype=np.float32), full.shape)
+    return RangeImage(full * mask, light * mask, mask, SENSOR, surface=full if surface else None)
+
+
+def batch_of(images: list[RangeImage]) -> CascadeBatch:
+    each = [seen(image, np.random.default_rng(3)) for image in images]
+    rays = type(each[0][0])(*(torch.cat(part) for part in zip(*(rays for rays, *_ in each), strict=True)))
+    shown = Seen(rays, *(torch.cat(part) for part in zip(*(part for _, *part in each), strict=True)))
+    none = torch.zeros(len(images), 1, 64, 256)
+    crops = Crops(None, rays, none, none, none.long(), tuple(range(len(images))), 0)  # type: ignore[arg-type]
+    return CascadeBatch(crops, None, None, None, shown)  # type: ignore[arg-type]
+
+
+def fill(logit: float = 0.0) -> FillUNet:
+    """One that says everywhere how likely a return is."""
+    torch.manual_seed(0)
+    network = FillUNet(WIDTHS)
+    torch.nn.init.normal_(network.out.weight, std=0.02)
+    with torch.no_grad():
+        network.out.weight.view(8, OUTPUTS, -1)[:, -1 - NOISES] = 0
+        network.out.bias.view(8, OUTPUTS)[:, -1 - NOISES] = logit
+    return network
+
+
+def test_what_is_seen_is_as_the_sensor_reports_it():
+    image = image_of()
+    for seed in range(8):
+        rays, metres, reflectance, surface = seen(image, np.random.default_rng(seed))
+        assert metres.shape == (1, 1, 64, 256) and rays.elevation.shape[2] == 64
+        assert (surface == 0).all() and (metres[0, 0, 16:] == 0).all() and ((reflectance > 0) == (metres > 0)).all()
+        values = np.unique(reflectance[reflectance > 0].numpy())
+        assert np.isin(values, image.reflectance).all() and len(values) > 50
+
+
+def test_holes_are_closed_where_a_return_is_expected_and_cast_surfaces_are_taken_as_they_are():
+    batch = batch_of([image_of(), image_of(surface=True)])
+    for logit, all_closed in ((5.0, True), (-5.0, False)):
+        known, lit = ObserverObjective(fill(), fill(logit))._surfaces(batch.seen)
+        real, street = known.metres[0, 0, :16], known.metres[1, 0, :16]
+        measured = batch.seen.metres[0, 0, :16]
+        assert_close(real[measured > 0], measured[measured > 0])
+        assert bool((real[measured == 0] > 0).all()) == all_closed
+        assert (street == batch.seen.surface[1, 0, :16]).all() and (street > 9 / 1.2).all()
+        assert not known.told.any() and (known.reflectance == 0).all() and lit.flatten().tolist() == [1, 0]
+
+
+def test_streets_teach_which_rays_return_and_not_how_bright_they_are():
+    objective = ObserverObjective(fill(), fill(5.0))
+    batch = batch_of([image_of(), image_of(surface=True)])
+    brighter = batch._replace(seen=batch.seen._replace(reflectance=batch.seen.reflectance / 2))
+    fewer = batch._replace(seen=batch.seen._replace(metres=batch.seen.metres * (batch.seen.reflectance > 0.5)))
+    losses, of_others, of_fewer = (objective(b)["observed"] for b in (batch, brighter, fewer))
+    assert losses.shape == (2,) and torch.isfinite(losses).all()
+    assert abs(losses[0] - of_others[0]) > 1e-3 and losses[1] == of_others[1]
+    assert abs(losses[1] - of_fewer[1]) > 1e-3
+
+
+@pytest.mark.slow
+def test_it_learns_how_many_are_lost_but_not_which():
+    network = fill()
+    objective = ObserverObjective(network, fill(5.0).eval())
+    batch = batch_of([image_of(), image_of()])
+    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
+    before = None
+    for _ in range(60):
+        loss = objective(batch)["observed"].mean()
+        before = before or float(loss.detach())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert float(loss.detach()) < 0.7 * before
+    known, _ = objective._surfaces(batch.seen)
+    with torch.no_grad():
+        filled = network.eval()(known, batch.seen.rays, draw_noise((2, 64, 256), torch.Generator().manual_seed(0)))
+    chance = filled.logit.sigmoid()[:, :, :16, 16:-16]
+    assert float(chance.mean()) == pytest.approx(1 / 3, abs=0.12)
+    returned = (batch.seen.metres > 0)[:, :, :16, 16:-16]
+    assert float(chance[returned].mean() - chance[~returned].mean()) < 0.2  # it is not told which
+
+
+def test_something_behind_a_pane_is_not_of_its_surface():
+    measured, surface = torch.tensor([0.0, 10.0, 10.2, 14.0, 10.0]), torch.tensor([10.0, 10.0, 10.0, 10.0, 0.0])
+    assert on_surface(measured, surface).tolist() == [False, True, True, False, False]
+
+
+def test_it_answers_for_the_sensor_that_it_was_tuned_to_alone():
+    experiment = preset("kitti")
+    experiment = replace(experiment, card=replace(experiment.card, sensor=SENSOR.name))
+    torch.manual_seed(1)
+    network = Cascade(CoarseUNet(16, (1, 1, 1, 1), 1), fill(5.0).eval(), observer=fill(-5.0).eval())
+    model = CascadeModel(network.eval(), SENSOR, experiment)
+    scan = Scan(*(getattr(image_of(surface=True).to_scan(), name) for name in ("xyz", "reflectance")))
+    other = replace(SENSOR, name="other")
+    assert len(model.realise(scan, SENSOR)) < 0.05 * len(scan) < 0.9 * len(scan) < len(model.realise(scan, other))
+    bare = replace(model, network=Cascade(network.coarse, network.fill))
+    assert len(bare.realise(scan, SENSOR)) > 0.9 * len(scan)
