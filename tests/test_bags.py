@@ -9,9 +9,9 @@ from full_scan import full_scan
 
 from lidarsynth.data.bag_writer import write_bag
 from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag, typestore
-from lidarsynth.files.fields import FileError, scan_from_fields
+from lidarsynth.files.fields import FileError, find, scan_from_fields
 from lidarsynth.verbs.batch import Job, Work, run
-from lidarsynth.verbs.inputs import inputs_of
+from lidarsynth.verbs.inputs import Reading, inputs_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
 pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
@@ -135,6 +135,19 @@ def test_what_is_no_bag_is_one_line(name: str, tmp_path: Path):
     (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FileError, match=r"cut.bag: expected a bag"), open_bag(tmp_path / "cut.bag") as bag:
         list(bag.clouds("/points"))
+
+
+def test_one_of_the_sensors_of_a_topic_is_read_and_its_points_stay(tmp_path: Path):
+    path = ros1(tmp_path)
+    with open_bag(path) as bag:
+        clouds = list(bag.clouds("/points"))
+    wanted = inputs_of([path], Reading(rings=(2, 5), transform=np.eye(4)))
+    for one, cloud in zip(wanted.stream(), clouds, strict=True):
+        loaded, ring = one.read(), cloud.fields[str(find(cloud.fields, "ring"))]
+        place = loaded.scan.extra["point"]
+        whole = scan_from_fields({**cloud.fields, "place": np.arange(len(ring))})[0].extra["place"]
+        np.testing.assert_array_equal(place, whole[(ring[whole] >= 2) & (ring[whole] <= 5)])
+        assert 0 < len(loaded.scan) < len(whole) and set(np.unique(loaded.scan.ring)) <= set(range(4))
 
 
 def test_a_bag_completed_keeps_every_measured_bit(tmp_path: Path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from full_scan import N, full_scan, same
 
-from lidarsynth.files.fields import NAMES, reflectance_from, rings_from_top, seconds_from
+from lidarsynth.files.fields import NAMES, FileError, reflectance_from, rings_from_top, seconds_from
 from lidarsynth.files.formats import read, read_with_report, write
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
@@ -51,6 +51,25 @@ def test_points_without_return_are_dropped_and_counted(scan: Scan, tmp_path: Pat
     found, dropped = read_with_report(tmp_path / "scan.bin")
     assert dropped == 4
     same(found, scan[np.setdiff1d(np.arange(N), [3, 5, 7, 9])], ("xyz", "reflectance"))
+
+
+def test_rings_of_one_sensor_are_read_by_the_numbers_of_the_file(scan: Scan, tmp_path: Path):
+    """Two sensors, whose lasers are numbered as they fire: together their rings would be those of neither."""
+    firing = np.array([0, 5, 1, 6, 2, 7, 3, 8, 4, 9], np.int32)
+    lower = replace(scan, xyz=scan.xyz * np.float32([1, 1, 1.1]), ring=firing[scan.ring] + 10)
+    both = Scan(*(np.concatenate([getattr(replace(scan, ring=firing[scan.ring]), name), getattr(lower, name)])
+                  for name in ("xyz", "reflectance", "ring")))  # fmt: skip
+    write(tmp_path / "both.pcd", both)
+    found, dropped = read_with_report(tmp_path / "both.pcd", rings=(10, 19))
+    assert dropped == 0
+    same(found, replace(lower, ring=scan.ring), ("xyz", "reflectance", "ring"))
+    same(read(tmp_path / "both.pcd", rings=(0, 9)), scan, ("xyz", "ring"))
+    assert read(tmp_path / "both.pcd").ring.max() == 19
+    with pytest.raises(FileError, match=r"both.pcd: expected rings 20-30, found rings 0-19"):
+        read(tmp_path / "both.pcd", rings=(20, 30))
+    write(tmp_path / "plain.bin", scan)
+    with pytest.raises(FileError, match="expected rings 0-9, found points without a ring field: only x, y, z, "):
+        read(tmp_path / "plain.bin", rings=(0, 9))
 
 
 def test_rings_count_from_the_top(scan: Scan):

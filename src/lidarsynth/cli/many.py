@@ -47,6 +47,10 @@ class Many:
     mount: Annotated[
         float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0, where that is the ground.")
     ] = None
+    rings: Annotated[
+        str | None,
+        arg(metavar="A-B", help="of a file of several sensors, such as 32-63; all others are left out."),
+    ] = None
     strict: Annotated[bool, arg(help="refuse points that are not in the sensor's frame, instead of a warning.")] = False
     format: Annotated[
         str | None,
@@ -63,12 +67,13 @@ class Many:
 def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:
     """Do the job with every scan, say what came of it, and return the results. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
-    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream, read_transform
+    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream, parse_rings, read_transform
 
     if many.workers < 0:
         raise ValueError(f"expected --workers of at least 0, found {many.workers}")
     transform = read_transform(many.transform, many.mount, many.axes)
-    inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise"))
+    rings = parse_rings(many.rings)
+    inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings))
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)

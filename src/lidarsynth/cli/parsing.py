@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial, wraps
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Union, cast
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Union, cast, get_type_hints
 
 import tyro
 
@@ -31,11 +31,11 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
     word = argv[0] if argv else "--help"
     if word in verbs:
         _one_recipe(argv[1:])
-        with _refusals(f"--{name.replace('_', '-')}" for name in inspect.signature(verbs[word]).parameters):
+        with _refusals(verbs[word]):
             return tyro.cli(_later(verbs[word]), prog=f"lidarsynth {word}", args=argv[1:])
     if not word.startswith("-"):
         raise ValueError(f"expected a verb of {', '.join(verbs)}, found {word!r}{_meant(word, verbs)}")
-    with _refusals(()):
+    with _refusals(None):
         told = {name: (inspect.getdoc(verb) or "").partition("\n\nArgs:")[0] for name, verb in verbs.items()}
         named = [tyro.conf.subcommand(name, description=text) for name, text in told.items()]
         return tyro.cli(
@@ -69,16 +69,30 @@ def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     return _with_arguments
 
 
-def _refusals(options: Iterable[str]) -> AbstractContextManager[None]:
+def _options(described: Any) -> dict[str, str]:
+    """The options of a verb, or of a class of them, by their names and by those of the parameters."""
+    options = {}
+    for name, hint in get_type_hints(described, include_extras=True).items():
+        called = [
+            word for part in getattr(hint, "__metadata__", ()) if (word := getattr(part, "name", None)) is not None
+        ]
+        if called == [""]:
+            options |= _options(hint.__origin__)
+        elif name != "return":
+            options[f"--{name.replace('_', '-')}"] = f"--{(called or [name])[-1].replace('_', '-')}"
+    return options | {own: own for own in options.values()}
+
+
+def _refusals(verb: Callable[..., None] | None) -> AbstractContextManager[None]:
     """While it is open, what tyro would complain of in a box is a ValueError of one line."""
-    return nullcontext() if events is None else events.on_parse_error(partial(_refuse, list(options)))
+    return nullcontext() if events is None else events.on_parse_error(partial(_refuse, verb))
 
 
-def _refuse(options: list[str], event: events.ParseErrorEvent) -> NoReturn:
-    raise ValueError(f"{event.prog}: {_said(options, event)}") from None
+def _refuse(verb: Callable[..., None] | None, event: events.ParseErrorEvent) -> NoReturn:
+    raise ValueError(f"{event.prog}: {_said(_options(verb) if verb else {}, event)}") from None
 
 
-def _said(options: list[str], event: events.ParseErrorEvent) -> str:
+def _said(options: Mapping[str, str], event: events.ParseErrorEvent) -> str:
     """What was expected and what was found."""
     if isinstance(event, events.MissingArgs):
         names = ", ".join(missing.arg.display_name() for missing in event.missing_arguments)
@@ -98,6 +112,8 @@ def _said(options: list[str], event: events.ParseErrorEvent) -> str:
 
 
 def _meant(found: str, words: Iterable[str]) -> str:
-    """The word that was probably meant, as a question."""
+    """The word that was probably meant, as a question; of a mapping, what it stands for."""
     near = get_close_matches(found, list(words), n=1)
-    return f"; was {near[0]} meant?" if near else ""
+    if not near:
+        return ""
+    return f"; was {words[near[0]] if isinstance(words, Mapping) else near[0]} meant?"

@@ -22,6 +22,7 @@ def sensor(
         str | None, arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture.")
     ] = None,
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None,
+    rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
     seed: NoSeed = 0,
     intensity: Intensity = "none",
     picture: Picture = True,
@@ -29,7 +30,7 @@ def sensor(
     """Learn a sensor from its scans: beams, columns, limits, mount, tilt, and what its carrier blocks."""
     from lidarsynth.pictures.learned import learned_figure
     from lidarsynth.pictures.render import save_png
-    from lidarsynth.verbs.inputs import Reading, inputs_of
+    from lidarsynth.verbs.inputs import Reading, inputs_of, parse_rings
     from lidarsynth.verbs.learned_sensor import doubts, from_metadata, learn, sensor_toml, summary, write_toml
 
     if out.suffix != ".toml":
@@ -38,7 +39,7 @@ def sensor(
         write_toml(out, sensor_toml(known, [f"from the metadata {scans[0].name}"]))
         say(f"wrote {out}: {known.height} beams, {known.width} columns")
         return
-    learned = learn(inputs_of(scans, Reading(intensity, topic, metadata)), out.stem)
+    learned = learn(inputs_of(scans, Reading(intensity, topic, metadata, rings=parse_rings(rings))), out.stem)
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))
     say(summary(learned))
     for line in doubts(learned):

@@ -48,13 +48,17 @@ def find(fields: Fields, name: str) -> str | None:
     return next((lower[usual] for usual in NAMES[name] if usual in lower), None)
 
 
-def scan_from_fields(fields: Fields, intensity: str = "auto") -> tuple[Scan, int]:
+def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, int] | None = None) -> tuple[Scan, int]:
     """The scan of N columns, and how many points it lost.
 
     Points with a non-finite coordinate or intensity, or at exactly (0, 0, 0) (no return), are dropped and counted.
-    `intensity`: see `reflectance_from`. Raises FileError (without the path) for anything that is not one LiDAR turn.
+    `intensity`: see `reflectance_from`; `rings`: see `on_rings`. Raises FileError (without the path) for anything that
+    is not one LiDAR turn.
     """
     x, y, z = _coordinates(fields)
+    if rings is not None:
+        fields = on_rings(fields, *rings)
+        x, y, z = _coordinates(fields)
     name = find(fields, "reflectance")
     if intensity == "none":
         values = np.zeros(len(x), np.float32)
@@ -84,6 +88,22 @@ def scan_from_fields(fields: Fields, intensity: str = "auto") -> tuple[Scan, int
         label=classes,
         extra={key: column[kept] for key, column in fields.items() if key not in taken and column.dtype.kind in "biuf"},
     ), dropped
+
+
+def on_rings(fields: Fields, first: int, last: int) -> Fields:
+    """The columns of the points on rings `first` to `last`, numbered from 0 then: one sensor's of a file of several.
+
+    Raises FileError where the file has none of them.
+    """
+    name = find(fields, "ring")
+    if name is None:
+        raise FileError(f"expected rings {first}-{last}, found points without a ring field: {_listed(fields)}")
+    ring = _numbers(fields[name], name)
+    kept = (ring >= first) & (ring <= last)
+    if not kept.any():
+        found = f"rings {ring.min():.6g}-{ring.max():.6g}" if len(ring) else "no points"
+        raise FileError(f"expected rings {first}-{last}, found {found}")
+    return {key: column[kept] for key, column in fields.items()} | {name: ring[kept] - first}
 
 
 def _coordinates(fields: Fields) -> list[np.ndarray]:

@@ -50,13 +50,22 @@ WRITERS: dict[str, Callable[[BufferedIOBase, Any], None]] = {  # a Scan; .npz al
 }
 
 
-def read(path: str | Path, intensity: str = "auto", labels: str | Path | None = None) -> Scan:
+def read(
+    path: str | Path,
+    intensity: str = "auto",
+    labels: str | Path | None = None,
+    rings: tuple[int, int] | None = None,
+) -> Scan:
     """One LiDAR turn from a file of any kind in READERS; see `read_with_report`."""
-    return read_with_report(path, intensity, labels)[0]
+    return read_with_report(path, intensity, labels, rings=rings)[0]
 
 
 def read_with_report(
-    path: str | Path, intensity: str = "auto", labels: str | Path | None = None, words: str | Path | None = None
+    path: str | Path,
+    intensity: str = "auto",
+    labels: str | Path | None = None,
+    words: str | Path | None = None,
+    rings: tuple[int, int] | None = None,
 ) -> tuple[Scan, int]:
     """The scan, and how many of the file's points were dropped: not finite, or (0, 0, 0) where nothing returned.
 
@@ -64,6 +73,7 @@ def read_with_report(
                (`fields.reflectance_from`), "none" to read a file without intensity with reflectance 0
     labels     a SemanticKITTI `.label` file with one word per point of the file
     words      likewise, of any ids, which are kept as they are in `extra["raw_label"]`
+    rings      of a file of several sensors, the first and last to read, as the file numbers them; None = all
     Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`), other fields as `extra`.
     Raises FileError, a ValueError of one line "path: expected ..., found ...".
     """
@@ -78,7 +88,7 @@ def read_with_report(
     if words is not None:
         fields["raw_label"] = read_words(words, len(next(iter(fields.values()), ())))
     with _naming(path):
-        return scan_from_fields(fields, intensity)
+        return scan_from_fields(fields, intensity, rings)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
     or None."""
     rings = 0 if ring is None else int((np.unique(ring, return_counts=True)[1] >= FEW).sum())
     if rings > sensor.height:
-        return f"them on {rings} rings, more than its {sensor.height} beams (two sensors in one file?)"
+        return f"them on {rings} rings, more than its {sensor.height} beams (of two sensors? --rings A-B takes one)"
     lift = float(np.mean(sensor.offsets)) if sensor.offsets else 0.0
     far = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR] - np.array([0, 0, lift], np.float32)
     if len(far) < 100:

@@ -32,6 +32,7 @@ class Reading:
     metadata   `.json` of an Ouster capture; None = the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
+    rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
     """
 
     intensity: str = "auto"
@@ -39,6 +40,7 @@ class Reading:
     metadata: Path | None = None
     transform: np.ndarray | None = None
     labels: bool = False
+    rings: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,9 @@ class FileInput:
         """The scan. Raises FileError."""
         words = label_path(self.path) if self.reading.labels else None
         words = words if words is not None and words.is_file() else None
-        return _loaded(*read_with_report(self.path, self.reading.intensity, words=words), self.reading)
+        return _loaded(
+            *read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings), self.reading
+        )
 
 
 @dataclass(frozen=True)
@@ -98,8 +102,9 @@ class MessageInput:
         """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
         try:
             cloud = cloud_of(self.message)
+            how = self.reading.intensity, self.reading.rings
             places = np.arange(len(next(iter(cloud.fields.values()), ())))
-            scan, dropped = scan_from_fields({**cloud.fields, "point": places}, self.reading.intensity)
+            scan, dropped = scan_from_fields({**cloud.fields, "point": places}, *how)
             loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
@@ -118,7 +123,7 @@ class TurnInput:
     def read(self) -> Loaded:
         """The scan. Raises FileError that names the capture."""
         try:
-            return _loaded(*scan_from_fields(self.fields, self.reading.intensity), self.reading)
+            return _loaded(*scan_from_fields(self.fields, self.reading.intensity, self.reading.rings), self.reading)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
 
@@ -246,6 +251,16 @@ def _bag_inputs(path: Path, reading: Reading) -> Iterator[Input]:
 def _capture_inputs(path: Path, reading: Reading) -> Iterator[Input]:
     for number, fields in enumerate(capture_turns(path, reading.metadata, reading.topic)):
         yield TurnInput(f"{path.stem}/{number:06d}", path, reading, fields)
+
+
+def parse_rings(text: str | None) -> tuple[int, int] | None:
+    """(32, 63) from 32-63; None is all. Raises ValueError."""
+    if text is None:
+        return None
+    first, dash, last = text.partition("-")
+    if not (dash and first.isdecimal() and last.isdecimal() and int(first) <= int(last) < 1 << 16):
+        raise ValueError(f"expected --rings FIRST-LAST, such as 32-63, found {text!r:.60}")
+    return int(first), int(last)
 
 
 def read_transform(text: str | None, mount: float | None = None, axes: str = "flu") -> np.ndarray | None:
