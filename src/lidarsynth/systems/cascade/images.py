@@ -15,6 +15,9 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_columns, grid_rows
+from lidarsynth.networks.fill_unet import NOISES, Known, draw_coherent, draw_noise
+from lidarsynth.networks.rays import Rays
+from lidarsynth.networks.things import draw_on_things, things
 from lidarsynth.streets.hdl64e import shifts
 from lidarsynth.streets.materials import NUMBER, TABLE
 from lidarsynth.streets.sensor_model import range_noise, speckled
@@ -22,16 +25,17 @@ from lidarsynth.streets.sensor_model import range_noise, speckled
 
 class Grain(NamedTuple):
     """How much samples take of each kind of noise of training, speckle, stripes and patches; and of `draw_coherent`,
-    where whether rays return has noise of its own."""
+    where whether rays return has noise of its own. things: whether patches are those that stand on the ground."""
 
     noise: tuple[float, float, float]
     returning: tuple[float, float, float] | None = None
+    things: bool = False
 
 
 # Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
 # `realise`'s; that of an observer.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
-OBSERVED = Grain((1.0, 1.0, 1.0))
+OBSERVED = Grain((1.0, 1.0, 1.0), things=True)
 # Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
 # before or behind it: of some rays, of a few more, as a crown is deep, and of the others none. Chosen by street-2
 # (docs/training-default.md), where streets have 0.08, 0.035 and 0.02 for all of them.
@@ -121,6 +125,18 @@ def with_doubts(logits: Tensor | None, rng: list[torch.Generator] | None) -> Ten
     steps = torch.stack([torch.randn(classes, 1, ALIKE, generator=one) for one in rng])
     smooth = steps[..., first] * turned.cos() + steps.roll(-1, -1)[..., first] * turned.sin()
     return logits - torch.special.ndtr(smooth).clamp(1e-6, 1 - 1e-6).log().neg().log().to(logits.device)
+
+
+def drawn(grain: Grain, known: Known, rays: Rays, rng: list[torch.Generator] | None) -> tuple[Tensor, Tensor | None]:
+    """Noise (B, NOISES, H', W') for the fill, zeros without generators, and that of returning, if it has its own."""
+    shape = (known.told.shape[2], known.told.shape[3])
+    if rng is None:
+        return torch.zeros(len(known.told), NOISES, *shape), None
+    if grain.things:
+        each = [draw_on_things(of, one) for of, one in zip(things(known.metres, rays), rng, strict=True)]
+        return torch.tensor(grain.noise)[:, None, None] * torch.cat(each), None
+    noise = weighted(draw_noise, grain.noise, shape, rng)
+    return noise, None if grain.returning is None else weighted(draw_coherent, grain.returning, shape, rng)
 
 
 def weighted(

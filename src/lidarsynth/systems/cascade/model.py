@@ -21,7 +21,7 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS, grid_rays
-from lidarsynth.networks.fill_unet import ANYHOW, NOISES, SNAP, Filled, Known, draw_coherent, draw_noise
+from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
 from lidarsynth.networks.rays import Rays, decode_range, padded
 from lidarsynth.streets.hdl64e import hidden, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
@@ -34,12 +34,12 @@ from lidarsynth.systems.cascade.images import (
     agreed,
     answered,
     as_read,
+    drawn,
     grid_of,
     noisy,
     parts,
     placed,
     shades_of,
-    weighted,
     with_doubts,
 )
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
@@ -378,15 +378,11 @@ class CascadeModel(ScanModel):
         bend: float = BEND,
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
-        count, _, height, width = known.told.shape
-        rays = self.response.told(rays_told(self.sensor))
-        noise, lost, device = torch.zeros(count, NOISES, height, width), None, self._device
-        if rng is not None:
-            noise = weighted(draw_noise, self.grain.noise, (height, width), rng).to(device)
-            if self.grain.returning is not None:
-                lost = weighted(draw_coherent, self.grain.returning, (height, width), rng).to(device)
+        rays, device = self.response.told(rays_told(self.sensor)), self._device
+        noise, lost = drawn(self.grain, known, rays, rng)
+        lost = None if lost is None else lost.to(device)
         known = Known(*(part.to(device) for part in known))
-        rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays))
+        rays = Rays(*(part.to(device).expand(len(known.told), *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             fill = self.network.fill if classify or rng is not None else self.network.surest
             return fill(known, rays, noise.to(device), classify, doubt, reach, lost, bend), rays

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
+from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known
 from lidarsynth.networks.rays import decode_range
+from lidarsynth.networks.things import draw_on_things, things
 from lidarsynth.systems.cascade.examples import AS_FAR, FARTHEST, CascadeBatch, Seen
 from lidarsynth.systems.cascade.scores import energy_score, joined, mean_of, truth
 from lidarsynth.training.randomness import sample_rng
@@ -29,8 +30,8 @@ class ObserverObjective(nn.Module):
         seen, count, seeds = batch.seen, len(batch.crops.seeds), batch.crops.seeds
         assert seen is not None
         known, lit = self._surfaces(seen)
-        shape = (1, *seen.metres.shape[2:])
-        noise = torch.cat([draw_noise(shape, sample_rng(seed, 3, k)) for k in (0, 1) for seed in seeds])
+        each = list(zip(things(known.metres, seen.rays), seeds, strict=True))
+        noise = torch.cat([draw_on_things(of, sample_rng(seed, 3, k)) for k in (0, 1) for of, seed in each])
         twice = (type(part)(*(torch.cat([t, t]) for t in part)) for part in (known, seen.rays))
         filled = self.network(*twice, noise.to(seen.metres))
         judged = torch.cat([torch.ones_like(lit), torch.ones_like(lit), lit], 1)
