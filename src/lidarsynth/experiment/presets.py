@@ -200,6 +200,7 @@ def default() -> Experiment:
             between_channels=64,
             beam_channels=56,
             likeliest=True,
+            observer_channels=48,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),
         training=Training(
@@ -242,7 +243,7 @@ def kitti() -> Experiment:
     return replace(
         start,
         name="kitti",
-        model=replace(start.model, observer=True),
+        model=replace(start.model, observer_channels=64),
         training=replace(start.training, steps=11_600),
         card=Card(
             licence="CC BY-NC-SA 3.0, that of KITTI",

@@ -53,7 +53,9 @@ class Model:
     between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none
     beam_channels: int = within(0, 0, 8192)  # cascade: width of what draws the beams between those, 0 = none
     likeliest: bool = False  # cascade: a fill of its own for the image of least error; samples are by the other
-    observer: bool = False  # cascade: a fill of its own that says what the sensor it was tuned to reports of surfaces
+    observer_channels: int = within(
+        0, 0, 8192
+    )  # cascade: width of the fill that says what is seen of surfaces, 0 = none
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):

@@ -28,7 +28,7 @@ class Cascade(nn.Module):
     between  draws the columns between those, twice over
     beams    draws the beams between those, then, twice over
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
-    observer   a fill that has learned from real scans what one sensor reports of surfaces, which `realise` gives
+    observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
     """
 
     def __init__(

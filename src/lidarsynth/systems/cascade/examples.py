@@ -94,7 +94,7 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
         *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer, tall)),
-        _all_seen(experiment, images, taken, seeds) if experiment.model.observer else None,
+        _all_seen(experiment, images, taken, seeds) if experiment.model.observer_channels else None,
     )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
@@ -32,13 +33,22 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
         for channels in (width, model.guide_channels)
     )
     assert coarse is not None
-    widths = (width, width * 3 // 2, width * 2, width * 5 // 2)
-    fill = FillUNet(widths, classes=model.classes)
-    likeliest, observer = (FillUNet(widths) if asked else None for asked in (model.likeliest, model.observer))
+    widths = _widths(width)
+    fill, likeliest = FillUNet(widths, classes=model.classes), FillUNet(widths) if model.likeliest else None
+    observer = FillUNet(_sixteens(_widths(model.observer_channels))) if model.observer_channels else None
     columns = ColumnTransformer(model.column_channels) if model.column_channels else None
     between = BetweenColumns(model.between_channels) if model.between_channels else None
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
     return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer)
+
+
+def _widths(first: int) -> tuple[int, int, int, int]:
+    return first, first * 3 // 2, first * 2, first * 5 // 2
+
+
+def _sixteens(widths: tuple[int, ...]) -> tuple[int, ...]:
+    """The next smaller multiples of 16, at least that."""
+    return tuple(max(width // 16 * 16, 16) for width in widths)
 
 
 def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
@@ -50,16 +60,30 @@ def model(experiment: Experiment, network: nn.Module) -> CascadeModel:
 def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, source: Experiment, name: str) -> None:
     """All weights, of equally wide networks; the sensor may differ, and what not all have starts fresh.
 
-    A fill for the least error, and an observer, where the weights have none of their own, start as their only one.
+    A fill for the least error, where the weights have none of its own, starts as their only one; so does an observer
+    that is as wide.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
     for part in ("coarse", "fill", "guide", "columns", "between", "beams"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
-    for own, source in ((network.likeliest, weights.surest), (network.observer, weights.observer or weights.fill)):
-        if own is not None:
-            learned = source.state_dict()
-            load_weights(own, {key: learned[key] for key in learned if not key.startswith("classes")}, name)
+    for own, sources in (
+        (network.likeliest, (weights.surest,)),
+        (network.observer, (weights.observer, weights.fill)),
+    ):
+        for source in sources:
+            if own is not None and source is not None and _shapes(source) == _shapes(own):
+                load_weights(own, _learned(source), name)
+                break
+
+
+def _learned(fill: FillUNet) -> dict[str, Tensor]:
+    """All weights but those of classes."""
+    return {name: value for name, value in fill.state_dict().items() if not name.startswith("classes")}
+
+
+def _shapes(fill: FillUNet) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in _learned(fill).items()}
 
 
 CASCADE = System("cascade", build, DESCRIPTION, model, lambda experiment: TASK, transfer, graph=fill_graph)

@@ -18,13 +18,15 @@ class ObserverObjective(nn.Module):
     """`objective(batch)` -> `observed` (n,): energy scores of two draws, with the cross-entropy of returning and the
     error of the mean reflectance.
 
-    Surfaces are those of streets cast perfectly where a crop has them: these teach which rays return, not how bright
-    they are. Of all other crops the holes are closed by `closing`, which does not learn here.
+    Surfaces are those of streets cast perfectly, where a crop has them. Of all other crops the holes are closed by
+    `closing`, which does not learn here.
+
+    shining  whether streets teach how bright surfaces are, and not only which rays return
     """
 
-    def __init__(self, network: FillUNet, closing: FillUNet):
+    def __init__(self, network: FillUNet, closing: FillUNet, shining: bool):
         super().__init__()
-        self.network, self._close = network, closing.forward
+        self.network, self._close, self._shining = network, closing.forward, shining
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         seen, count, seeds = batch.seen, len(batch.crops.seeds), batch.crops.seeds
@@ -58,7 +60,7 @@ class ObserverObjective(nn.Module):
         cast = (seen.surface > 0).flatten(1).any(1)[:, None, None, None]
         metres = torch.where(cast, seen.surface, closed)
         metres = metres * (metres < FARTHEST)
-        return Known(metres, torch.zeros_like(metres), nothing, metres > 0, nothing), (~cast).float()
+        return Known(metres, torch.zeros_like(metres), nothing, metres > 0, nothing), (~cast | self._shining).float()
 
 
 def on_surface(measured: Tensor, surface: Tensor) -> Tensor:

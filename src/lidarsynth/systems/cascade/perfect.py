@@ -28,10 +28,9 @@ def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
     return sensor.resized(width=int(np.clip(full, *COLUMNS)))
 
 
-def observing(network: Cascade, tuned: bool) -> tuple[Cascade, Grain]:
-    """The networks whose fill says what a sensor reports, and the noise it takes: of the sensor that they were `tuned`
-    to, the observer, where there is one."""
-    if network.observer is None or not tuned:
+def observing(network: Cascade) -> tuple[Cascade, Grain]:
+    """The networks whose fill says what a sensor reports, the observer where there is one, and the noise it takes."""
+    if network.observer is None:
         return network, REALISED
     return Cascade(network.coarse, network.observer), OBSERVED
 

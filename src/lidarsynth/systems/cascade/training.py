@@ -171,10 +171,10 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
     """
     assert isinstance(network, Cascade)
     likeliest = () if network.likeliest is None else (Phase(LikeliestObjective(network.likeliest), "likeliest"),)
-    observer = ()
+    own = likeliest
     if network.observer is not None:
-        observer = (Phase(ObserverObjective(network.observer, network.surest), "observer", every=EVERY),)
-    own = (*likeliest, *observer)
+        objective = ObserverObjective(network.observer, network.surest, shining=not experiment.base)
+        own = (*likeliest, Phase(objective, "observer", every=EVERY))
     if experiment.base:
         return own
     if bool((network.coarse.standard[1] == 1).all()):
