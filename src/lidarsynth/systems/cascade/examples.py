@@ -28,6 +28,7 @@ TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 FARTHEST = 250.0  # metres
+EVERY = 4  # steps from one of the observer to the next: it learns sooner
 AS_FAR = (0.3, 0.03)  # metres, and share of the range, by which what was measured is of a surface and not behind it
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
@@ -91,11 +92,12 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     known, truth = ([torch.cat(part) for part in zip(*(c[i] for c in crops), strict=True)] for i in (0, 2))
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
-    return CascadeBatch(
+    batch = CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
         *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer, tall)),
-        _all_seen(experiment, images, taken, seeds) if experiment.model.observer_channels else None,
     )
+    observed = experiment.model.observer_channels and step % EVERY == 0
+    return batch._replace(seen=_all_seen(experiment, images, taken, seeds)) if observed else batch
 
 
 def _all_seen(experiment: Experiment, images: Images, taken: list[RangeImage], seeds: tuple[int, ...]) -> Seen:

@@ -67,14 +67,15 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     for part in ("coarse", "fill", "guide", "columns", "between", "beams"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
-    for own, sources in (
-        (network.likeliest, (weights.surest,)),
-        (network.observer, (weights.observer, weights.fill)),
-    ):
-        for source in sources:
-            if own is not None and source is not None and _shapes(source) == _shapes(own):
-                load_weights(own, _learned(source), name)
-                break
+    _start(network.likeliest, (weights.surest,), name)
+    _start(network.observer, (weights.observer, weights.fill), name)
+
+
+def _start(own: FillUNet | None, sources: tuple[FillUNet | None, ...], name: str) -> None:
+    """With the weights of the first that is as wide."""
+    alike = (fill for fill in sources if fill is not None and own is not None and _shapes(fill) == _shapes(own))
+    if own is not None and (source := next(alike, None)) is not None:
+        load_weights(own, _learned(source), name)
 
 
 def _learned(fill: FillUNet) -> dict[str, Tensor]:

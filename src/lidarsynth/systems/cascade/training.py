@@ -21,7 +21,7 @@ from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
-from lidarsynth.systems.cascade.examples import CascadeBatch, Crops, draw, grid
+from lidarsynth.systems.cascade.examples import EVERY, CascadeBatch, Crops, draw, grid
 from lidarsynth.systems.cascade.layout import BOUND
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.observing import ObserverObjective
@@ -39,7 +39,6 @@ from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
 from lidarsynth.training.task import Phase, Task
 
-EVERY = 2  # steps from one of the observer to the next
 FITTED = 256  # streets that the standards of the coarse stage are measured on
 
 
