@@ -92,12 +92,13 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     known, truth = ([torch.cat(part) for part in zip(*(c[i] for c in crops), strict=True)] for i in (0, 2))
     rays = stacked([c[1] for c in crops])
     count = sum(position < samples for position in positions)
-    batch = CascadeBatch(
-        Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
-        *(Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer, tall)),
-    )
+    parts = (Grids(*(torch.stack(part) for part in zip(*each, strict=True))) for each in (grids, finer, tall))
     observed = experiment.model.observer_channels and step % EVERY == 0
-    return batch._replace(seen=_all_seen(experiment, images, taken, seeds)) if observed else batch
+    return CascadeBatch(
+        Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
+        *parts,
+        seen=_all_seen(experiment, images, taken, seeds) if observed else None,
+    )
 
 
 def _all_seen(experiment: Experiment, images: Images, taken: list[RangeImage], seeds: tuple[int, ...]) -> Seen:
