@@ -1,4 +1,4 @@
-"""Noise that is alike all over a thing: what is of one piece is mostly of one material, as bright everywhere."""
+"""Noise that is alike all over a thing, which is mostly of one material, and that changes slowly on the ground."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from lidarsynth.networks.rays import Rays
 STEEPEST = math.radians(10)  # of the line between two hits to the farther ray, from which they are of one thing
 LOW, LEVEL = 0.8, -0.02  # of the way to flat ground, and radians of elevation, from which a hit is on the ground
 NONE = -1
+NODES = (8, 32)  # rows and columns from one node of the ground's noise to the next
 
 
 def things(metres: Tensor, rays: Rays) -> np.ndarray:
@@ -37,12 +38,23 @@ def things(metres: Tensor, rays: Rays) -> np.ndarray:
 
 
 def draw_on_things(of: np.ndarray, rng: torch.Generator | None = None) -> Tensor:
-    """(1, NOISES, H, W) as `draw_noise`, whose patches are the things (H, W) where there are any."""
+    """(1, NOISES, H, W) as `draw_noise`, whose patches are the things (H, W), and smooth elsewhere."""
     noise = draw_noise((1, *of.shape), rng)
     numbers, which = np.unique(of, return_inverse=True)
     each = torch.randn(len(numbers), generator=rng)[torch.from_numpy(which.reshape(of.shape))]
-    noise[0, 2] = torch.where(torch.from_numpy(of != NONE), each, noise[0, 2])
+    noise[0, 2] = torch.where(torch.from_numpy(of != NONE), each, _smooth(*of.shape, rng))
     return noise
+
+
+def _smooth(height: int, width: int, rng: torch.Generator | None) -> Tensor:
+    """(H, W) unit Gaussians that go from one node to the next, around the turn."""
+    tall, wide = NODES
+    columns = max(width // wide, 1)
+    nodes = torch.randn(height // tall + 2, columns, generator=rng)
+    row, column = torch.arange(height) / tall, torch.arange(width) * (columns / width)
+    down, along = ((place - place.floor()) * (math.pi / 2) for place in (row, column))
+    across = nodes[:, column.long()] * along.cos() + nodes.roll(-1, 1)[:, column.long()] * along.sin()
+    return across[row.long()] * down.cos()[:, None] + across[row.long() + 1] * down.sin()[:, None]
 
 
 def _alike(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> np.ndarray:
