@@ -1,6 +1,7 @@
 """What a network learns from perfect scans, from realised ones and from streets as the sensor sees them.
 
 python benchmarks/realise_training.py --network pixels|rangenet --judge FOLDER... [--scans 128] [--steps 600]
+    [--model default]
 
 The same places three times: as a simulator casts them (no reflectance; the network is judged without it too), made real
 by `realise`, and as the streets' sensor model sees them; and the last without reflectance, so that the worth of the
@@ -38,9 +39,9 @@ SEED, CUTS, COLUMNS, PIXELS, RATE = 901, 4, 256, 8192, 4e-3
 Prepare = Callable[[RangeImage], np.ndarray]  # -> (C, 64, 1024)
 
 
-def places(count: int) -> dict[str, list[RangeImage]]:
+def places(count: int, word: str) -> dict[str, list[RangeImage]]:
     """The kinds of scans by name, four places of each world."""
-    streets, model = SyntheticStreets(SEED, 1 << 30, SENSOR), load("default").into(SENSOR)
+    streets, model = SyntheticStreets(SEED, 1 << 30, SENSOR), load(word).into(SENSOR)
     perfect, seen = zip(*(streets.pair(POSES * (k // 4) + 4 * (k % 4)) for k in range(count)), strict=True)
     real = [model.realised(p.to_scan(), SENSOR, seed=k) for k, p in enumerate(perfect)]
     real = [replace(image, completed=None, xyz=None) for image in real]
@@ -147,10 +148,11 @@ def main() -> None:
     parser.add_argument("--generated", type=int, default=0, help="learn from so many generated scans instead")
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--model", default="default", help="that realises")
     parser.add_argument("--judge", type=Path, nargs="+", default=[])
     args = parser.parse_args()
     torch.set_num_threads(1)
-    kinds = {"generated, labelled": generated(args.generated)} if args.generated else places(args.scans)
+    kinds = {"generated, labelled": generated(args.generated)} if args.generated else places(args.scans, args.model)
     counts = np.bincount(np.concatenate([classes_of(i).ravel() for i in list(kinds.values())[-1]]), minlength=20)
     counts = np.where(np.arange(20) > 0, counts, 0)
     weights = class_weights(counts / counts.sum()) * (torch.arange(20) > 0)
