@@ -6,7 +6,7 @@ python benchmarks/realise.py --real FOLDER [--model default]           real scan
 The perfect scan of a street is what its rays meet; that of a real scan is its completion by the same model. Both are
 judged against what the sensor really reported. Beside it: nothing dropped, as many rays dropped at random, and in each
 beam as many as the truth drops there (cf. the frequency maps of DUSty v2), and with --inversion what a GAN drops whose
-image is that scan (DUSty v2, WACV 2023); these get the mean reflectance of the truth.
+image is that scan (DUSty v2, WACV 2023); these get the mean reflectance of the truth. --picture draws the first three.
 Columns:
 
 dropped          share of the perfect scan's rays that do not return
@@ -36,12 +36,15 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.pictures.figure import panel
+from lidarsynth.pictures.render import reflectance_strip, save_png
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.gan.model import GanModel
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.segmentation.training import confusion
 from lidarsynth.weights.load import load, load_parts
 
+SHOWN = 3  # scans of a picture
 BINS = np.array([0, 5, 10, 20, 30, 50, 80, 200])  # metres
 Pair = tuple[RangeImage, RangeImage]  # perfect, as the sensor reported it
 
@@ -154,12 +157,23 @@ def table(
         yield f"| {name} | {' | '.join(row(images, pairs))} | {distance} | {share} |"
 
 
+def picture(pairs: Sequence[Pair], model: ScanModel) -> np.ndarray:
+    """(H', W', 3) uint8: reflectances that the sensor measured, and those realised, of the first scans."""
+    rows = []
+    for k, (perfect, seen) in enumerate(pairs[:SHOWN]):
+        real = model.realised(perfect.to_scan(), perfect.sensor, seed=k)
+        rows += [[("as the sensor saw it", reflectance_strip(seen))]]
+        rows += [[(f"realised from its surfaces by {model.experiment.name}", reflectance_strip(real))]]
+    return panel(rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--streets", type=int, default=0, help="how many")
     parser.add_argument("--real", type=Path, help="a folder of KITTI's .bin files or labelled .npz images")
     parser.add_argument("--sensor", default="hdl-64e-kitti")
     parser.add_argument("--model", default="default")
+    parser.add_argument("--picture", type=Path, help="a .png to write instead of the table")
     parser.add_argument("--inversion", help="a GAN beside it: DUSty v2, trained on scans of the sensor")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -171,6 +185,9 @@ def main() -> None:
     else:
         pairs = list(street_pairs(sensor, args.streets))
         others = [SyntheticStreets(SEED, 1 << 40, sensor, apart=True).image(k) for k in range(args.streets)]
+    if args.picture:
+        print(save_png(args.picture, picture(pairs, model)))
+        return
     gan = None if args.inversion is None else load(args.inversion).into(sensor)
     if not (gan is None or isinstance(gan, GanModel)):
         raise SystemExit(f"{args.inversion}: expected a GAN, found {gan.experiment.model.network}")
