@@ -37,12 +37,12 @@ def things(metres: Tensor, rays: Rays) -> np.ndarray:
     return np.where(hit, _joined(far.size, first, second).reshape(count, height, width), NONE)
 
 
-def draw_on_things(of: np.ndarray, rng: torch.Generator | None = None) -> Tensor:
-    """(1, NOISES, H, W) as `draw_noise`, whose patches are the things (H, W), and smooth elsewhere."""
+def draw_on_things(of: np.ndarray, rng: torch.Generator | None = None, ground: float = 1.0) -> Tensor:
+    """(1, NOISES, H, W) as `draw_noise`, whose patches are the things (H, W), and elsewhere smooth, so much of it."""
     noise = draw_noise((1, *of.shape), rng)
     numbers, which = np.unique(of, return_inverse=True)
     each = torch.randn(len(numbers), generator=rng)[torch.from_numpy(which.reshape(of.shape))]
-    noise[0, 2] = torch.where(torch.from_numpy(of != NONE), each, _smooth(*of.shape, rng))
+    noise[0, 2] = torch.where(torch.from_numpy(of != NONE), each, ground * _smooth(*of.shape, rng))
     return noise
 
 

@@ -25,17 +25,17 @@ from lidarsynth.streets.sensor_model import range_noise, speckled
 
 class Grain(NamedTuple):
     """How much samples take of each kind of noise of training, speckle, stripes and patches; and of `draw_coherent`,
-    where whether rays return has noise of its own. things: whether patches are those that stand on the ground."""
+    where whether rays return has noise of its own. ground: patches are the things, and how much there is on the ground."""
 
     noise: tuple[float, float, float]
     returning: tuple[float, float, float] | None = None
-    things: bool = False
+    ground: float | None = None
 
 
 # Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
-# `realise`'s; that of an observer.
+# `realise`'s; an observer's: less on the ground than it learned, with which streets are read better (docs/simulation.md).
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
-OBSERVED = Grain((1.0, 1.0, 1.0), things=True)
+OBSERVED = Grain((1.0, 1.0, 1.0), ground=0.6)
 # Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
 # before or behind it: of some rays, of a few more, as a crown is deep, and of the others none. Chosen by street-2
 # (docs/training-default.md), where streets have 0.08, 0.035 and 0.02 for all of them.
@@ -132,8 +132,8 @@ def drawn(grain: Grain, known: Known, rays: Rays, rng: list[torch.Generator] | N
     shape = (known.told.shape[2], known.told.shape[3])
     if rng is None:
         return torch.zeros(len(known.told), NOISES, *shape), None
-    if grain.things:
-        each = [draw_on_things(of, one) for of, one in zip(things(known.metres, rays), rng, strict=True)]
+    if grain.ground is not None:
+        each = [draw_on_things(of, one, grain.ground) for of, one in zip(things(known.metres, rays), rng, strict=True)]
         return torch.tensor(grain.noise)[:, None, None] * torch.cat(each), None
     noise = weighted(draw_noise, grain.noise, shape, rng)
     return noise, None if grain.returning is None else weighted(draw_coherent, grain.returning, shape, rng)
