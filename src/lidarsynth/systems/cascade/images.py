@@ -25,7 +25,7 @@ from lidarsynth.streets.sensor_model import range_noise, speckled
 
 class Grain(NamedTuple):
     """How much samples take of each kind of noise of training, speckle, stripes and patches; and of `draw_coherent`,
-    where whether rays return has noise of its own. ground: patches are the things, and how much there is on the ground."""
+    where whether rays return has noise of its own. ground: patches are things; how much is on the ground."""
 
     noise: tuple[float, float, float]
     returning: tuple[float, float, float] | None = None
@@ -33,7 +33,7 @@ class Grain(NamedTuple):
 
 
 # Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
-# `realise`'s; an observer's: less on the ground than it learned, with which streets are read better (docs/simulation.md).
+# `realise`'s; an observer's, less on the ground than it learned, with which streets are read better.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 OBSERVED = Grain((1.0, 1.0, 1.0), ground=0.6)
 # Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
