@@ -33,9 +33,10 @@ class Grain(NamedTuple):
 
 
 # Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
-# `realise`'s; an observer's, less on the ground than it learned, with which streets are read better.
+# `realise`'s; an observer's, less on the ground than it learned, with which streets are read better; that of one which
+# learned from scans of the sensor, all of it.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
-OBSERVED = Grain((1.0, 1.0, 1.0), ground=0.6)
+OBSERVED, TUNED = Grain((1.0, 1.0, 1.0), ground=0.6), Grain((1.0, 1.0, 1.0), ground=1.0)
 # Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
 # before or behind it: of some rays, of a few more, as a crown is deep, and of the others none. Chosen by street-2
 # (docs/training-default.md), where streets have 0.08, 0.035 and 0.02 for all of them.

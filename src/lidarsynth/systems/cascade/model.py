@@ -235,7 +235,7 @@ class CascadeModel(ScanModel):
         scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
         model = self.suited_to(scan) if sensor is None else self.into(sensor)
         model = model.into(fitting(scan, model.sensor, projection))
-        network, grain = observing(self.network)
+        network, grain = observing(self.network, model.tuned)
         model = replace(model, network=network, grain=grain, labelled=False)
         image = project(scan, model.sensor, projection).keep(~model._blocked)
         if not image.mask.any():

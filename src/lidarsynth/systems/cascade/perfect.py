@@ -12,7 +12,7 @@ from lidarsynth.lidar.projection import pixel_of_points, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.systems.cascade.images import OBSERVED, REALISED, Grain
+from lidarsynth.systems.cascade.images import OBSERVED, REALISED, TUNED, Grain
 
 ALIKE = 1.33  # a scan with so many times the sensor's columns, or so many times fewer, has its own
 COLUMNS = (128, 4096)
@@ -28,11 +28,14 @@ def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
     return sensor.resized(width=int(np.clip(full, *COLUMNS)))
 
 
-def observing(network: Cascade) -> tuple[Cascade, Grain]:
-    """The networks whose fill says what a sensor reports, the observer where there is one, and the noise it takes."""
+def observing(network: Cascade, tuned: bool) -> tuple[Cascade, Grain]:
+    """The networks whose fill says what a sensor reports, the observer where there is one, and the noise it takes.
+
+    tuned  whether it learned from scans of this sensor
+    """
     if network.observer is None:
         return network, REALISED
-    return Cascade(network.coarse, network.observer), OBSERVED
+    return Cascade(network.coarse, network.observer), TUNED if tuned else OBSERVED
 
 
 def logistic(logit: Tensor, rng: list[torch.Generator]) -> Tensor:
