@@ -53,9 +53,7 @@ class Model:
     between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none
     beam_channels: int = within(0, 0, 8192)  # cascade: width of what draws the beams between those, 0 = none
     likeliest: bool = False  # cascade: a fill of its own for the image of least error; samples are by the other
-    observer_channels: int = within(
-        0, 0, 8192
-    )  # cascade: width of the fill that says what is seen of surfaces, 0 = none
+    observer_channels: int = within(0, 0, 8192)  # cascade: width of what says what is seen of surfaces, 0 = none
     dropout: float = within(0.0, 0, 0.999)
 
     def __post_init__(self):

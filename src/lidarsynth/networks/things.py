@@ -42,7 +42,7 @@ def draw_on_things(of: np.ndarray, rng: torch.Generator | None = None, ground: f
     noise = draw_noise((1, *of.shape), rng)
     numbers, which = np.unique(of, return_inverse=True)
     each = torch.randn(len(numbers), generator=rng)[torch.from_numpy(which.reshape(of.shape))]
-    noise[0, 2] = torch.where(torch.from_numpy(of != NONE), each, ground * _smooth(*of.shape, rng))
+    noise[0, 2] = torch.where(torch.from_numpy(of != NONE), each, ground * _smooth(of.shape[0], of.shape[1], rng))
     return noise
 
 
