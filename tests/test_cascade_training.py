@@ -225,7 +225,7 @@ def test_with_a_base_the_fills_of_one_sensor_alone_are_learned_and_kept(tmp_path
     assert kept and {name.split(".")[0] for name in kept} == {"likeliest", "observer"}
     before, after = (load(source).network.state_dict() for source in ("default", tmp_path / "run"))
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
-    assert changed == {"likeliest"}
+    assert changed == {"likeliest", "observer"}
 
 
 def test_what_columns_are_told_of_their_neighbours_is_spoilt_at_times_and_never_what_they_learn():
