@@ -23,20 +23,21 @@ HIDDEN = 32
 class Reader(nn.Module):
     """`reader(x) -> logits` (B, 20, H, W) of x (B, 5 or 15, H, W): RangeNet's input, and the channels of `geometry`.
 
-    Begins as street-1's RangeNet: what is added, to the first convolution and to the logits, begins at 0.
+    Begins as street-1's RangeNet: what is added, to the first convolution and to the logits, begins at 0. Or, with a
+    width, as one of 21 layers that has learned nothing.
     """
 
-    def __init__(self, told: bool):
+    def __init__(self, told: bool, width: int | None = None):
         super().__init__()
-        network = load_parts(WORD)[1]
+        network = RangeNet(21, width) if width else load_parts(WORD)[1]
         assert isinstance(network, RangeNet)
-        self.rangenet, self.told, width = network, told, network.width
+        self.rangenet, self.told, width, fresh = network, told, network.width, width is not None
         if told:
             self.stem = nn.Conv2d(CHANNELS, width, 3, padding=1, bias=False)
             self.pixel = nn.Conv2d(5 + CHANNELS, HIDDEN, 1)
             self.mixed = nn.Conv2d(HIDDEN + width, HIDDEN, 1)
             self.classes = nn.Conv2d(HIDDEN, len(CLASSES), 1)
-            for weights in (self.stem.weight, self.classes.weight, self.classes.bias):
+            for weights in () if fresh else (self.stem.weight, self.classes.weight, self.classes.bias):
                 assert weights is not None
                 nn.init.zeros_(weights)
 
