@@ -68,8 +68,8 @@ def said(network: ColumnTransformer, grid: Grid, rays: torch.Tensor) -> tuple[to
     """All that a network says of a whole grid, by the plan that `rngs()` draw."""
     plan = drawn_plan(network, rays, chances()[1])
     around = network.context(grid, rays, plan)[:, None]
-    expected = ranges_expected(grid, rays)
-    drawn = network.pixel(told(grid, rays, *expected, plan), around, *expected)
+    *expected, wall = ranges_expected(grid, rays)
+    drawn = network.pixel(told(grid, rays, *expected, wall, plan), around, *expected)
     return (*drawn[:4], *network.shades(drawn, grid.code, expected[0], *shades_expected(grid)))
 
 
@@ -127,7 +127,7 @@ def test_columns_that_are_judged_are_judged_as_among_all(network: ColumnTransfor
 def test_hypotheses_are_exact_on_ground_slopes_and_walls(normal: tuple[float, float, float], level: float, which: int):
     grid = known_grid(to_plane(normal, level), torch.full((1, ROWS, COLUMNS), 0.3))
     rays, _ = grid_rays(SENSOR, np.zeros((ROWS, COLUMNS), bool), np.arange(ROWS), np.arange(COLUMNS))
-    codes, valid = ranges_expected(grid, rays[None])
+    codes, valid, _ = ranges_expected(grid, rays[None])
     judged = valid[..., which] & grid.returned & (grid.code < 0.5)  # to 60 m
     if which == 0:
         judged &= torch.arange(ROWS)[None, :, None] > 4  # flat ground below the horizon
@@ -140,7 +140,7 @@ def test_an_untrained_networks_hypotheses_need_neighbours():
     rays, _ = grid_rays(
         replace(SENSOR, tilt=(2.0, 1.0)), np.zeros((ROWS, COLUMNS), bool), np.arange(ROWS), np.arange(COLUMNS)
     )
-    codes, valid = ranges_expected(grid, rays[None])
+    codes, valid, _ = ranges_expected(grid, rays[None])
     assert valid[..., 0].all() and not valid[..., 1:].any()
     assert torch.isfinite(codes).all()
 

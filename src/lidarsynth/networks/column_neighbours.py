@@ -10,10 +10,11 @@ from torch.nn import functional as F
 
 from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS
 from lidarsynth.networks.rays import decode_range, encode_range
+from lidarsynth.networks.wall_lines import walls
 
 LEFT, AROUND = 3, 2  # columns to the left, and rows up and down in them, that a pixel is told
-HYPOTHESES, SHADES = 8, 3  # of range, of reflectance
-FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 5
+HYPOTHESES, SHADES = 12, 3  # of range, of reflectance
+FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 5 + 5
 SECTORS, LEVELS, HIGHEST = 16, 24, 1.05  # of the turn; of how far one is open; code of one without returns
 NEAREST, FARTHEST = 0.5, 300.0  # metres of hypotheses
 
@@ -83,12 +84,14 @@ def far_as_planned(plan: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return code.repeat_interleave(columns, 1), code.roll(-1, 1).repeat_interleave(columns, 1), part
 
 
-def ranges_expected(grid: Grid, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Range codes (B, H, W, 8) as neighbours to the left and below would have them, and whether they say anything."""
+def ranges_expected(grid: Grid, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Range codes (B, H, W, 12) as neighbours to the left and below would have them, whether they say anything, and
+    the `character` (B, H, W, 5) of the walls to the left."""
     near = nearness(grid.code, grid.returned, rays)
     left, left2 = (_right(near, k) for k in (1, 2))
     above, under = F.pad(left, (0, 0, 1, 0))[:, :-1], moved_up(left, 1)
-    return guesses(left, left2, above, under, moved_up(near, 1), moved_up(near, 2), steepening(rays), rays)
+    below, seen = (moved_up(near, 1), moved_up(near, 2)), walls(near, rays)
+    return *guesses(left, left2, above, under, *below, steepening(rays), rays, seen.nearness), seen.character
 
 
 def steepening(rays: Tensor) -> Tensor:
@@ -112,22 +115,27 @@ def guesses(
     below2: Tensor,
     steeper: Tensor,
     rays: Tensor,
+    standing: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Range codes (B, ..., 8) and whether they say anything, of pixels (B, ...) whose neighbours are so near.
+    """Range codes (B, ..., 12) and whether they say anything, of pixels (B, ...) whose neighbours are so near.
 
     Flat ground; as far as the one to the left; the plane of the two to the left; upright above the one below; the slope
-    of the two below; the plane of three; as far as the one above to the left; and as the second to the left.
+    of the two below; the plane of three; as far as the one above to the left; as the second to the left; and the four
+    walls of `Walls.nearness`.
 
     under, above  those to the left of the one below and of the one above; steeper: ratio of the steps of the slope
+    standing      (B, ..., 4), 0 where there is none
     """
     near = torch.stack(
         [left, 2 * left - left2, below, below + (below - below2) * steeper, left + below - under, above, left2], -1
     )
+    near = torch.cat([near, standing], -1)
     there = torch.stack([left, left2, below, below2, under, above], -1) > 0
     a, a2, b, b2, ab, c = there.unbind(-1)
     level, ground = levelled(rays)[..., None], rays[:, 1, ..., None] / 2
     metres = 1 / (near.clamp_min(1e-4) * level)
-    valid = torch.stack([a, a & a2, b, b & b2, a & b & ab, c, a2], -1) & (metres < FARTHEST) & (metres > NEAREST)
+    said = torch.cat([torch.stack([a, a & a2, b, b & b2, a & b & ab, c, a2], -1), standing > 0], -1)
+    valid = said & (metres < FARTHEST) & (metres > NEAREST)
     codes = torch.where(valid, encode_range(metres.clamp(NEAREST, FARTHEST)), ground)
     return torch.cat([ground, codes], -1), torch.cat([torch.ones_like(valid[..., :1]), valid], -1)
 
@@ -160,14 +168,14 @@ def beneath_of(known: Tensor) -> Tensor:
     return torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
 
 
-def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, plan: Tensor) -> Tensor:
+def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, wall: Tensor, plan: Tensor) -> Tensor:
     """(B, H, W, F): what each pixel is told of those around, of its ray and its row, what it may be, and the plan."""
     known = relative(grid, rays)
     height = known.shape[1]
     beneath = beneath_of(known)
     rows = torch.eye(height, device=known.device)[None, :, None].expand(*known.shape[:3], height)
     ahead = [part[:, None] for part in far_as_planned(plan)]
-    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, rows, *ahead)
+    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, wall, rows, *ahead)
 
 
 def told_of(
@@ -176,19 +184,21 @@ def told_of(
     rays: Tensor,
     hypotheses: Tensor,
     valid: Tensor,
+    wall: Tensor,
     row: Tensor,
     aim: Tensor,
     after: Tensor,
     part: Tensor,
 ) -> Tensor:
     """`told` of pixels (..., F), of the parts that are theirs: beside (..., 45), beneath (..., 45), rays (..., 8),
-    hypotheses (..., 8), row (..., 16), which is one-hot, and what is planned (...)."""
+    hypotheses (..., 12), the `character` of walls (..., 5), row (..., 16), which is one-hot, and what is planned
+    (...)."""
     own = (4 * (hypotheses - hypotheses[..., :1])).clamp(-4, 4)
     fine = torch.asinh(200 * (hypotheses - hypotheses[..., 3:4])) / 4
     ground, left = hypotheses[..., 0], hypotheses[..., 1]
     ahead = [(4 * (aim - ground)).clamp(-4, 4), (4 * (after - ground)).clamp(-4, 4), torch.tanh(10 * (aim - left)),
              torch.tanh(10 * (after - left)), part.expand_as(ground)]  # fmt: skip
-    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, torch.stack(ahead, -1)], -1)
+    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, torch.stack(ahead, -1), wall], -1)
 
 
 def levelled(rays: Tensor) -> Tensor:

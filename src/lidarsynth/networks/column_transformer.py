@@ -31,8 +31,9 @@ from lidarsynth.networks.column_neighbours import (
     values,
 )
 from lidarsynth.networks.pixel_mixture import CODES, TONES, PixelDrawer, picked
+from lidarsynth.networks.wall_lines import WallMemory
 
-SHARP, HEAT = 1.0, 1.0  # of draws: chosen by street-2 (docs/training-default.md)
+SHARP, HEAT = 0.85, 1.0  # of draws: chosen by street-2 (docs/training-default.md)
 
 
 class ColumnTransformer(PixelDrawer):
@@ -71,9 +72,10 @@ class ColumnTransformer(PixelDrawer):
         here, seen = slice(None) if columns is None else columns, seen or grid
         plan = openness(grid)
         around = self.context(seen, rays, plan)[:, None, here]  # (B, 1, 128, D)
-        expected = ranges_expected(seen, rays)
-        features = told(seen, rays, *expected, plan)[:, :, here]  # (B, 16, 128, F)
-        hypotheses, valid, copies, copied = (part[:, :, here] for part in (*expected, *shades_expected(seen)))
+        hypotheses, valid, wall = ranges_expected(seen, rays)
+        features = told(seen, rays, hypotheses, valid, wall, plan)[:, :, here]  # (B, 16, 128, F)
+        expected = (hypotheses, valid, *shades_expected(seen))
+        hypotheses, valid, copies, copied = (part[:, :, here] for part in expected)
         grid, free = Grid(*(part[:, :, here] for part in grid)), rays[:, 6, :, here] < 0.5
         drawn = self.pixel(features, around, hypotheses, valid)
         mean = self.unlikelihood(drawn, grid, hypotheses, copies, copied, free)
@@ -151,6 +153,7 @@ def draw(
     kept: list[list[Tensor]] = [[] for _ in network.layers]
     steeper, rows = steepening(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
     none, nothing = rays.new_zeros(count), rays.new_zeros(count, 3 * (ROWS - 1))
+    memory = WallMemory(rays)
     left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
     for j in range(COLUMNS):
         before = values(Grid(*(part[:, :, j - 1 : j] for part in grid))) if j else rays.new_zeros(count, 3, ROWS, 1)
@@ -165,11 +168,12 @@ def draw(
         shades = [
             (grid.shade[..., j - k] if j >= k else torch.zeros_like(grid.shade[..., 0])).unbind(1) for k in (1, 2)
         ]
+        standing, character = (part.unbind(1) for part in memory.next())
         near, beneath, column, lower = [none, none], nothing, [], none
         for i, (beyond, ray, u, ratio, row) in reversed(list(enumerate(of_rows))):
             a, b = left[i + 1], left2[i + 1]
-            expected = guesses(a, b, left[i], left[i + 2], near[0], near[1], ratio, ray)
-            features = told_of(beyond, beneath, ray, *expected, row, *(part[j] for part in planned))
+            expected = guesses(a, b, left[i], left[i + 2], near[0], near[1], ratio, ray, standing[i])
+            features = told_of(beyond, beneath, ray, *expected, character[i], row, *(part[j] for part in planned))
             drawn = network.pixel(features, around, *expected)
             code = picked(drawn.choice, drawn.centre, drawn.scale, u[:, 1:3], sharp, heat, CODES)
             copied = torch.stack([a, b, near[0]], -1) > 0
@@ -187,6 +191,7 @@ def draw(
         for part, new in zip(grid, zip(*column, strict=True), strict=True):
             part[..., j] = torch.stack(new[::-1], 1)
         left2, left = left, [none, *near[:ROWS], none]
+        memory.see(torch.stack(near[:ROWS], 1))
         on_column()
     return grid
 

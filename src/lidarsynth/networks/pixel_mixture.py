@@ -53,7 +53,7 @@ class PixelDrawer(nn.Module, ABC):
         for block in self.blocks:
             x = block(x)
         count = self.guesses
-        returns, choice, shift, scale = self.range_head(x).split([1, count + CODES[2], count, count], -1)
+        returns, choice, shift, scale = self.range_head(x).float().split([1, count + CODES[2], count, count], -1)
         scale = SHARPEST + 0.02 * torch.exp(scale.clamp(-8, 2) - 1)
         return Drawn(returns[..., 0], _among(choice, valid), hypotheses + 0.02 * shift, scale, x)
 
@@ -63,7 +63,7 @@ class PixelDrawer(nn.Module, ABC):
         """Log shares (..., S + 36), centres and scales (..., S) of reflectance, told the range code (...)."""
         near = torch.tanh(20 * (code[..., None] - hypotheses))
         x = F.silu(self.shade_stem(torch.cat([drawn.hidden, near, code[..., None]], -1)))
-        choice, shift, scale = self.shade_head(x).split([self.copies + TONES[2], self.copies, self.copies], -1)
+        choice, shift, scale = self.shade_head(x).float().split([self.copies + TONES[2], self.copies, self.copies], -1)
         scale = SHARPEST_SHADE + 0.05 * torch.exp(scale.clamp(-6, 2) - 1)
         return _among(choice, copied), copies + 0.05 * shift, scale
 

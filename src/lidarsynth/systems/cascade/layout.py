@@ -20,6 +20,7 @@ from lidarsynth.networks.column_neighbours import Grid, known_grid, levelled, ne
 from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.rays import decode_range, encode_range
 from lidarsynth.streets.hdl64e import unevenness
+from lidarsynth.systems.cascade.facades import with_facades
 from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
 
@@ -167,7 +168,8 @@ def beyond(grid: Grid, rays: Tensor, new: Tensor, side: tuple[int, int]) -> Grid
 
 
 def _straight(grid: Grid, rows: np.ndarray, sensor: Sensor) -> Grid:
-    return known_grid(straightened(_metres(grid), rows, sensor, edges=True), grid.shade)
+    metres = straightened(_metres(grid), rows, sensor, edges=True)
+    return known_grid(with_facades(metres, rows, sensor), grid.shade)
 
 
 def _metres(grid: Grid) -> Tensor:

@@ -40,7 +40,7 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor, edges: bool =
         inverse = torch.cat([inverse[:, :1], inner, inverse[:, -1:]], 1)
     cosine = elevation.cos().clamp_min(1e-3)  # a beam may look straight up
     away = torch.where(returned, cosine / inverse.clamp_min(1e-6), 0)
-    return _upright(away, height) / cosine
+    return upright(away, height) / cosine
 
 
 def along_rings(metres: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ def _nearer(inverse: Tensor, one: Tensor, other: Tensor, share: Tensor | float, 
     return inverse + 0.5 * away * _same(away / inverse.clamp_min(1e-6), near)
 
 
-def _upright(away: Tensor, height: Tensor) -> Tensor:
+def upright(away: Tensor, height: Tensor) -> Tensor:
     """Horizontal distances (B, R, C), nearer to those of the beams above and below that meet the same wall."""
     ground = (height[:, 1:] / height[:, :-1]).clamp_min(1e-6).log().abs()  # between beams that both look down
     near = torch.where(height[:, :-1] < 0, (GROUND * ground).clamp(1e-6, NEAR), NEAR)
