@@ -165,9 +165,7 @@ def draw(
         window = relative(Grid(*(part[:, :, since : j + 1] for part in grid)), rays[..., since : j + 1])
         of_rows = zip(beside(window)[:, :, -1].unbind(1), rays[..., j].unbind(2), chance[..., j].unbind(2),
                       steeper[..., j].unbind(1), rows, strict=True)  # fmt: skip
-        shades = [
-            (grid.shade[..., j - k] if j >= k else torch.zeros_like(grid.shade[..., 0])).unbind(1) for k in (1, 2)
-        ]
+        shades = _shades_left(grid, j)
         standing, character = (part.unbind(1) for part in memory.next())
         near, beneath, column, lower = [none, none], nothing, [], none
         for i, (beyond, ray, u, ratio, row) in reversed(list(enumerate(of_rows))):
@@ -194,6 +192,12 @@ def draw(
         memory.see(torch.stack(near[:ROWS], 1))
         on_column()
     return grid
+
+
+def _shades_left(grid: Grid, column: int) -> list[tuple[Tensor, ...]]:
+    """Reflectances (B,) of each row of the next and the second column to the left, 0 beyond the first."""
+    zero = torch.zeros_like(grid.shade[..., 0])
+    return [(grid.shade[..., column - k] if column >= k else zero).unbind(1) for k in (1, 2)]
 
 
 def drawn_plan(network: ColumnTransformer, rays: Tensor, u: Tensor) -> Tensor:
