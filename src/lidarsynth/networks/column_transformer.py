@@ -152,8 +152,7 @@ def draw(
     grid = Grid(*(torch.zeros(shape, dtype=kind, device=device) for kind in kinds))
     kept: list[list[Tensor]] = [[] for _ in network.layers]
     steeper, rows = steepening(rays), torch.eye(ROWS, device=device).expand(count, ROWS, ROWS).unbind(1)
-    none, nothing = rays.new_zeros(count), rays.new_zeros(count, 3 * (ROWS - 1))
-    memory = WallMemory(rays)
+    none, nothing, memory = rays.new_zeros(count), rays.new_zeros(count, 3 * (ROWS - 1)), WallMemory(rays)
     left = left2 = [none] * (ROWS + 2)  # nearness of columns to the left, from the row above the first to that below
     for j in range(COLUMNS):
         before = values(Grid(*(part[:, :, j - 1 : j] for part in grid))) if j else rays.new_zeros(count, 3, ROWS, 1)
