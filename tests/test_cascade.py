@@ -24,6 +24,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade import model as cascade_model
 from lidarsynth.systems.cascade.images import noisy
 from lidarsynth.systems.cascade.known import spread
+from lidarsynth.systems.cascade.layout import one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.surfaces import straightened
 
@@ -541,3 +542,17 @@ def test_completion_asks_the_fill_of_least_error_and_generation_the_other(model:
     assert np.abs(plain.range - likely.range)[~known].max() > 0.01
     a, b = (one.complete(image.keep(known), known, method="sample", seed=1) for one in (model, other))
     np.testing.assert_array_equal(a.range, b.range)
+
+
+def test_threads_are_as_before_when_columns_are_drawn():
+    before, seen = torch.get_num_threads(), []
+
+    def drawn() -> None:
+        with one_thread():
+            seen.append(torch.get_num_threads())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        drawn()
+    assert seen == [1]
+    assert torch.get_num_threads() == before
