@@ -76,21 +76,40 @@ def batches(reader: Reader, images: Sequence[RangeImage], seed: int) -> Iterator
         inputs, labels = [], []
         for image in (images[k] for k in rng.integers(len(images), size=IMAGES)):
             values, label = cuts(image, rng)
-            x, first = reader.prepared(values[None]), rng.integers(image.shape[1])
-            for start in (first, first + image.shape[1] // 2):
-                columns = (start + np.arange(COLUMNS)) % image.shape[1]
-                inputs.append(x[..., columns])
-                labels.append(torch.from_numpy(label[:, columns]))
+            for x, classes in opposite(reader.prepared(values[None]), label, rng):
+                inputs.append(x)
+                labels.append(classes)
         yield torch.cat(inputs), torch.stack(labels)
+
+
+def opposite(x: Tensor, label: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[Tensor, Tensor]]:
+    """Two cuts (1, C, H, 256) and (H, 256), opposite to each other, of a scan (1, C, H, W) and its classes (H, W)."""
+    first, width = rng.integers(label.shape[1]), label.shape[1]
+    for start in (first, first + width // 2):
+        columns = (start + np.arange(COLUMNS)) % width
+        yield x[..., columns], torch.from_numpy(label[:, columns].astype(np.int64))
+
+
+def balance(images: Sequence[RangeImage]) -> Tensor:
+    """(20,) weights of the classes, by how many of the images' pixels are of each."""
+    labels = [np.where(i.mask, i.label, 0)[::2, ::4].ravel() for i in images if i.label is not None]
+    counts = np.bincount(np.concatenate(labels), minlength=len(CLASSES)).astype(float)
+    counts[0] = 0
+    weights = class_weights(counts / counts.sum())
+    weights[0] = 0
+    return weights
+
+
+@torch.no_grad()
+def average_in(average: nn.Module, new: nn.Module, kept: float) -> None:
+    """The average of weights of so far, of which `kept` stays, with the new ones."""
+    for mine, other in zip(average.state_dict().values(), new.state_dict().values(), strict=True):
+        mine.lerp_(other, 1 - kept) if mine.is_floating_point() else mine.copy_(other)
 
 
 def trained(reader: Reader, images: Sequence[RangeImage], minutes: float) -> Reader:
     """The average of the weights over the last steps, after that many minutes."""
-    labels = np.concatenate([i.label[::2, ::4].ravel() for i in images[::7] if i.label is not None])
-    counts = np.bincount(labels, minlength=len(CLASSES)).astype(float)
-    counts[0] = 0
-    weights = class_weights(counts / counts.sum())
-    weights[0] = 0
+    weights = balance(images[::7])
     optimizer = torch.optim.AdamW(reader.parameters(), RATE, weight_decay=1e-3)
     average, start = copy.deepcopy(reader), time.monotonic()
     reader.train()
@@ -106,9 +125,7 @@ def trained(reader: Reader, images: Sequence[RangeImage], minutes: float) -> Rea
         (losses.sum() / (label > 0).sum()).backward()
         nn.utils.clip_grad_norm_(reader.parameters(), 2.0)
         optimizer.step()
-        with torch.no_grad():
-            for mine, new in zip(average.state_dict().values(), reader.state_dict().values(), strict=True):
-                mine.lerp_(new, 1 - KEPT) if mine.is_floating_point() else mine.copy_(new)
+        average_in(average, reader, KEPT)
     return average.eval()
 
 

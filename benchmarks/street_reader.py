@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from street_classes import COLUMNS, Sample, cuts, judged, unlabelled, varied
+from street_classes import Sample, average_in, balance, cuts, judged, opposite, unlabelled, varied
 from street_network import Reader
 from torch import Tensor, nn
 
@@ -29,7 +29,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.segmentation.adaptation import adapted
-from lidarsynth.systems.segmentation.training import class_weights, pixels
+from lidarsynth.systems.segmentation.training import pixels
 
 WIDTH, POOL, IMAGES, JUDGED = 16, 1200, 3, 12_000  # JUDGED: pixels of a batch that the Lovasz-softmax sees
 RATE, LATER, KEPT = 3e-3, 8e-4, 0.99  # learning rates of both parts; share of the former average that a step keeps
@@ -68,12 +68,10 @@ def synthetic(reader: Reader, pool: Sequence[RangeImage], rng: np.random.Generat
 def halves(parts: Parts, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """(2 n, C, H, 256) and (2 n, H, 256): of each of n scans two opposite cuts."""
     inputs, labels = [], []
-    for x, label in parts:
-        first, width = rng.integers(label.shape[1]), label.shape[1]
-        for start in (first, first + width // 2):
-            columns = (start + np.arange(COLUMNS)) % width
-            inputs.append(x[..., columns])
-            labels.append(torch.from_numpy(label[:, columns].astype(np.int64)))
+    for part in parts:
+        for x, classes in opposite(*part, rng):
+            inputs.append(x)
+            labels.append(classes)
     return torch.cat(inputs), torch.stack(labels)
 
 
@@ -127,16 +125,9 @@ def taught(
 ) -> Reader:
     """The average of the weights over the last steps, after that many minutes; `kept` is written every five."""
     network, rng, reader = reader, np.random.default_rng(seed), copy.deepcopy(reader).train()
-    labels, pools = [], streets_of(seed)
-    optimizer, start, said = torch.optim.AdamW(reader.parameters(), rate, weight_decay=1e-3), time.monotonic(), 0.0
-    pool = next(pools)
-    for image in pool[::5]:
-        assert image.label is not None
-        labels.append(np.where(image.mask, image.label, 0)[::2, ::4].ravel())
-    counts = np.bincount(np.concatenate(labels), minlength=len(CLASSES)).astype(float)
-    counts[0] = 0
-    weights, bf16 = class_weights(counts / counts.sum()), resolved_precision("auto", torch.device("cpu")) == "bf16"
-    weights[0] = 0
+    pools, bf16 = streets_of(seed), resolved_precision("auto", torch.device("cpu")) == "bf16"
+    optimizer, weights = torch.optim.AdamW(reader.parameters(), rate, weight_decay=1e-3), balance(next(pools)[::5])
+    start, said = time.monotonic(), 0.0
     told: list[Sample] = []
     for step, pool in enumerate(pools):
         spent = (time.monotonic() - start) / 60
@@ -162,9 +153,7 @@ def taught(
         (losses.sum() / (label > 0).sum() + lovasz(flat[some], classes[some])).backward()
         nn.utils.clip_grad_norm_(reader.parameters(), 2.0)
         optimizer.step()
-        with torch.no_grad():
-            for mine, new in zip(network.state_dict().values(), reader.state_dict().values(), strict=True):
-                mine.lerp_(new, 1 - KEPT) if mine.is_floating_point() else mine.copy_(new)
+        average_in(network, reader, KEPT)
         if kept and spent - said > 5:
             said = spent
             torch.save(network.state_dict(), kept)

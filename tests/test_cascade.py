@@ -556,3 +556,15 @@ def test_threads_are_as_before_when_columns_are_drawn():
         drawn()
     assert seen == [1]
     assert torch.get_num_threads() == before
+
+
+def test_columns_are_drawn_in_one_thread_and_all_else_as_before(model: CascadeModel):
+    columns = ColumnTransformer(16, layers=1, pixel=16, blocks=1).eval()
+    both = replace(model, network=Cascade(model.network.coarse, model.network.fill, None, columns))
+    before, seen = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        both.generate(1, seed=5, on_step=lambda: seen.append(torch.get_num_threads()))
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1] * 128 + [2]
