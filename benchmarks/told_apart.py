@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarsynth.diffusion.samplers import generators
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS
 from lidarsynth.networks.column_neighbours import Grid, known_grid, nearness
@@ -26,6 +27,7 @@ from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.fill_unet import ring
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import grid
+from lidarsynth.systems.cascade.layout import draft
 from lidarsynth.weights.load import load_parts
 
 SEED, TOGETHER, BATCH, RATE, WIDTH, BLOCKS = 4242, 64, 12, 2e-3, 48, 4
@@ -70,12 +72,13 @@ def both(cascade: Cascade, count: int) -> tuple[Grid, Grid, Tensor]:
     """`count` true grids (B, 16, 128), as many drawn ones, and their rays (B, 8, 16, 128)."""
     assert cascade.columns is not None
     streets, rng, drawn = VirtualStreets(SEED, 1 << 40), np.random.default_rng(SEED), []
-    metres, reflectance, rays = map(
-        torch.stack, zip(*(grid(streets.image(k), rng)[:3] for k in range(count)), strict=True)
+    metres, reflectance, rays, standing = map(
+        torch.stack, zip(*(grid(streets.image(k), rng) for k in range(count)), strict=True)
     )
     for first in range(0, count, TOGETHER):
-        part = rays[first : first + TOGETHER]
-        drawn.append(draw(cascade.columns, part, [torch.Generator().manual_seed(first + k) for k in range(len(part))]))
+        told = rays[first : first + TOGETHER], standing[first : first + TOGETHER]
+        rngs = generators(first, len(told[0]))
+        drawn.append(draw(cascade.columns, told[0], draft(cascade, *told, rngs), rngs))
     true = known_grid(metres, reflectance.clamp(-0.1, 1.1))
     return true, Grid(*(torch.cat(part).clone() for part in zip(*drawn, strict=True))), rays
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from lidarsynth.diffusion.samplers import generators
+from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Data, Experiment, Model
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -17,6 +19,7 @@ from lidarsynth.networks.candidates import BEND, candidates
 from lidarsynth.networks.cascade import GUIDANCE, Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet, grid_columns, grid_rays, grid_rows, left_filled
 from lidarsynth.networks.column_transformer import ColumnTransformer
+from lidarsynth.networks.drafts import BOUND
 from lidarsynth.networks.fill_unet import NOISES, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import decode_range, encode_range, level_sines, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden, written_out
@@ -24,7 +27,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade import model as cascade_model
 from lidarsynth.systems.cascade.images import noisy
 from lidarsynth.systems.cascade.known import spread
-from lidarsynth.systems.cascade.layout import one_thread
+from lidarsynth.systems.cascade.layout import DRAFT, draft, one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.surfaces import straightened
 
@@ -542,6 +545,22 @@ def test_completion_asks_the_fill_of_least_error_and_generation_the_other(model:
     assert np.abs(plain.range - likely.range)[~known].max() > 0.01
     a, b = (one.complete(image.keep(known), known, method="sample", seed=1) for one in (model, other))
     np.testing.assert_array_equal(a.range, b.range)
+
+
+def test_a_draft_is_noise_led_half_way_each_by_its_own_generator(model: CascadeModel):
+    rays, standing = (part[None].expand(3, *part.shape) for part in grid_rays(
+        SMALL, SMALL.blocked_rays(), grid_rows(SMALL.height), grid_columns(SMALL.width)))  # fmt: skip
+    network = Cascade(model.network.coarse, model.network.fill)
+    three = draft(network, rays, standing, generators(5, 3))
+    (last,) = draft(network, rays[:1], standing[:1], generators(7, 1))
+    assert_close(three[2], last, atol=1e-4, rtol=1e-4)
+    assert (three[0] - three[1]).abs().max() > 0.1
+    assert three[:, 6].unique().item() == pytest.approx(
+        flow(BOUND).log_snr(torch.tensor(DRAFT)).item() / BOUND, abs=1e-5
+    )
+    quiet = draft(network, rays, standing, generators(5, 3), t=0.05)
+    noise = (three[:, :2] - three[:, 2:4]).std(), (quiet[:, :2] - quiet[:, 2:4]).std()
+    assert noise[1] < noise[0] / 4  # x_t and the mean of what it may become are the nearer, the less noise is left
 
 
 def test_threads_are_as_before_when_columns_are_drawn():

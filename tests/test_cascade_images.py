@@ -128,7 +128,7 @@ def test_cells_are_connected_through_others():
     assert not connected(chain, chain + 1, 1000).any()
 
 
-def test_half_of_what_hangs_is_taken_away_and_what_stands_stays():
+def test_three_tenths_of_what_hangs_are_taken_away_and_what_stands_stays():
     metres, shade = np.full((1, 32, 256), 20.0, np.float32), np.full((1, 32, 256), 0.3, np.float32)
     metres[:, 24:] = 8  # ground, nearer than the wall
     metres[0, 10:24, 40:44] = 7.5  # a post that stands on it
@@ -153,4 +153,4 @@ def test_half_of_what_hangs_is_taken_away_and_what_stands_stays():
         rest[12:15] = False
         np.testing.assert_allclose(found[rest], metres[0][rest], rtol=1e-4)
         np.testing.assert_allclose(found[12:15, 40:44], 7.5, rtol=1e-4)
-    assert 0.35 < np.mean(left) < 0.65 and min(left) < 0.5 < max(left)
+    assert 0.6 < np.mean(left) < 0.8 and min(left) < 0.7 < max(left)

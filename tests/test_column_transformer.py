@@ -9,28 +9,28 @@ import torch
 from torch.testing import assert_close
 
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, grid_rays
+from lidarsynth.networks.coarse_unet import COLUMNS, ROWS, CoarseUNet, grid_rays
 from lidarsynth.networks.column_neighbours import (
-    SECTORS,
     Grid,
     known_grid,
-    openness,
     ranges_expected,
     shades_expected,
     told,
 )
-from lidarsynth.networks.column_transformer import ColumnTransformer, draw, drawn_plan
+from lidarsynth.networks.column_transformer import ColumnTransformer, draw
+from lidarsynth.networks.drafts import DRAFT_CHANNELS, drafted
 from lidarsynth.networks.pixel_mixture import CODES, TONES, mixture, picked
+from lidarsynth.networks.rays import encode_range
 
 SENSOR = Sensor("sixteen", tuple(np.linspace(6, -24, ROWS).tolist()), COLUMNS, 0.5, 120.0, mount=1.8)
 
 
 @pytest.fixture(scope="module")
 def network() -> ColumnTransformer:
-    """Untrained, and not indifferent to the plan."""
+    """Untrained, and not indifferent to the draft."""
     torch.manual_seed(0)
     network = ColumnTransformer(32, layers=2, pixel=24, blocks=1).eval()
-    torch.nn.init.normal_(network.planned.weight, std=0.3)
+    torch.nn.init.normal_(network.read.weight, std=0.3)
     return network
 
 
@@ -42,8 +42,19 @@ def rays() -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def drawn(network: ColumnTransformer, rays: torch.Tensor) -> Grid:
-    return draw(network, rays, rngs(), sharp=0.5, heat=1.0)
+def draft() -> torch.Tensor:
+    return torch.randn(2, DRAFT_CHANNELS, ROWS, COLUMNS, generator=torch.Generator().manual_seed(5))
+
+
+@pytest.fixture(scope="module")
+def drawn(network: ColumnTransformer, rays: torch.Tensor, draft: torch.Tensor) -> Grid:
+    return draw(network, rays, draft, rngs(), sharp=0.5, heat=1.0)
+
+
+def of_rays() -> tuple[torch.Tensor, torch.Tensor]:
+    """Of one image without anything blocked."""
+    parts = grid_rays(SENSOR, np.zeros((ROWS, COLUMNS), bool), np.arange(ROWS), np.arange(COLUMNS))
+    return parts[0][None], parts[1][None]
 
 
 def rngs(first: int = 0) -> list[torch.Generator]:
@@ -56,26 +67,28 @@ def to_plane(normal: tuple[float, float, float], level: float) -> torch.Tensor:
     return torch.from_numpy(np.where(nearer > 1 / 120, 1 / np.maximum(nearer, 1 / 120), 0)).float()[None]
 
 
-def chances() -> tuple[torch.Tensor, torch.Tensor]:
-    """What `rngs()` give: (2, 5, 16, 128) for the pixels, then (2, 16) for the plan."""
-    drawn = [(torch.rand(5, ROWS, COLUMNS, generator=one), torch.rand(SECTORS, generator=one)) for one in rngs()]
-    pixels, sectors = (torch.stack(part) for part in zip(*drawn, strict=True))
-    return pixels.clamp(0.001, 0.999), sectors
+def chances() -> torch.Tensor:
+    """What `rngs()` give, (2, 5, 16, 128)."""
+    return torch.stack([torch.rand(5, ROWS, COLUMNS, generator=one) for one in rngs()]).clamp(0.001, 0.999)
 
 
 @torch.inference_mode()
-def said(network: ColumnTransformer, grid: Grid, rays: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """All that a network says of a whole grid, by the plan that `rngs()` draw."""
-    plan = drawn_plan(network, rays, chances()[1])
-    around = network.context(grid, rays, plan)[:, None]
+def said(network: ColumnTransformer, grid: Grid, rays: torch.Tensor, draft: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """All that a network says of a whole grid."""
+    read = network.reader(draft, rays)
+    around = network.context(grid, rays, read)[:, None]
     *expected, wall = ranges_expected(grid, rays)
-    drawn = network.pixel(told(grid, rays, *expected, wall, plan), around, *expected)
+    drawn = network.pixel(told(grid, rays, *expected, wall, read), around, *expected)
     return (*drawn[:4], *network.shades(drawn, grid.code, expected[0], *shades_expected(grid)))
 
 
-def test_a_grid_is_drawn_as_the_network_says_of_the_whole(network: ColumnTransformer, rays: torch.Tensor, drawn: Grid):
-    u = chances()[0].permute(0, 2, 3, 1).flatten(0, 2)
-    returns, choice, centre, scale, shade_choice, copies, spread = (x.flatten(0, 2) for x in said(network, drawn, rays))
+def test_a_grid_is_drawn_as_the_network_says_of_the_whole(
+    network: ColumnTransformer, rays: torch.Tensor, draft: torch.Tensor, drawn: Grid
+):
+    u = chances().permute(0, 2, 3, 1).flatten(0, 2)
+    returns, choice, centre, scale, shade_choice, copies, spread = (
+        x.flatten(0, 2) for x in said(network, drawn, rays, draft)
+    )
     back = (u[:, 0] < returns.sigmoid()) & (rays[:, 6] < 0.5).flatten()
     assert (back == drawn.returned.flatten()).all() and 500 < back.sum() < back.numel()
     code = picked(choice, centre, scale, u[:, 1:3], 0.5, 1.0, CODES)
@@ -85,39 +98,53 @@ def test_a_grid_is_drawn_as_the_network_says_of_the_whole(network: ColumnTransfo
     assert not drawn.code[~drawn.returned].any() and not drawn.returned[:, 12:, 40:50].any()
 
 
-def test_a_pixel_knows_what_was_drawn_before_it_alone(network: ColumnTransformer, rays: torch.Tensor, drawn: Grid):
+def test_a_pixel_knows_what_was_drawn_before_it_alone(
+    network: ColumnTransformer, rays: torch.Tensor, draft: torch.Tensor, drawn: Grid
+):
     row, column = 7, 60
     other = Grid(*(part.clone() for part in drawn))
     other.code[:, row, column], other.shade[:, row, column], other.returned[:, row, column] = 0.3, 0.7, True
-    pairs = zip(said(network, drawn, rays)[:4], said(network, other, rays)[:4], strict=True)
+    pairs = zip(said(network, drawn, rays, draft)[:4], said(network, other, rays, draft)[:4], strict=True)
     changed = [(a - b).abs().reshape(2, ROWS, COLUMNS, -1).amax(-1) > 1e-5 for a, b in pairs]
     seen = torch.stack(changed).any(0).any(0)
     assert not seen[:, :column].any() and not seen[row:, column].any()
     assert seen[:row, column].any() and seen[:, column + 1].any()
 
 
-def test_a_plan_says_how_far_sectors_are_open_and_is_drawn_in_turn(network: ColumnTransformer, rays: torch.Tensor):
-    metres = torch.where(torch.arange(COLUMNS) < 64, 5.0, 50.0).expand(1, ROWS, COLUMNS).clone()
-    metres[..., 120:] = 0
-    metres[:, 8:] = 2.0  # the lower beams do not count
-    plan = openness(known_grid(metres, torch.ones_like(metres)))
-    near, far = (1 + int(23 * (math.log2(r + 1) / 4 - 1 + 0.6) / 1.6) for r in (5, 50))
-    assert plan[0].tolist() == [near] * 8 + [far] * 7 + [0]
-    with torch.inference_mode():
-        chosen = drawn_plan(network, rays, chances()[1])
-        shares = network.levels(chosen, rays).softmax(-1).cumsum(-1)
-        again = network.levels(torch.where(torch.arange(SECTORS) < 9, chosen, 1), rays)
-    below = torch.cat([torch.zeros(2, SECTORS, 1), shares], -1).gather(2, chosen[..., None])[..., 0]
-    u = chances()[1]
-    assert (below <= u + 1e-5).all() and (u <= shares.gather(2, chosen[..., None])[..., 0] + 1e-5).all()
-    assert_close(again.softmax(-1).cumsum(-1)[:, :10], shares[:, :10])
-    assert (network.plans(chosen) != network.plans(chosen.flip(1))).any()
+def test_a_pixel_knows_the_draft_around_it_and_ahead(
+    network: ColumnTransformer, rays: torch.Tensor, draft: torch.Tensor, drawn: Grid
+):
+    other = draft.clone()
+    other[:, :, :, 60] += 1
+    changed = (said(network, drawn, rays, draft)[0] - said(network, drawn, rays, other)[0]).abs().amax((0, 1)) > 1e-5
+    assert changed[52:61].all() and not changed[:52].any()  # eight columns ahead; all later ones, by what is around
+    assert changed[61:].all()
 
 
-def test_columns_that_are_judged_are_judged_as_among_all(network: ColumnTransformer, rays: torch.Tensor, drawn: Grid):
+def test_a_draft_says_what_its_noise_may_become():
+    """Of a grid that is no noise any more, the grid; of one that is nothing else, x_t alone tells."""
+    coarse, (rays, standing) = CoarseUNet(16, (1, 1, 1, 1), 1).eval(), of_rays()
+    coarse.standard[0], coarse.standard[1] = -0.2, 0.25
+    metres = torch.full((1, ROWS, COLUMNS), 12.0)
+    x_0 = coarse.encode(metres, torch.full_like(metres, 0.3), standing)
+    t = torch.tensor([1e-4])
+    draft = drafted(coarse, x_0, t, rays, standing)
+    assert draft.shape == (1, DRAFT_CHANNELS, ROWS, COLUMNS)
+    assert_close(draft[:, :2], x_0[:, ::2])
+    assert_close(draft[:, 2:4], x_0[:, ::2], atol=0.01, rtol=0)
+    away = (4 * (encode_range(metres) - rays[:, 1] / 2)).clamp(-4, 4)
+    assert_close(draft[:, 4], away, atol=0.02, rtol=0)
+    assert_close(draft[:, 5], torch.full_like(away, 4 * 0.25))
+    halfway = drafted(coarse, x_0, torch.tensor([0.5]), rays, standing)
+    assert abs(halfway[0, 6, 0, 0]) < 1e-5 < draft[0, 6, 0, 0]
+
+
+def test_columns_that_are_judged_are_judged_as_among_all(
+    network: ColumnTransformer, rays: torch.Tensor, draft: torch.Tensor, drawn: Grid
+):
     free = (rays[:, 6] < 0.5).sum(1)
-    each = [network(drawn, rays, torch.tensor([k]))[:, :3] * free[:, k, None] for k in range(COLUMNS)]
-    assert_close(sum(each) / free.sum(1)[:, None], network(drawn, rays)[:, :3], atol=1e-4, rtol=1e-4)
+    each = [network(drawn, rays, draft, torch.tensor([k])) * free[:, k, None] for k in range(COLUMNS)]
+    assert_close(sum(each) / free.sum(1)[:, None], network(drawn, rays, draft), atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -165,16 +192,16 @@ def test_a_mixture_is_a_density_and_is_drawn_from():
         assert (found < edge).float().mean().item() == pytest.approx(expected, abs=4 * math.sqrt(0.25 / 20000) + 0.01)
 
 
-def test_it_learns_a_road(rays: torch.Tensor):
+def test_it_learns_a_road(rays: torch.Tensor, draft: torch.Tensor):
     """Eighty steps on flat ground: which rays return, and that it is the ground, far likelier than one bin of 64."""
     torch.manual_seed(0)
     network = ColumnTransformer(32, layers=1, pixel=32, blocks=1)
     ground = to_plane((0.0, 0.0, 1.0), -1.8)
     grid = known_grid(ground.expand(2, -1, -1), torch.full((2, ROWS, COLUMNS), 0.3))
     optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-    losses = torch.zeros(4)
+    losses = torch.zeros(3)
     for step in range(80):
-        losses = network(grid, rays, torch.arange(step % 8, COLUMNS, 8)).mean(0)
+        losses = network(grid, rays, draft, torch.arange(step % 8, COLUMNS, 8)).mean(0)
         optimizer.zero_grad()
         losses.sum().backward()
         optimizer.step()

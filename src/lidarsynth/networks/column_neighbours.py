@@ -9,13 +9,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS
+from lidarsynth.networks.drafts import READ
 from lidarsynth.networks.rays import decode_range, encode_range
 from lidarsynth.networks.wall_lines import walls
 
 LEFT, AROUND = 3, 2  # columns to the left, and rows up and down in them, that a pixel is told
 HYPOTHESES, SHADES = 12, 3  # of range, of reflectance
-FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 5 + 5
-SECTORS, LEVELS, HIGHEST = 16, 24, 1.05  # of the turn; of how far one is open; code of one without returns
+FEATURES = 3 * (LEFT * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 5 + READ
 NEAREST, FARTHEST = 0.5, 300.0  # metres of hypotheses
 
 
@@ -63,25 +63,6 @@ def values(grid: Grid) -> Tensor:
     """(B, 3, H, W) of known pixels, of the size of one."""
     back = grid.returned
     return torch.stack([2 * grid.code * back, 2 * grid.shade * back, 2 * back.float() - 1], 1)
-
-
-def openness(grid: Grid) -> Tensor:
-    """(B, 16) int64, how far each sector of a grid is open: the mean range code of the upper beams' returns, in 23
-    levels from 1 on, 0 without any."""
-    upper = slice(None, ROWS // 2)
-    code, count = ((part[:, upper].float().sum(1)).unflatten(1, (SECTORS, -1)).sum(2)
-                   for part in (grid.code * grid.returned, grid.returned))  # fmt: skip
-    level = 1 + (LEVELS - 1) * (code / count.clamp_min(1) + 0.6) / 1.6
-    return torch.where(count > 0, level.long().clamp(1, LEVELS - 1), 0)
-
-
-def far_as_planned(plan: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Range codes that a plan (B, 16) has for the sector of each column and the next one, and the share of its sector
-    that lies to a column's left; each (B, 128)."""
-    code = torch.where(plan > 0, (plan.float() - 0.5) / (LEVELS - 1) * 1.6 - 0.6, HIGHEST)
-    columns = COLUMNS // SECTORS
-    part = (torch.arange(COLUMNS, device=plan.device) % columns / columns).expand(len(plan), -1)
-    return code.repeat_interleave(columns, 1), code.roll(-1, 1).repeat_interleave(columns, 1), part
 
 
 def ranges_expected(grid: Grid, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -168,14 +149,14 @@ def beneath_of(known: Tensor) -> Tensor:
     return torch.cat([low[:, r : r + height] for r in range(1, height)], -1)
 
 
-def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, wall: Tensor, plan: Tensor) -> Tensor:
-    """(B, H, W, F): what each pixel is told of those around, of its ray and its row, what it may be, and the plan."""
+def told(grid: Grid, rays: Tensor, hypotheses: Tensor, valid: Tensor, wall: Tensor, draft: Tensor) -> Tensor:
+    """(B, H, W, F): what each pixel is told of those around, of its ray and its row, what it may be, and the draft, of
+    which (B, H, W, 48) was read."""
     known = relative(grid, rays)
     height = known.shape[1]
-    beneath = beneath_of(known)
     rows = torch.eye(height, device=known.device)[None, :, None].expand(*known.shape[:3], height)
-    ahead = [part[:, None] for part in far_as_planned(plan)]
-    return told_of(beside(known), beneath, rays.permute(0, 2, 3, 1), hypotheses, valid, wall, rows, *ahead)
+    around = beside(known), beneath_of(known)
+    return told_of(*around, rays.permute(0, 2, 3, 1), hypotheses, valid, wall, rows, draft)
 
 
 def told_of(
@@ -186,19 +167,13 @@ def told_of(
     valid: Tensor,
     wall: Tensor,
     row: Tensor,
-    aim: Tensor,
-    after: Tensor,
-    part: Tensor,
+    draft: Tensor,
 ) -> Tensor:
     """`told` of pixels (..., F), of the parts that are theirs: beside (..., 45), beneath (..., 45), rays (..., 8),
-    hypotheses (..., 12), the `character` of walls (..., 5), row (..., 16), which is one-hot, and what is planned
-    (...)."""
+    hypotheses (..., 12), the `character` of walls (..., 5), row (..., 16), which is one-hot, and draft (..., 48)."""
     own = (4 * (hypotheses - hypotheses[..., :1])).clamp(-4, 4)
     fine = torch.asinh(200 * (hypotheses - hypotheses[..., 3:4])) / 4
-    ground, left = hypotheses[..., 0], hypotheses[..., 1]
-    ahead = [(4 * (aim - ground)).clamp(-4, 4), (4 * (after - ground)).clamp(-4, 4), torch.tanh(10 * (aim - left)),
-             torch.tanh(10 * (after - left)), part.expand_as(ground)]  # fmt: skip
-    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, torch.stack(ahead, -1), wall], -1)
+    return torch.cat([beside, beneath, rays, own, fine, valid.float(), row, wall, draft], -1)
 
 
 def levelled(rays: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ def _network(experiment: Experiment) -> str:
 
 def _details(experiment: Experiment) -> dict[str, str]:
     model = experiment.model
-    layout = "column by column, and " if model.column_channels else ""
+    layout = "column by column after a draft by flow matching, and " if model.column_channels else ""
     between = "; 512 columns by what is drawn between them" if model.between_channels else ""
     between += ", then up to 61 beams" if model.beam_channels else ""
     grid = f"a grid of 16 beams x 128 columns, {layout}by flow matching{between}"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample
-from lidarsynth.diffusion.schedule import flow
+from lidarsynth.diffusion.schedule import Schedule, flow
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_beams import draw_beams, interleaved, with_between
 from lidarsynth.networks.between_columns import draw_between, joined
@@ -19,14 +19,16 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
 from lidarsynth.networks.column_neighbours import Grid, known_grid, levelled, nearness
 from lidarsynth.networks.column_transformer import draw
+from lidarsynth.networks.drafts import BOUND, drafted
 from lidarsynth.networks.rays import decode_range, encode_range
 from lidarsynth.streets.hdl64e import unevenness
 from lidarsynth.systems.cascade.facades import with_facades
 from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
 
-BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 STEPS_DEFAULT = 16
+# Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
+DRAFT, DRAFT_STEPS = 0.63, 8
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion
@@ -60,6 +62,18 @@ def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
     """The coarse network of rays (B, 8, 16, 128) as a denoiser, or the one led away from its guide."""
     answers = network.velocity if guided else network.coarse
     return Denoiser(answers, flow(BOUND), "velocity", clip=False, condition=(rays,))
+
+
+def draft(network: Cascade, rays: Tensor, standing: Tensor, rng: list[torch.Generator], t: float = DRAFT) -> Tensor:
+    """What `drafted` says of grids of rays (B, 8, 16, 128) that were led from noise to time t."""
+
+    def to_draft(schedule: Schedule, steps: int) -> Tensor:
+        first, last = schedule.log_snr(torch.tensor([1.0, t], dtype=torch.float64)).tolist()
+        return schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64)).clamp(max=1)
+
+    x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
+    *_, last = sample(velocity(network, rays, guided=True), x_1, STEPS["dpmpp-2m"], DRAFT_STEPS, rng, to_draft)
+    return drafted(network.coarse, last.x_s, last.s, rays, standing)
 
 
 def times(count: int, tell: Callable[[], object]) -> Callable[[], None]:
@@ -102,8 +116,9 @@ def grids(
     (told, standing), (sampler, steps) = rays_of(rows, columns), how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
+        after = draft(network, told, standing, rng)
         with one_thread():
-            grid = draw(network.columns, told, rng, on_step)
+            grid = draw(network.columns, told, after, rng, on_step)
         grid = _straight(grid, rows, sensor)
         grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
         grid, rows = _taller(network, grid, rows, columns, rays_of, rng)

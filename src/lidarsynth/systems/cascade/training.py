@@ -18,11 +18,11 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
 from lidarsynth.networks.column_neighbours import Grid, known_grid, spoilt
 from lidarsynth.networks.column_transformer import ColumnTransformer
+from lidarsynth.networks.drafts import BOUND, LEARNED, drafted
 from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import EVERY, CascadeBatch, Crops, draw, grid
-from lidarsynth.systems.cascade.layout import BOUND
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.observing import ObserverObjective
 from lidarsynth.systems.cascade.scores import (
@@ -123,7 +123,8 @@ class CoarseObjective(nn.Module):
             rng = sample_rng(batch.crops.seeds[0], 2, 0)
             whole = known_grid(metres, reflectance)
             judged = torch.randperm(COLUMNS, generator=rng)[: COLUMNS // 2].to(rays.device)
-            losses["columns"] = self.columns(whole, rays, judged, spoilt(whole, rng)).sum(1)
+            draft = self._draft(x_0, eps, rays, standing, rng)
+            losses["columns"] = self.columns(whole, rays, draft, judged, spoilt(whole, rng)).sum(1)
         if self.between is not None:
             whole, rays = known_grid(batch.finer.metres, batch.finer.reflectance), batch.finer.rays
             known, hidden = (Grid(*(part[..., k::2] for part in whole)) for k in (0, 1))
@@ -134,6 +135,14 @@ class CoarseObjective(nn.Module):
             judged = torch.arange(SEAM, rays.shape[-1] - SEAM, device=rays.device)
             losses["beams"] = self.beams(known, rays[:, :, ::2], hidden, rays[:, :, 1::2], judged).sum(1)
         return losses
+
+    @torch.no_grad()
+    def _draft(self, x_0: Tensor, eps: Tensor, rays: Tensor, standing: Tensor, rng: torch.Generator) -> Tensor:
+        """(b, 7, 16, 128) drafts that become x_0, of any of the times that columns learn."""
+        low, high = LEARNED
+        t = (low + (high - low) * torch.rand(len(x_0), generator=rng)).to(x_0)
+        _, alpha, sigma = flow(BOUND).at(t, x_0)
+        return drafted(self.network, alpha * x_0 + sigma * eps, t, rays, standing)
 
 
 def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor, Tensor]:
