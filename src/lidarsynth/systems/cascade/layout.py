@@ -65,7 +65,8 @@ def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
 
 
 def draft(network: Cascade, rays: Tensor, standing: Tensor, rng: list[torch.Generator], t: float = DRAFT) -> Tensor:
-    """What `drafted` says of grids of rays (B, 8, 16, 128) that were led from noise to time t."""
+    """(B, 7, 16, 128) what `drafted` says of noise that was led to time t, for rays (B, 8, 16, 128) of standing
+    elevations (B, 16, 128) in radians, each by a generator of its own."""
 
     def to_draft(schedule: Schedule, steps: int) -> Tensor:
         first, last = schedule.log_snr(torch.tensor([1.0, t], dtype=torch.float64)).tolist()
