@@ -1,7 +1,7 @@
 """How well a small network learns to tell the grids that a cascade draws from those of streets (a classifier two-sample
 test, Lopez-Paz & Oquab 2017).
 
-python benchmarks/told_apart.py [--model default] [--grids 1024] [--steps 300]
+python benchmarks/told_apart.py [--model default] [--grids 1024] [--steps 300] [--seed 4242]
 
 Both of the same virtual sensors; an eighth is held out. Prints, of the held-out ones, the area under the ROC curve by
 single columns, told eleven around, and by whole grids: 0.5 if nobody can tell, 1 if anybody can. Range and reflectance
@@ -68,10 +68,10 @@ class Judge(nn.Module):
         return self.column(h.flatten(1, 2).transpose(1, 2))[..., 0]
 
 
-def both(cascade: Cascade, count: int) -> tuple[Grid, Grid, Tensor]:
+def both(cascade: Cascade, count: int, seed: int) -> tuple[Grid, Grid, Tensor]:
     """`count` true grids (B, 16, 128), as many drawn ones, and their rays (B, 8, 16, 128)."""
     assert cascade.columns is not None
-    streets, rng, drawn = VirtualStreets(SEED, 1 << 40), np.random.default_rng(SEED), []
+    streets, rng, drawn = VirtualStreets(seed, 1 << 40), np.random.default_rng(seed), []
     metres, reflectance, rays, standing = map(
         torch.stack, zip(*(grid(streets.image(k), rng) for k in range(count)), strict=True)
     )
@@ -117,13 +117,14 @@ def main() -> None:
     parser.add_argument("--model", default="default")
     parser.add_argument("--grids", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=SEED, help="of the streets")
     args = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = load_parts(args.model)[1]
     if not isinstance(network, Cascade) or network.columns is None:
         parser.error(f"expected a cascade that draws columns, found {args.model}")
-    true, drawn, rays = both(network, args.grids)
+    true, drawn, rays = both(network, args.grids, args.seed)
     held = len(rays) // 8
     judge = learned(taken(true, slice(held, None)), taken(drawn, slice(held, None)), rays[held:], args.steps)
     with torch.inference_mode():
