@@ -429,3 +429,15 @@ def test_a_base_is_of_the_shipped_weights_that_have_none(tmp_path, base):
     save(tmp_path / "m", replace(experiment, base=base), network, half=True)
     with pytest.raises(ValueError, match=r"expected a base of shipped weights that have none, found"):
         load_parts(tmp_path / "m")
+
+
+def test_a_model_follows_its_base_whose_networks_have_changed_since(tmp_path):
+    experiment, network = load_parts("kitti")
+    before = replace(
+        experiment, model=replace(experiment.model, guide_channels=32, column_channels=0, class_channels=8)
+    )
+    save(tmp_path / "m", before, network, half=True)
+    found, again = load_parts(tmp_path / "m")
+    assert found == experiment
+    for name, value in network.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, atol=0, rtol=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ from lidarsynth.lidar.whole_file import whole_file
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
 OWN = ("likeliest.", "observer.")  # how the weights begin that a model with a base does not share with it
+OWN_PARTS = ("likeliest", "observer_channels")  # what a record says of them
 
 
 def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
@@ -33,6 +35,13 @@ def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: b
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
         file.write_bytes(serialized(weights))  # save_file would hide it from other users
     return folder
+
+
+def on_base(experiment: Experiment, base: Experiment) -> Experiment:
+    """The record of a model with a base, of the networks that its base has now: those that it shares may have changed
+    since it was saved."""
+    own = {name: getattr(experiment.model, name) for name in OWN_PARTS}
+    return replace(experiment, model=replace(base.model, **own))
 
 
 def read_experiment(folder: str | Path) -> Experiment:

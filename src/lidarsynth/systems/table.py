@@ -9,7 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from lidarsynth.experiment.folder import OWN, RECORD, WEIGHTS, read_experiment
+from lidarsynth.experiment.folder import OWN, RECORD, WEIGHTS, on_base, read_experiment
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
@@ -127,7 +127,10 @@ def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
     Of one with a `base`, the weights that it shares are read from that, which must be shipped and have no base itself.
     """
     experiment, path = read_experiment(folder), Path(folder) / WEIGHTS
-    shared = _shared(experiment, str(folder))
+    shared: dict[str, Tensor] = {}
+    if experiment.base:
+        base, shared = _base(experiment, str(folder))
+        experiment = on_base(experiment, base)
     with Undrawn():
         network = build_network(experiment)
     try:
@@ -141,12 +144,11 @@ def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
     return experiment, network
 
 
-def _shared(experiment: Experiment, folder: str) -> dict[str, Tensor]:
-    """The weights that an experiment has from its base, by name."""
-    if not experiment.base:
-        return {}
+def _base(experiment: Experiment, folder: str) -> tuple[Experiment, dict[str, Tensor]]:
+    """The record of an experiment's base, and the weights that it has from it, by name."""
     bases = {home.name: home for home in SHIPPED.iterdir() if (home / RECORD).is_file()}
-    own = bases.get(experiment.base)
-    if own is None or read_experiment(own).base:
+    home = bases.get(experiment.base)
+    base = None if home is None else read_experiment(home)
+    if home is None or base is None or base.base:
         raise ValueError(f"{folder}: expected a base of shipped weights that have none, found {experiment.base!r:.60}")
-    return {name: value for name, value in load_file(own / WEIGHTS).items() if not name.startswith(OWN)}
+    return base, {name: value for name, value in load_file(home / WEIGHTS).items() if not name.startswith(OWN)}
