@@ -1,11 +1,12 @@
 """How good the classes are that `--labels` gives: of generated scans by another network, of known ones by the truth.
 
-python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--model default]
+python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--model default] [--by-class]
 
 generated  scans from noise: how often street-1's RangeNet, which saw the same scan, gives the same class
 streets    held-out worlds as hdl-64e-kitti sees them: whole, and of every fourth beam alone, against the truth; beside
            them the RangeNet on the whole scans
 real       folders of labelled real scans, read as `benchmarks/street.py --classes` reads them
+by-class   the IoU of each class, of streets and real scans that are wholly known
 
 mIoU is over the classes that occur in the truth, or, of generated scans, that the RangeNet finds.
 """
@@ -22,6 +23,7 @@ import torch
 from street import HELD_OUT, SENSOR, WORD, labelled, streets
 
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.metrics.reconstruction import class_iou, confusion_matrix
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.systems.scan_model import ScanModel
@@ -31,14 +33,27 @@ from lidarsynth.weights.load import load, load_parts
 
 def cells(pairs: Iterable[tuple[RangeImage, RangeImage]]) -> str:
     """Two cells of (truth, answer): share of the labelled pixels with the same class, and mIoU."""
+    counts = counted(pairs)
+    there = np.flatnonzero(counts.sum(1)[1:]) + 1
+    share = np.trace(counts[1:, 1:]) / max(counts[1:].sum(), 1)
+    return f"{100 * share:.1f} % | {class_iou(counts, (0,))[there].mean():.3f} ({len(there)})"
+
+
+def by_class(name: str, pairs: Iterable[tuple[RangeImage, RangeImage]]) -> str:
+    """A line of (truth, answer): the IoU of each class that the truth has."""
+    counts = counted(pairs)
+    iou = class_iou(counts, (0,))
+    return f"{name}: " + ", ".join(f"{CLASSES[k][0]} {iou[k]:.2f}" for k in range(1, 20) if counts[k].any())
+
+
+def counted(pairs: Iterable[tuple[RangeImage, RangeImage]]) -> np.ndarray:
+    """(20, 20) pixels of (truth, answer), truth by row."""
     counts = np.zeros((20, 20), np.int64)
     for truth, answer in pairs:
         assert truth.label is not None and answer.label is not None
         both = truth.mask & (truth.label > 0)
         counts += confusion_matrix(np.where(both, truth.label, 0), answer.label)
-    there = np.flatnonzero(counts.sum(1)[1:]) + 1
-    share = np.trace(counts[1:, 1:]) / max(counts[1:].sum(), 1)
-    return f"{100 * share:.1f} % | {class_iou(counts, (0,))[there].mean():.3f} ({len(there)})"
+    return counts
 
 
 def answered(model: ScanModel, image: RangeImage, every: int = 1) -> RangeImage:
@@ -64,6 +79,8 @@ def rows(model: ScanModel, args: argparse.Namespace) -> Iterator[str]:
         yield f"| {name} | {cells((i, answered(model, i)) for i in images)} |"
         yield f"| {name}, every fourth beam | {cells((i, answered(model, i, 4)) for i in images)} |"
         yield f"| {name}, RangeNet of {WORD} | {cells((i, classify(network, i)) for i in images)} |"
+    for name, images in sets.items() if args.by_class else ():
+        yield by_class(name, ((i, answered(model, i)) for i in images))
 
 
 def main() -> None:
@@ -72,6 +89,7 @@ def main() -> None:
     parser.add_argument("--streets", type=int, default=0, help="how many scans")
     parser.add_argument("--real", type=Path, nargs="+", default=[], help="folders of labelled scans")
     parser.add_argument("--model", default="default")
+    parser.add_argument("--by-class", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
     for line in rows(load(args.model).into(SENSOR).with_labels(), args):

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.systems.cascade.scores import lovasz
 from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.segmentation.adaptation import adapted
 from lidarsynth.systems.segmentation.training import pixels
@@ -45,18 +46,6 @@ def streets_of(seed: int) -> Iterator[Sequence[RangeImage]]:
         if step % 2:
             pool[rng.integers(POOL)] = next(stream)
         yield pool
-
-
-def lovasz(logits: Tensor, label: Tensor) -> Tensor:
-    """The Lovasz-softmax of logits (N, C) and label (N,), mean over the classes there."""
-    chances, losses = logits.softmax(1), []
-    for k in label.unique().tolist():
-        own = (label == k).float()
-        errors, order = (own - chances[:, k]).abs().sort(descending=True)
-        own = own[order]
-        jaccard = 1 - (own.sum() - own.cumsum(0)) / (own.sum() + (1 - own).cumsum(0))
-        losses.append((errors * torch.cat([jaccard[:1], jaccard.diff()])).sum())
-    return torch.stack(losses).mean()
 
 
 def synthetic(reader: Reader, pool: Sequence[RangeImage], rng: np.random.Generator) -> Parts:

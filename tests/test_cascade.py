@@ -17,6 +17,7 @@ from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks import fill_unet
 from lidarsynth.networks.candidates import BEND, candidates
 from lidarsynth.networks.cascade import GUIDANCE, Cascade
+from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import CoarseUNet, grid_columns, grid_rays, grid_rows, left_filled
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.drafts import BOUND
@@ -403,13 +404,14 @@ def test_a_scan_is_completed_in_its_own_sensor_until_another_is_named(model: Cas
 
 @pytest.fixture(scope="module")
 def learned(model: CascadeModel) -> CascadeModel:
-    """The untrained cascade with a head of classes, most rays returning."""
+    """The untrained cascade with a network of classes, most rays returning."""
     torch.manual_seed(1)
     fill = FillUNet((16, 16, 16, 16), classes=20).eval()
     fill.load_state_dict(model.network.fill.state_dict(), strict=False)
     torch.nn.init.normal_(fill.out.weight, std=0.3)
     experiment = replace(model.experiment, model=replace(model.experiment.model, classes=20))
-    return replace(model, network=Cascade(model.network.coarse, fill), experiment=experiment)
+    network = Cascade(model.network.coarse, fill, classes=ClassUNet(8).eval())
+    return replace(model, network=network, experiment=experiment)
 
 
 def perfect(sensor: Sensor) -> Scan:

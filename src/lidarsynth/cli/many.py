@@ -98,6 +98,8 @@ def _model(job: Job) -> ScanModel | None:
     if job.verb == "realise":
         model.check_realises()
         return model
+    if job.verb == "label":
+        return model.with_labels()
     model.check(job.how)
     check_confident(model, job.how, job.least)
     return model.with_labels() if job.labels else model
@@ -109,7 +111,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
 
     work = list(works(inputs, out, "ply"))
     model = _model(job)
-    calls = 1 if model is None or job.verb == "realise" else model.calls(model.resolved(job.how))
+    calls = 1 if model is None or job.verb in ("realise", "label") else model.calls(model.resolved(job.how))
     with step_bar(work[0].item.path.name, calls) as on_step:
         (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:

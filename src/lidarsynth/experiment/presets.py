@@ -195,7 +195,6 @@ def default() -> Experiment:
             num_residual_blocks=(2, 2, 2, 2),  # of the coarse stage
             coords_encoding=None,  # both are told each pixel's rays
             classes=20,
-            guide_channels=32,
             column_channels=256,
             between_channels=64,
             beam_channels=56,

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
+from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
@@ -29,6 +30,7 @@ class Cascade(nn.Module):
     beams    draws the beams between those, then, twice over
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
     observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
+    classes    says of each return what it is of
     """
 
     def __init__(
@@ -41,10 +43,11 @@ class Cascade(nn.Module):
         beams: BetweenBeams | None = None,
         likeliest: FillUNet | None = None,
         observer: FillUNet | None = None,
+        classes: ClassUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
-        self.beams, self.likeliest, self.observer = beams, likeliest, observer
+        self.beams, self.likeliest, self.observer, self.classes = beams, likeliest, observer, classes
 
     @property
     def surest(self) -> FillUNet:

@@ -16,12 +16,14 @@ EXTENT = 32.0  # metres from the car to the left and right border of a view from
 
 
 def portrait(image: RangeImage) -> np.ndarray:
-    """(H', W', 3) uint8: strips of range, reflectance and, if known, class above a perspective view of the points."""
+    """(H', W', 3) uint8: strips of range, reflectance and, if known, class above a perspective view of the points, in
+    the colours of their classes, if known, else by height."""
     distance, reflectance = strips(image, image.sensor.max_range)
     rows: list[list[Picture]] = [[("range", distance)], [("reflectance", reflectance)]]
+    by = "height" if image.label is None else "label"
     if image.label is not None:
         rows.append([("class", _enlarged(label_strip(image, _rows(image)), image))])
-    return panel([*rows, [("points", perspective(image, size=(STRIP, STRIP * 9 // 16)))]])
+    return panel([*rows, [("points", perspective(image, size=(STRIP, STRIP * 9 // 16), by=by))]])
 
 
 def strips(image: RangeImage, max_range: float) -> tuple[np.ndarray, np.ndarray]:

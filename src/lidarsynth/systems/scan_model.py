@@ -181,6 +181,22 @@ class ScanModel(ABC):
         """Raises ValueError for a model that cannot `realise`."""
         raise self._lacks("which rays return")
 
+    def label(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None) -> Scan:
+        """The scan, bit by bit, with the class of each point: SemanticKITTI's 1-19, 0 out of the sensor's view or
+        limits.
+
+        scan    points, as a scan or an array (N, 3) x y z
+        sensor  that made the scan; None = recognised from the points, or that of `into`
+
+        Labels that it had are replaced. Raises ValueError for a model that has learned no classes, and where no point
+        is in view.
+        """
+        return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor).to_scan()
+
+    def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None) -> RangeImage:
+        """The image of `label`."""
+        raise self._lacks("classes")
+
     def with_labels(self) -> ScanModel:
         """The same model, whose images also have the class of each return, SemanticKITTI's 1-19.
 

@@ -1,4 +1,4 @@
-"""Many scans through `complete`, `upsample`, `realise` or `project`: one by one or in processes, one report."""
+"""Many scans through `complete`, `upsample`, `realise`, `label`, `project`: one by one or in processes, one report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
@@ -28,16 +29,18 @@ from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
+from lidarsynth.verbs.labelling import label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 
-FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
+FIRST, EVERY, MOST = 2, 50, 4  # whose frame is looked at: the first ones, and every so many; classes that are named
+FIELDS = {"realise": realised_fields, "label": labelled_fields}  # of a bag's messages; of the others, `message_fields`
 
 
 @dataclass(frozen=True)
 class Job:
     """What is done with every scan.
 
-    verb       complete, upsample, realise or project
+    verb       complete, upsample, realise, label or project
     model      as `load` takes it; not of project
     how        of complete and upsample; of realise its seed, scan i being drawn from seed + i
     corrupt    recipe to hide a part first, of complete
@@ -49,7 +52,7 @@ class Job:
     transform  (4, 4) that was applied to the points, to be undone in the result, or None
     strict     refuse scans that are not in their sensor's frame
     picture    a .png beside each file
-    labels     classes of the points too, of complete and upsample
+    labels     classes of the points too, of complete and upsample; of label, always
     """
 
     verb: str
@@ -126,6 +129,7 @@ def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> C
             model = load(job.model, device=job.device)
         model = model.into(job.into) if job.into else model
         model = model.with_labels() if job.labels else model
+        model = model if job.verb != "label" or job.how.precision is None else model.at_precision(job.how.precision)
     return partial(_one, job, model, on_step)
 
 
@@ -138,8 +142,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         cloud = None
         if work.target is None:
             points = _points(done, loaded, job.transform)
-            fields = realised_fields if job.verb == "realise" else message_fields
-            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields(points, loaded.given))
+            fields = FIELDS.get(job.verb, message_fields)(points, loaded.given)
+            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields)
         else:
             _store(work.target, done, loaded, job)
     except (ValueError, FloatingPointError) as error:
@@ -166,7 +170,7 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
 
 def _misfit(scan: Scan, job: Job) -> str | None:
     """That the points cannot be of the sensor that was named as theirs, in one line."""
-    if job.sensor is None or job.verb not in ("complete", "upsample"):
+    if job.sensor is None or job.verb not in ("complete", "upsample", "label"):
         return None
     sensor = get_sensor(job.sensor)
     found = misfit(scan.xyz, sensor, scan.ring)
@@ -204,9 +208,22 @@ def _made(
         sensor = named_sensor(scan, path, "--sensor", job.sensor)
         filled = realise_scan(model, scan, sensor, job.how.seed + work.number)
         return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
+    if job.verb == "label":
+        sensor = named_sensor(scan, path, "--sensor", job.sensor)
+        named = label_scan(model, scan, sensor)
+        return named, _found(named.points, sensor)
     sensor = named_sensor(scan, path, "--from", job.sensor)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
+
+
+def _found(points: Scan, sensor: Sensor) -> str:
+    """How much of the points is of the commonest classes, in words."""
+    assert points.label is not None
+    count = np.bincount(points.label, minlength=len(CLASSES))
+    most = [k for k in np.argsort(-count) if k and count[k]][:MOST]
+    named = ", ".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}" for k in most)
+    return f"{len(points)} points of {sensor.name}: {named}, {count[0]} without a class"
 
 
 def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | None) -> Scan:

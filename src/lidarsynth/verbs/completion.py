@@ -15,7 +15,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, reconstruction_errors
 from lidarsynth.networks.interpolation import METHODS
-from lidarsynth.pictures.portrait import before_and_after
+from lidarsynth.pictures.portrait import before_and_after, portrait
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import interpolated
 from lidarsynth.systems.scan_model import OnStep, ScanModel
@@ -47,8 +47,11 @@ class Filled:
         return self.image.to_scan()
 
     def figure(self) -> np.ndarray:
-        """(H', W', 3) uint8: strips, 3-D and bird's eye views of before, after and, where known, the truth."""
+        """(H', W', 3) uint8: strips, 3-D and bird's eye views of before, after and, where known, the truth; of an image
+        alone, its portrait."""
         shown = self.shown
+        if len(shown) == 1:
+            return portrait(self.image)
         after = next(name for name, image in shown.items() if image is self.image)
         return before_and_after(shown, {after: self.points})
 

@@ -20,6 +20,7 @@ from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS, grid_co
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
+from lidarsynth.systems.cascade.lessons import AS_FAR, Lessons, lessons
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
@@ -29,7 +30,6 @@ HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, low
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 FARTHEST = 250.0  # metres
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
-AS_FAR = (0.3, 0.03)  # metres, and share of the range, by which what was measured is of a surface and not behind it
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -70,6 +70,7 @@ class CascadeBatch(NamedTuple):
     grids: Grids  # of 128 columns
     finer: Grids  # of 256 or, every second step, 512, where the sensors have so many
     taller: Grids  # of 31 beams and 160 columns, see `taller`
+    lessons: Lessons  # in what returns are of
     seen: Seen | None = None  # for an observer
 
 
@@ -97,6 +98,7 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
         *parts,
+        lessons=lessons(taken, seeds),
         seen=_all_seen(experiment, images, taken, seeds) if observed else None,
     )
 

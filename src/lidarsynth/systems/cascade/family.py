@@ -11,6 +11,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
@@ -39,7 +40,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     columns = ColumnTransformer(model.column_channels) if model.column_channels else None
     between = BetweenColumns(model.between_channels) if model.between_channels else None
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
-    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer)
+    classes = ClassUNet(model.class_channels, classes=model.classes) if model.classes else None
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes)
 
 
 def _widths(first: int) -> tuple[int, int, int, int]:
@@ -64,7 +66,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     that is as wide.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide", "columns", "between", "beams"):
+    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)

@@ -10,6 +10,10 @@ from lidarsynth.diffusion import repaint
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import even_log_snr, noise_like
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.cascade import Cascade
+from lidarsynth.systems.cascade.known import widened
+from lidarsynth.systems.cascade.layout import velocity
+from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep
 
@@ -27,6 +31,32 @@ def repainted(
         if on_step is not None:
             on_step()
     return x_0
+
+
+def with_holes_drawn(
+    network: Cascade,
+    told: tuple[np.ndarray, np.ndarray, np.ndarray],
+    grid: tuple[np.ndarray, ...],
+    cell: np.ndarray,
+    beams: tuple[Sensor, np.ndarray, Tensor, Tensor],
+    rng: list[torch.Generator],
+    how: Filling,
+    on_step: OnStep,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Metres, reflectance and known pixels (H, W), as `told`, with a grid of new ones where nothing is known around.
+
+    grid   rows and columns (16, 128), which know most; cell: which of its cells know any
+    beams  the sensor, how dim the grid's beams are (16, 1), its rays (1, 8, 16, 128) and standing elevations
+    """
+    sensor, dim, rays, standing = beams
+    values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(rays.device) for v in told[:2])
+    here, dimness = (torch.from_numpy(part).to(rays.device) for part in (told[2][grid][None, None], dim))
+    known = network.coarse.encode(*values, standing, dimness)  # type: ignore[call-arg]
+    # What is known guides; a sector lost erred 6.1 m for 4.3 with both.
+    x_0 = repainted(velocity(network, rays, guided=False), known, here, rng, how, on_step)
+    drawn, shades = network.coarse.decode(x_0, standing, dimness)
+    new = (part[0].cpu().numpy() for part in (straightened(drawn, grid[0].ravel(), sensor), shades))
+    return with_grid(told, grid, ~widened(cell), *new, sensor)  # type: ignore[call-arg]
 
 
 def with_grid(

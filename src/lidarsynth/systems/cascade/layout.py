@@ -28,7 +28,7 @@ from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightene
 
 STEPS_DEFAULT = 16
 # Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
-DRAFT, DRAFT_STEPS = 0.63, 8
+DRAFT, DRAFT_STEPS = 0.53, 8
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion

@@ -26,7 +26,7 @@ from lidarsynth.networks.rays import Rays, decode_range, padded
 from lidarsynth.streets.hdl64e import hidden, written_out
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.holes import repainted, with_grid
+from lidarsynth.systems.cascade.holes import with_holes_drawn
 from lidarsynth.systems.cascade.images import (
     GENERATED,
     SPECKLE,
@@ -42,13 +42,13 @@ from lidarsynth.systems.cascade.images import (
     shades_of,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered, widened
-from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times, velocity
+from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered
+from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times
+from lidarsynth.systems.cascade.naming import class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
-from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.known_pixels import sensor_that_made, with_known
@@ -64,6 +64,7 @@ class CascadeModel(ScanModel):
 
     network.coarse   velocity of flow matching on a grid of 16 beams x 128 columns of the sensor
     network.fill     known pixels and rays -> all pixels, in one step
+    network.classes  an image -> the class of each return
     own              whether scans are completed, and made denser, in the sensor that made them: until `into`
     labelled         whether its images have classes: after `with_labels`
     precision        of the fill's matrix products: fp32 | bf16
@@ -108,7 +109,7 @@ class CascadeModel(ScanModel):
 
     def with_labels(self) -> CascadeModel:
         """The same model, whose images also have the class of each return."""
-        if not self.experiment.model.classes:
+        if self.network.classes is None:
             super().with_labels()  # refuses
         return replace(self, labelled=True)
 
@@ -169,7 +170,12 @@ class CascadeModel(ScanModel):
         known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
-            metres, reflectance, told = own._holes(metres, reflectance, told, rng, how, on_step)
+            grid_of(self.sensor)  # refuses those that are smaller
+            rows, columns, cell = best_known(told)
+            dim, grid = own.response.unevenness(self.sensor)[rows], np.ix_(rows, columns)
+            beams = self.sensor, dim, *own._grid_rays(rows, columns, 1)
+            parts = with_holes_drawn(self.network, (metres, reflectance, told), grid, cell, beams, rng, how, on_step)
+            metres, reflectance, told = parts
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
@@ -177,9 +183,9 @@ class CascadeModel(ScanModel):
             own = replace(own, response=tried(own.response, fill, image, known, reflectance, rays, self.tuned))
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
-        filled = filled if noise is None else self._recorded(filled, rng[0])
+        filled = with_known(filled if noise is None else noisy(filled, rng[0]), image, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
-        return with_known(filled, image, known, keep_reflectance=lit)
+        return own._named([filled])[0]
 
     def upsample(
         self,
@@ -243,6 +249,19 @@ class CascadeModel(ScanModel):
         answer = model._answers(unanswered(image, padded(model.sensor)), generators(seed, 1), surely=image.range[None])
         return observed(scan, image, answer[0], projection)
 
+    def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None) -> RangeImage:
+        """The image of `label`, with the classes of its pixels."""
+        scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
+        model = self.with_labels()
+        model = model.suited_to(scan) if sensor is None else model.into(sensor)
+        pixels = pixel_of_points(scan, model.sensor, projection)
+        image = project(scan, model.sensor, projection, pixels=pixels)
+        if not image.mask.any():
+            raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
+        model = replace(model, response=response_of(image, image.mask))
+        (image,) = model._named([image])
+        return replace(image, completed=replace(scan, label=class_of_points(scan.xyz, image, pixels)))
+
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch: the coarse steps, the fill. Raises ValueError as `stream`."""
         grid_of(self.sensor)
@@ -262,7 +281,7 @@ class CascadeModel(ScanModel):
     ) -> list[RangeImage]:
         """Grids (B, R, C) as whole images. Reflectances are the likeliest, then get the speckle of their class. Of 16
         beams, first these are filled, then all between: at once, most would know nothing above or below."""
-        own = replace(self, sensor=written_out(self.sensor), labelled=bool(self.experiment.model.classes))
+        own = replace(self, sensor=written_out(self.sensor))
         told = metres.cpu().numpy(), reflectance.cpu().numpy()
         if len(rows) > ROWS:  # little is left to say
             drawn = calm = own._between(*told, rows, columns, None, rng)
@@ -275,12 +294,16 @@ class CascadeModel(ScanModel):
             drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
         shades = shades_of(drawn, calm)
         read = map(as_read, drawn, shades, rng)
-        return [self._recorded(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
+        return self._named(
+            [noisy(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
+        )
 
-    def _recorded(self, image: RangeImage, rng: torch.Generator) -> RangeImage:
-        """A sample with its sensor's noise, without the labels that nobody asked for."""
-        image = noisy(image, rng)
-        return image if self.labelled else replace(image, label=None)
+    def _named(self, images: list[RangeImage]) -> list[RangeImage]:
+        """The images with the classes that `network.classes` sees in them, or without any that nobody asked for."""
+        if not self.labelled:
+            return [replace(image, label=None) for image in images]
+        assert self.network.classes is not None
+        return named(self.network.classes, images, self.response, self.sensor, self.precision)
 
     def _between(
         self,
@@ -295,30 +318,6 @@ class CascadeModel(ScanModel):
         ranges, shades, told = placed(metres, reflectance, rows, columns, self.sensor, self._blocked)
         samples = zip(self._fill(ranges, shades, told, True, rng, kinds), ranges, shades, told, strict=True)
         return [with_known(a, RangeImage(r, f, r > 0, self.sensor), t, keep_reflectance=True) for a, r, f, t in samples]
-
-    def _holes(
-        self,
-        metres: np.ndarray,
-        reflectance: np.ndarray,
-        told: np.ndarray,
-        rng: list[torch.Generator],
-        how: Filling,
-        on_step: OnStep,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Metres, reflectance and known pixels with a grid of new ones where nothing is known around."""
-        grid_of(self.sensor)
-        rows, columns, cell = best_known(told)
-        rays, standing = self._grid_rays(rows, columns, 1)
-        grid, coarse = np.ix_(rows, columns), self.network.coarse
-        values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(self._device) for v in (metres, reflectance))
-        here = torch.from_numpy(told[grid])[None, None].to(self._device)
-        dim = torch.from_numpy(self.response.unevenness(self.sensor)[rows]).to(self._device)
-        known = coarse.encode(*values, standing, dim)  # type: ignore[call-arg]
-        # What is known guides; a sector lost erred 6.1 m for 4.3 with both.
-        x_0 = repainted(velocity(self.network, rays, guided=False), known, here, rng, how, on_step)
-        drawn, shades = coarse.decode(x_0, standing, dim)
-        new = (part[0].cpu().numpy() for part in (straightened(drawn, rows, self.sensor), shades))
-        return with_grid((metres, reflectance, told), grid, ~widened(cell), *new, self.sensor)  # type: ignore[call-arg]
 
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
@@ -353,7 +352,7 @@ class CascadeModel(ScanModel):
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
         drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
         reach = ANYHOW if drawn else SNAP
-        classify = self.labelled or (kinds is not None and bool(self.experiment.model.classes))
+        classify = kinds is not None and bool(self.experiment.model.classes)
         bend = BEND if kinds is None else BEND / 2
         filled, rays = self._network(known, rng, weights is not None, classify, reach, bend)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)

@@ -9,7 +9,8 @@ from torch.nn import functional as F
 from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known
 from lidarsynth.networks.rays import decode_range
 from lidarsynth.networks.things import draw_on_things, things
-from lidarsynth.systems.cascade.examples import AS_FAR, FARTHEST, CascadeBatch, Seen
+from lidarsynth.systems.cascade.examples import FARTHEST, CascadeBatch, Seen
+from lidarsynth.systems.cascade.lessons import AS_FAR
 from lidarsynth.systems.cascade.scores import energy_score, joined, mean_of, truth
 from lidarsynth.training.randomness import sample_rng
 

@@ -58,6 +58,19 @@ def misnamed(filled: Filled, rays: Rays, classes: Tensor) -> Tensor:
     return mean_of(entropy, (classes > 0) & (rays.inside > 0))
 
 
+def lovasz(logits: Tensor, label: Tensor) -> Tensor:
+    """The Lovasz-softmax (Berman et al. 2018) of logits (N, C) and classes (N,), mean over the classes there: as good
+    as 1 - IoU, so that rare classes count as much as others. 0 for no pixel."""
+    chances, losses = logits.softmax(1), [logits.sum() * 0]
+    for k in label.unique().tolist():
+        own = (label == k).float()
+        errors, order = (own - chances[:, k]).abs().sort(descending=True)
+        own = own[order]
+        jaccard = 1 - (own.sum() - own.cumsum(0)) / (own.sum() + (1 - own).cumsum(0))
+        losses.append((errors * torch.cat([jaccard[:1], jaccard.diff()])).sum())
+    return torch.stack(losses).sum() / max(len(losses) - 1, 1)
+
+
 def mean_of(values: Tensor, mask: Tensor) -> Tensor:
     """(b,) means over `mask`, but for the crop's ends."""
     values, mask = values[..., SEAM:-SEAM], mask[..., SEAM:-SEAM]

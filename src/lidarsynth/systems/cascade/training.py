@@ -24,6 +24,7 @@ from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import EVERY, CascadeBatch, Crops, draw, grid
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.naming import NamingObjective
 from lidarsynth.systems.cascade.observing import ObserverObjective
 from lidarsynth.systems.cascade.scores import (
     SEAM,
@@ -185,6 +186,8 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
         own = (*likeliest, Phase(objective, "observer", every=EVERY))
     if experiment.base:
         return own
+    if network.classes is not None:
+        own = (*own, Phase(NamingObjective(network.classes), "classes"))
     if bool((network.coarse.standard[1] == 1).all()):
         streets = VirtualStreets(experiment.training.seed + 1, FITTED)
         fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
@@ -209,7 +212,8 @@ def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.op
     if not experiment.base:
         learned["fill"] = torch.optim.AdamW(network.fill.parameters(), **options)
         learned["coarse"] = torch.optim.AdamW([coarse], **options)
-    for name, own in (("likeliest", network.likeliest), ("observer", network.observer)):
+    classes = None if experiment.base else network.classes
+    for name, own in (("likeliest", network.likeliest), ("observer", network.observer), ("classes", classes)):
         if own is not None:
             learned[name] = torch.optim.AdamW(own.parameters(), **options)
     return learned
@@ -241,7 +245,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams", "observed"),
+    parts=("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams", "observed", "named"),
     draw=draw,
     phases=phases,
     judge=judge,

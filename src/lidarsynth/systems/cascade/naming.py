@@ -1,0 +1,118 @@
+"""What returns are of: how the network of classes learns, and how it is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.surroundings import surroundings
+from lidarsynth.networks.class_unet import ClassUNet, around_the_turn, class_inputs
+from lidarsynth.networks.rays import Rays
+from lidarsynth.systems.cascade.examples import CascadeBatch
+from lidarsynth.systems.cascade.known import known_of, rays_told
+from lidarsynth.systems.cascade.response import Response
+from lidarsynth.systems.cascade.scores import SEAM, lovasz
+from lidarsynth.training.randomness import sample_rng
+
+TOGETHER, JUDGED = 4, 12_000  # images asked at once; pixels of a batch that the Lovasz-softmax sees
+# Of a thousand returns of varied streets, how many are of each class, from unlabeled to traffic sign.
+THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 29.7, 161, 25.5, 66.8, 9.8, 3.8)
+
+
+class NamingObjective(nn.Module):
+    """`objective(batch)` -> `named` (n,): cross-entropies in which rare classes weigh more (Paszke et al. 2016), and
+    the Lovasz-softmax of the batch; the cuts' ends, beyond which their turns would go on, are not judged."""
+
+    def __init__(self, network: ClassUNet):
+        super().__init__()
+        self.network = network
+        shares = np.array(THOUSAND) / 1000
+        weights = 1 / np.log(1.02 + shares)
+        self.register_buffer("weights", torch.from_numpy(weights / (weights * shares).sum()).float(), persistent=False)
+
+    def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
+        lessons = batch.lessons
+        classes = lessons.classes[..., SEAM:-SEAM]
+        logits = self.network(lessons.inputs)[..., SEAM:-SEAM].float()
+        entropy = F.cross_entropy(logits, classes, self.get_buffer("weights"), ignore_index=0, reduction="none")
+        named, flat = (classes > 0).sum((1, 2)), classes.flatten()
+        some = torch.randint(len(flat), (JUDGED,), generator=sample_rng(lessons.seeds[0], 5, 0)).to(flat.device)
+        some = some[flat[some] > 0]
+        overlap = lovasz(logits.permute(0, 2, 3, 1).flatten(0, 2)[some], flat[some])
+        return {"named": entropy.sum((1, 2)) / named.clamp_min(1) + overlap}
+
+
+@torch.inference_mode()
+def named(
+    network: ClassUNet, images: Sequence[RangeImage], response: Response, sensor: Sensor, precision: str = "fp32"
+) -> list[RangeImage]:
+    """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
+    there is none."""
+    rays, found = response.told(rays_told(sensor)), []
+    even = np.stack([response.even(image.reflectance) for image in images])
+    with torch.autocast(next(network.parameters()).device.type, torch.bfloat16, enabled=precision == "bf16"):
+        for i in range(0, len(images), TOGETHER):
+            found.append(_classes(network, images[i : i + TOGETHER], even[i : i + TOGETHER], rays))
+    labels = np.concatenate(found)
+    return [replace(image, label=label * image.mask) for image, label in zip(images, labels, strict=True)]
+
+
+def _classes(network: ClassUNet, images: Sequence[RangeImage], even: np.ndarray, rays: Rays) -> np.ndarray:
+    """(B, H, W) of every ray, of reflectances (B, H, W) as the streets' sensor would report them."""
+    device, size = next(network.parameters()).device, (rays.elevation.shape[2], rays.elevation.shape[3])
+    ranges, masks = (np.stack(part) for part in zip(*((image.range, image.mask) for image in images), strict=True))
+    known = known_of(ranges, even, masks, True, size)
+    (height, width), columns = images[0].shape, np.arange(size[1]) % images[0].shape[1]
+    around = np.stack([surroundings(_on_true_beams(image))[..., columns] for image in images])
+    around = np.pad(around, ((0, 0), (0, 0), (0, size[0] - height), (0, 0)))
+    parts = known.metres, known.reflectance, torch.from_numpy(around), *rays
+    metres, shade, near, *told = (part.to(device) for part in parts)
+    rays = Rays(*(part.expand(len(images), *part.shape[1:]) for part in told))
+    logits = network(around_the_turn(class_inputs(metres, shade, near, rays)))
+    return logits[:, 1:, :height, :width].argmax(1).cpu().numpy() + 1  # 0, unlabeled, is no answer
+
+
+def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """(N,) int64 class of each point (N, 3) of pixels (row, column): of the one, of the nine around, that is nearest in
+    range, as a pixel holds but one of its points; 0 for points of no row, out of the sensor's limits, or around which
+    nothing returned."""
+    assert image.label is not None
+    (row, column), (height, width) = pixels, image.shape
+    depth = np.linalg.norm(xyz, axis=1)
+    nearest, found = np.full(len(xyz), np.inf), np.zeros(len(xyz), np.int64)
+    for down in (0, -1, 1):
+        for across in (0, -1, 1):
+            at = np.clip(row + down, 0, height - 1), (column + across) % width
+            off = np.where(image.mask[at], np.abs(image.range[at] - depth), np.inf)
+            closer = off < nearest
+            nearest, found = np.where(closer, off, nearest), np.where(closer, image.label[at], found)
+    seen = (row >= 0) & (depth >= image.sensor.min_range) & (depth <= image.sensor.max_range)
+    return np.where(seen, found, 0)
+
+
+def _on_true_beams(image: RangeImage) -> RangeImage:
+    """The image, what is filled in as high as the measured points around: beams look a little elsewhere than a sensor's
+    record says, and a ground of both kinds would be rough."""
+    if image.xyz is None:
+        return image
+    measured, rays = image.mask & np.any(image.xyz != 0, axis=-1), image.sensor.points(image.range)
+    off = np.where(measured, _elevation(image.xyz) - _elevation(rays), np.nan)
+    rows = np.flatnonzero(measured.any(1))
+    if not len(rows):
+        return image
+    turned = np.interp(np.arange(len(off)), rows, np.nanmedian(off[rows], axis=1))[:, None]
+    flat, z = np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]
+    shorter = np.cos(turned) - np.sin(turned) * z / np.maximum(flat, 1e-6)
+    raised = np.stack([rays[..., 0] * shorter, rays[..., 1] * shorter, z * np.cos(turned) + flat * np.sin(turned)], -1)
+    return replace(image, xyz=np.where(measured[..., None], image.xyz, raised).astype(np.float32))
+
+
+def _elevation(xyz: np.ndarray) -> np.ndarray:
+    return np.arctan2(xyz[..., 2], np.hypot(xyz[..., 0], xyz[..., 1]))

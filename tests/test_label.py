@@ -1,0 +1,107 @@
+"""The verb `label`: every point gets a class and stays as it was, in files, folders and bags; and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from networks import tiny_cascade
+from test_cascade import SMALL, perfect
+
+from lidarsynth.cli.main import main
+from lidarsynth.files.formats import read, write
+from lidarsynth.files.labels import read_words
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.systems.cascade.naming import class_of_points
+from lidarsynth.weights.load import load
+
+WORDS = ("--model", "model", "--sensor", "own.toml", "--no-picture")
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a model, a sensor and a scan of it that says nothing of classes."""
+    monkeypatch.chdir(tmp_path)
+    tiny_cascade(SMALL).save("model")
+    elevations = list(SMALL.elevations)
+    Path("own.toml").write_text(
+        f"elevations = {elevations}\nwidth = 256\nmin_range = 0.5\nmax_range = 120.0\nmount = 1.8\n"
+    )
+    write("scan.ply", replace(perfect(SMALL), label=None, reflectance=np.linspace(0, 1, len(perfect(SMALL)))))
+    return tmp_path
+
+
+def test_points_and_fields_stay_and_get_a_class(place: Path, capsys: pytest.CaptureFixture[str]):
+    main(["label", "scan.ply", "--out", "named.ply", *WORDS])
+    before, after = read("scan.ply"), read("named.ply")
+    assert f"{len(before)} points of own" in capsys.readouterr().out
+    for name in ("xyz", "reflectance", "ring", "time"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    np.testing.assert_array_equal(after.extra["object"], before.extra["object"])
+    assert after.label is not None and after.label.min() >= 1 and after.label.max() < len(CLASSES)
+    library = load("model").label(before, "own.toml")
+    np.testing.assert_array_equal(library.label, after.label)
+    again = load("model").label(library, "own.toml")  # labels that it had are replaced by the same
+    np.testing.assert_array_equal(again.label, after.label)
+
+
+def test_a_bin_gets_a_file_of_raw_ids_and_a_folder_is_worked_through(place: Path):
+    Path("in").mkdir()
+    for name in "ab":
+        write(f"in/{name}.bin", replace(perfect(SMALL), ring=None))
+    main(["label", "in", "--out", "out", "--format", "bin", *WORDS])
+    assert sorted(path.name for path in Path("out").iterdir() if path.suffix != ".json") == [
+        "a.bin", "a.label", "b.bin", "b.label"]  # fmt: skip
+    assert Path("out/a.bin").read_bytes() == Path("in/a.bin").read_bytes()
+    assert (read_words(Path("out/a.label"), 6144) > 0).all()
+
+
+def test_bags_keep_their_columns(place: Path):
+    pytest.importorskip("rosbags")
+    from lidarsynth.data.bag_writer import write_bag
+    from lidarsynth.data.bags import Cloud
+    from lidarsynth.verbs.inputs import Reading, inputs_of
+
+    scan = perfect(SMALL)
+    fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
+              "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip
+    with write_bag(Path("in.mcap")) as writer:
+        writer.write_cloud("/points", Cloud(10**9, "lidar", 10**9, fields))
+    main(["label", "in.mcap", "--out", "out.mcap", "--model", "model", "--sensor", "own.toml"])
+    (cloud,) = (item.read() for item in inputs_of([Path("out.mcap")], Reading("none")).stream())
+    assert cloud.given.keys() == fields.keys() | {"label"}
+    for name, column in fields.items():
+        np.testing.assert_array_equal(cloud.given[name], column)
+    assert cloud.given["label"].min() >= 1
+
+
+def test_pictures_show_classes(place: Path):
+    main(["label", "scan.ply", "--out", "named.ply", *WORDS[:-1]])
+    assert Path("named.png").stat().st_size > 10_000
+
+
+def test_points_out_of_view_have_no_class_and_those_behind_others_their_own():
+    metres = np.full((24, 256), 20.0, np.float32)
+    metres[:, 128:] = 5.0
+    label = np.where(np.arange(256) < 128, 13, 1) * np.ones((24, 1), int)
+    image = RangeImage(metres, metres / 40, metres > 0, SMALL, label)
+    row, column = np.array([3, 3, 3, -1, 3]), np.array([127, 128, 40, 40, 40])
+    depth = np.array([5.1, 19.0, 20.0, 20.0, 0.1])  # before its pixel; behind it; at it; out of view; too near
+    xyz = np.stack([depth, np.zeros(5), np.zeros(5)], 1)
+    assert class_of_points(xyz, image, (row, column)).tolist() == [1, 13, 13, 0, 0]
+
+
+def test_what_cannot_be_labelled_is_refused_in_one_line(place: Path, capsys: pytest.CaptureFixture[str]):
+    for words, said in (
+        (
+            ["label", "scan.ply", "--out", "o.ply", "--model", "kitti-streets"],
+            "expected a model that has learned classes",
+        ),
+        (["label", "none.ply", "--out", "o.ply"], "none.ply"),
+        (["label", "scan.ply", "--out", "o.ply", "--model", "model"], "--sensor"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        error = capsys.readouterr().err.strip()
+        assert stopped.value.code == 2 and said in error and "\n" not in error and not Path("o.ply").exists()
