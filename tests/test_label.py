@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from networks import tiny_cascade
 from test_cascade import SMALL, perfect
+from test_realise import save_model_and_sensor, write_bag_of
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write
@@ -23,11 +23,7 @@ WORDS = ("--model", "model", "--sensor", "own.toml", "--no-picture")
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a model, a sensor and a scan of it that says nothing of classes."""
     monkeypatch.chdir(tmp_path)
-    tiny_cascade(SMALL).save("model")
-    elevations = list(SMALL.elevations)
-    Path("own.toml").write_text(
-        f"elevations = {elevations}\nwidth = 256\nmin_range = 0.5\nmax_range = 120.0\nmount = 1.8\n"
-    )
+    save_model_and_sensor()
     write("scan.ply", replace(perfect(SMALL), label=None, reflectance=np.linspace(0, 1, len(perfect(SMALL)))))
     return tmp_path
 
@@ -59,15 +55,10 @@ def test_a_bin_gets_a_file_of_raw_ids_and_a_folder_is_worked_through(place: Path
 
 def test_bags_keep_their_columns(place: Path):
     pytest.importorskip("rosbags")
-    from lidarsynth.data.bag_writer import write_bag
-    from lidarsynth.data.bags import Cloud
     from lidarsynth.verbs.inputs import Reading, inputs_of
 
     scan = perfect(SMALL)
-    fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
-              "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip
-    with write_bag(Path("in.mcap")) as writer:
-        writer.write_cloud("/points", Cloud(10**9, "lidar", 10**9, fields))
+    fields = write_bag_of(scan, Path("in.mcap"), 1)
     main(["label", "in.mcap", "--out", "out.mcap", "--model", "model", "--sensor", "own.toml"])
     (cloud,) = (item.read() for item in inputs_of([Path("out.mcap")], Reading("none")).stream())
     assert cloud.given.keys() == fields.keys() | {"label"}

@@ -21,12 +21,30 @@ WORDS = ("--sensor", "own.toml", "--no-picture")
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a model, a sensor and a perfect scan."""
     monkeypatch.chdir(tmp_path)
+    save_model_and_sensor()
+    return tmp_path
+
+
+def save_model_and_sensor() -> None:
+    """`model` and `own.toml`, here."""
     tiny_cascade(SMALL).save("model")
     elevations = list(SMALL.elevations)
     Path("own.toml").write_text(
         f"elevations = {elevations}\nwidth = 256\nmin_range = 0.5\nmax_range = 120.0\nmount = 1.8\n"
     )
-    return tmp_path
+
+
+def write_bag_of(scan: Scan, path: Path, count: int) -> dict[str, np.ndarray]:
+    """The columns of a bag of so many messages, each of the same scan."""
+    from lidarsynth.data.bag_writer import write_bag
+    from lidarsynth.data.bags import Cloud
+
+    fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
+              "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip
+    with write_bag(path) as writer:
+        for k in range(count):
+            writer.write_cloud("/points", Cloud(10**9 + k, "lidar", 10**9 + k, fields))
+    return fields
 
 
 def is_part_of(real: Scan, whole: Scan) -> np.ndarray:
@@ -110,16 +128,10 @@ def test_labels_that_do_not_fit_are_named(place: Path, capsys: pytest.CaptureFix
 
 def test_bags_keep_their_columns(place: Path):
     pytest.importorskip("rosbags")
-    from lidarsynth.data.bag_writer import write_bag
-    from lidarsynth.data.bags import Cloud
     from lidarsynth.verbs.inputs import Reading, inputs_of
 
     scan = perfect(SMALL)
-    fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
-              "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip
-    with write_bag(Path("sim.mcap")) as writer:
-        for k in range(2):
-            writer.write_cloud("/points", Cloud(10**9 + k, "lidar", 10**9 + k, fields))
+    fields = write_bag_of(scan, Path("sim.mcap"), 2)
     main(["realise", "sim.mcap", "--out", "real.mcap", "--model", "model", "--sensor", "own.toml"])
     clouds = [item.read() for item in inputs_of([Path("real.mcap")], Reading("none")).stream()]
     assert [cloud.stamp for cloud in clouds] == [10**9, 10**9 + 1]

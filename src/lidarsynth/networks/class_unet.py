@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.networks.fill_unet import Block, Halve, Pointwise
-from lidarsynth.networks.rays import Rays, encode_range
+from lidarsynth.networks.rays import Rays, encode_range, steps_told
 
 PATCH, PIXEL = 2, 32  # rows and columns of the patches that become channels; numbers of each pixel in the end
 BLOCKS = (1, 1, 1, 1, 2)  # of each level, which is half as high and wide as the one before
@@ -57,8 +56,6 @@ def class_inputs(metres: Tensor, reflectance: Tensor, around: Tensor, rays: Rays
     beams would read it, and surroundings (B, A, H, W)."""
     back = (metres > 0).float()
     code = encode_range(metres)
-    full = torch.ones_like(back)
-    steps = [full * torch.log2(step * (180 / math.pi) / 0.4 + 0.1) / 2 for step in (rays.up, rays.down, rays.across)]
     return torch.cat(
         [
             back,
@@ -66,7 +63,7 @@ def class_inputs(metres: Tensor, reflectance: Tensor, around: Tensor, rays: Rays
             (8 * (code - encode_range(rays.ground))).clamp(-3, 3) * back,
             3 * rays.elevation.expand_as(back),
             2 * encode_range(rays.ground),
-            *steps,
+            *steps_told(rays, back),
             (3 * (reflectance + rays.dimness) - 0.5) * back,
             around,
         ],

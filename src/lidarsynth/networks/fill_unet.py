@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.networks.candidates import BEND, RANGE_CANDIDATES, REFLECTANCE_CANDIDATES, Candidates, candidates
-from lidarsynth.networks.rays import Rays, decode_range, encode_range
+from lidarsynth.networks.rays import Rays, decode_range, encode_range, steps_told
 
 STEM = (4, 2)  # rows, columns of the patches that become channels
 NOISES = 3  # per pixel, along a ring, in patches
@@ -224,7 +224,6 @@ def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tens
     ground = encode_range(rays.ground)
     others = 8 * (guesses.code[:, [0, 3, 4, 5, 6, 7, 8, 9]] - base)
     full = torch.ones_like(told)
-    steps = [full * torch.log2(step * (180 / math.pi) / 0.4 + 0.1) / 2 for step in (rays.up, rays.down, rays.across)]
     return torch.cat(
         [
             noise,
@@ -239,7 +238,7 @@ def inputs(known: Known, rays: Rays, guesses: Candidates, noise: Tensor) -> Tens
             guesses.near,
             3 * rays.elevation.expand_as(told),
             ground.expand_as(told) * 2,
-            *steps,
+            *steps_told(rays, told),
             rays.blocked.expand_as(told),
             rays.inside.expand_as(told),
             10 * rays.dimness * full,

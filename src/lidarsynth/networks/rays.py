@@ -102,6 +102,13 @@ def rays_of(
     return Rays(*(torch.from_numpy(np.ascontiguousarray(part, np.float32))[None, None] for part in parts))
 
 
+def steps_told(rays: Rays, like: Tensor) -> list[Tensor]:
+    """Angular steps up, down and across, each (B, 1, H, W) as `like`, in logarithms of about unit size: 0 for 0.36
+    degrees."""
+    degrees = (step * (180 / math.pi) for step in (rays.up, rays.down, rays.across))
+    return [torch.ones_like(like) * torch.log2(step / 0.4 + 0.1) / 2 for step in degrees]
+
+
 def stacked(rays: Sequence[Rays]) -> Rays:
     """Images of equal size as one batch."""
     return Rays(*(torch.cat(parts) for parts in zip(*rays, strict=True)))

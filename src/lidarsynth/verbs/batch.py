@@ -19,8 +19,7 @@ from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.semantic_kitti import CLASSES
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
@@ -29,10 +28,10 @@ from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
-from lidarsynth.verbs.labelling import label_scan, labelled_fields
+from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 
-FIRST, EVERY, MOST = 2, 50, 4  # whose frame is looked at: the first ones, and every so many; classes that are named
+FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
 FIELDS = {"realise": realised_fields, "label": labelled_fields}  # of a bag's messages; of the others, `message_fields`
 
 
@@ -129,7 +128,6 @@ def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> C
             model = load(job.model, device=job.device)
         model = model.into(job.into) if job.into else model
         model = model.with_labels() if job.labels else model
-        model = model if job.verb != "label" or job.how.precision is None else model.at_precision(job.how.precision)
     return partial(_one, job, model, on_step)
 
 
@@ -210,20 +208,11 @@ def _made(
         return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor)
-        named = label_scan(model, scan, sensor)
-        return named, _found(named.points, sensor)
+        named = label_scan(model, scan, sensor, job.how.precision)
+        return named, found(named.points, sensor)
     sensor = named_sensor(scan, path, "--from", job.sensor)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
-
-
-def _found(points: Scan, sensor: Sensor) -> str:
-    """How much of the points is of the commonest classes, in words."""
-    assert points.label is not None
-    count = np.bincount(points.label, minlength=len(CLASSES))
-    most = [k for k in np.argsort(-count) if k and count[k]][:MOST]
-    named = ", ".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}" for k in most)
-    return f"{len(points)} points of {sensor.name}: {named}, {count[0]} without a class"
 
 
 def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | None) -> Scan:

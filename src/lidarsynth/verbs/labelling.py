@@ -6,15 +6,27 @@ import numpy as np
 
 from lidarsynth.files.fields import Fields
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import Filled
 
+MOST = 4  # classes that are told
 
-def label_scan(model: ScanModel, scan: Scan, sensor: Sensor) -> Filled:
+
+def label_scan(model: ScanModel, scan: Scan, sensor: Sensor, precision: str | None = None) -> Filled:
     """A scan of `sensor` with a class for every point. Raises ValueError as `ScanModel.label` does."""
-    named = model.named(scan, sensor)
+    named = (model if precision is None else model.at_precision(precision)).named(scan, sensor)
     return Filled(named, lambda: {"classes": named}, {})
+
+
+def found(points: Scan, sensor: Sensor) -> str:
+    """How much of the points is of the commonest classes, in words."""
+    assert points.label is not None
+    count = np.bincount(points.label, minlength=len(CLASSES))
+    most = [k for k in np.argsort(-count) if k and count[k]][:MOST]
+    named = ", ".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}" for k in most)
+    return f"{len(points)} points of {sensor.name}: {named}, {count[0]} without a class"
 
 
 def labelled_fields(named: Scan, given: Fields) -> Fields:

@@ -20,15 +20,13 @@ from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS, grid_co
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
-from lidarsynth.systems.cascade.lessons import AS_FAR, Lessons, lessons
+from lidarsynth.systems.cascade.lessons import AS_FAR, FARTHEST, HEIGHT, WIDTH, Lessons, lessons, to_height
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
 
 TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
-HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
-FARTHEST = 250.0  # metres
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
@@ -181,7 +179,7 @@ def crop(
     r, f, told, returned, lit, near, label = (
         torch.from_numpy(np.ascontiguousarray(a, a.dtype if a.dtype == bool else np.float32))[None, None] for a in full
     )
-    rays = Rays(*(_to_height(part, below) for part in rays))
+    rays = Rays(*map(to_height, rays))
     return Known(near * returned, f * lit, told, returned, lit), rays, (r, f, label.long())
 
 
@@ -199,14 +197,7 @@ def seen(image: RangeImage, rng: np.random.Generator) -> tuple[Rays, Tensor, Ten
     if rng.random() < 0.5:
         arrays, rays = [part[:, ::-1] for part in arrays], Rays(*(part.flip(3) for part in rays))
     metres, reflectance, surface = (torch.from_numpy(np.ascontiguousarray(a, np.float32))[None, None] for a in arrays)
-    return Rays(*(_to_height(part, below) for part in rays)), metres, reflectance, surface
-
-
-def _to_height(part: Tensor, below: int) -> Tensor:
-    """Rays of 32 rows with 32 more of padding below, copies of the last; those of 64 as they are."""
-    if part.shape[2] == 1 or part.shape[2] == HEIGHT:
-        return part
-    return torch.cat([part, part[:, :, -1:].expand(-1, -1, HEIGHT - part.shape[2], -1)], 2)
+    return Rays(*map(to_height, rays)), metres, reflectance, surface
 
 
 def _responding(reflectance: np.ndarray, dim: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

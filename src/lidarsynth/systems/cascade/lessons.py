@@ -19,7 +19,8 @@ from lidarsynth.networks.class_unet import class_inputs
 from lidarsynth.networks.rays import Rays, rays_of
 from lidarsynth.streets.hdl64e import unevenness
 
-HEIGHT, WIDTH, FARTHEST = 64, 256, 250.0  # of a cut; metres
+HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, lower ones are padded
+FARTHEST = 250.0  # metres
 AS_FAR = (0.3, 0.03)  # metres, and share of the range, by which what was measured is of a surface and not behind it
 ACROSS = (-2, -1, 1, 2)  # columns of a ring whose speckle is averaged
 ALIKE, FLAT = 0.05, 0.1  # share of the range by which neighbours of one surface differ; and the ground from flat ground
@@ -89,15 +90,15 @@ def _cut(parts: np.ndarray, sensor: Sensor, columns: np.ndarray, top: int) -> tu
     below = HEIGHT - parts.shape[1]
     seen = torch.from_numpy(np.pad(parts, ((0, 0), (0, below), (0, 0))))[None]
     rays = rays_of(sensor, np.zeros((sensor.height, sensor.width), bool), columns)
-    rays = Rays(*(_window(part, top) for part in rays))
+    rays = Rays(*(part if part.shape[2] == 1 else to_height(part[:, :, top : top + HEIGHT]) for part in rays))
     return class_inputs(seen[:, :1], seen[:, 1:2], seen[:, 2:-1], rays), seen[:, -1].long()
 
 
-def _window(part: Tensor, top: int) -> Tensor:
-    """Rays of the 64 beams from `top` on, (1, 1, H, ...) with copies of the last where there are fewer."""
-    if part.shape[2] == 1:
+def to_height(part: Tensor) -> Tensor:
+    """Rays (1, 1, H, ...) of fewer than 64 rows with copies of the last below; those of 64, or of one for all, as they
+    are."""
+    if part.shape[2] in (1, HEIGHT):
         return part
-    part = part[:, :, top : top + HEIGHT]
     return torch.cat([part, part[:, :, -1:].expand(-1, -1, HEIGHT - part.shape[2], -1)], 2)
 
 
