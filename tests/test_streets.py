@@ -269,6 +269,33 @@ def test_more_comes_beside_what_is_there():
         assert kinds[1].count(kind) > kinds[0].count(kind) + 3
 
 
+def test_heavy_vehicles_walls_barriers_panels_and_garages_come_beside_what_is_there():
+    more = Density(heavy=4, walls=3, barriers=1, panels=3, garages=2)
+    plain, full = (world(0, density) for density in (TODAY, more))
+    before, after = ({corners.tobytes() for corners in of.corners} for of in (plain, full))
+    assert before <= after and len(after) > len(before) + 1000
+    np.testing.assert_array_equal(plain.poses, full.poses)
+    kinds = full.things["kind"].tolist()
+    assert {"guard rail", "panel"} <= set(kinds) and set(kinds) & {"concrete barrier", "high wall", "board fence"}
+    assert len(full.fronts) > len(plain.fronts)
+    actors = actors_of(full)
+    heavy = np.isin(actors.kind, ["lorry", "coach", "trailer"])
+    assert heavy.sum() > 3 and np.all(actors.size[heavy][:, 0] > 2.8)
+    vehicles = np.flatnonzero(np.isin(actors.kind, ["car", "van", "truck", "bus", "lorry", "coach", "trailer"]))
+    for one in np.flatnonzero(heavy):  # a trailer is 5 m long; a lorry and a car's halves are 12 m
+        gap = np.linalg.norm(actors.place[vehicles, :2] - actors.place[one, :2], axis=1)
+        assert np.sort(gap)[1] > 5.9
+
+
+def test_lorries_and_trailers_have_boxes_and_their_own_classes():
+    made = LabelledStreets(3, 32, SMALL, Options(density=Density(heavy=6)))
+    seen = [(box.kind, box.points, frame.raw) for frame in (made[k] for k in range(0, 32, 4)) for box in frame.boxes]
+    raws = {"lorry": 18, "coach": 13, "trailer": 20}
+    for kind, raw in raws.items():
+        found = [words for word, points, words in seen if word == kind and points > 5]
+        assert found and any((words & 0xFFFF == raw).any() for words in found)
+
+
 def test_cyclists_ride_forward_beside_the_road():
     drive = draw_drive(1, 0, 2.0, Density(cyclists=4, traffic=0))
     moment = drive.moment(1.0)

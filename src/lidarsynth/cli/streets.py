@@ -39,6 +39,11 @@ def streets(
     cyclists: Annotated[
         float, arg(help="on the sidewalk's edge, likewise; without any there is hardly a rider.")
     ] = 0.0,
+    heavy: Annotated[float, arg(help="lorries, coaches and trailers that stand, likewise.")] = 0.0,
+    walls: Annotated[float, arg(help="walls and fences of more kinds, likewise.")] = 0.0,
+    barriers: Annotated[float, arg(help="crash barriers, likewise.")] = 0.0,
+    panels: Annotated[float, arg(help="larger than signs, likewise.")] = 0.0,
+    garages: Annotated[float, arg(help="rows of them, likewise.")] = 0.0,
     kerbs: Annotated[float, arg(help="their height: 1 = 12 cm, 0.5 = half of it.")] = 1.0,
     rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
     fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
@@ -53,10 +58,9 @@ def streets(
     from lidarsynth.streets.frame import LabelledStreets, Options
     from lidarsynth.streets.weather import Weather
 
-    density, weather = (
-        Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs, cyclists),
-        Weather(rain, fog),
-    )
+    more = {"groups": groups, "motorcycles": motorcycles, "works": works, "cyclists": cyclists, "heavy": heavy,
+            "walls": walls, "barriers": barriers, "panels": panels, "garages": garages}  # fmt: skip
+    density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
     made = LabelledStreets(seed, count, get_sensor(sensor), options)
     workers = os.cpu_count() or 1 if workers is None else workers

@@ -113,6 +113,11 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
         "kerbs": 1,
         "rough": 1,
         "cyclists": 0,
+        "heavy": 0,
+        "walls": 0,
+        "barriers": 0,
+        "panels": 0,
+        "garages": 0,
     }
     for of in (options, options["density"], options["optics"]):
         for name in later.keys() & of.keys():

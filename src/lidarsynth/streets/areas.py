@@ -43,10 +43,15 @@ class Area:
     kerb_bushes: float = 0.6  # per 100 m and side
     on_road: float = 1.5  # pedestrians on the main road
     woods: float = 1.0  # size of those that close a view
-    groups: float = 0.0  # of people who stand together, per 100 m and side; these four only where asked for
+    groups: float = 0.0  # of people who stand together, per 100 m and side; these nine only where asked for
     motorcycles: float = 0.0
     works: float = 0.0
     cyclists: float = 0.0
+    heavy: float = 0.0
+    walls: float = 0.0
+    barriers: float = 0.0
+    panels: float = 0.0
+    garages: float = 0.0
     kerb: float = KERB  # m, from carriageway to sidewalk
 
 
@@ -93,9 +98,11 @@ AREAS: dict[str, Area] = {
 class Density:
     """How much of what there is, as factors of what the kind of street has; 1 leaves a world as it is.
 
-    groups, motorcycles, works, cyclists  more, per 100 m and side: groups of people, parked motorcycles, road works,
-           cyclists beside the road
     kerbs  factor of their height of 12 cm
+
+    More, per 100 m and side: groups of people, parked motorcycles, road works, cyclists beside the road; heavy vehicles
+    that stand (lorries, coaches, trailers); walls and fences of more kinds; crash barriers; panels larger than signs;
+    garages.
     """
 
     traffic: float = 1.0  # moving vehicles and cyclists
@@ -107,6 +114,11 @@ class Density:
     works: float = 0.0
     kerbs: float = 1.0
     cyclists: float = 0.0
+    heavy: float = 0.0
+    walls: float = 0.0
+    barriers: float = 0.0
+    panels: float = 0.0
+    garages: float = 0.0
 
     def of(self, area: Area) -> Area:
         """The kind of street with these factors. Raises ValueError for a factor below 0."""
@@ -120,9 +132,12 @@ class Density:
         low, high = _scaled(area.parked, self.parking)
         new["parked"] = (min(low, 1.0), min(high, 1.0))
         green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
-        new |= {name: getattr(self, name) for name in ("groups", "motorcycles", "works", "cyclists")}
+        new |= {name: getattr(self, name) for name in MORE}
         green["on_road"], green["kerb"] = area.on_road * self.pedestrians, area.kerb * self.kerbs
         return replace(area, **new, **green)
+
+
+MORE = ("groups", "motorcycles", "works", "cyclists", "heavy", "walls", "barriers", "panels", "garages")
 
 
 def _scaled(bounds: Range, factor: float) -> Range:

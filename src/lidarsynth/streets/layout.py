@@ -46,6 +46,9 @@ def fill(builder: WorldBuilder, places: Array, lane: Array | None = None) -> Non
                 parked(builder, road, side, places if lane is None else lane)
                 moving(builder, road, side, places)
     more(builder)
+    for road in builder.ground.roads:
+        for side in (-1, 1):
+            garages(builder, road, side)
 
 
 def _count(builder: WorldBuilder, per_100: float, road: Road) -> int:
@@ -91,8 +94,10 @@ def _houses(
     near: Array,
     depth: Array,
     across: bool = False,
+    tall: tuple[float, float] = (5, 14),
 ) -> None:
-    """Boxes from (s, near) to (s + length, near + depth) beside a road; those on a carriageway are left out."""
+    """Boxes from (s, near) to (s + length, near + depth) beside a road, `tall` m high; those on a carriageway are left
+    out."""
     rng, count = builder.rng, len(s)
     if not count:
         return
@@ -104,8 +109,19 @@ def _houses(
     u, v = sd[..., 0] - middle[:, None], side * (sd[..., 1] - near[:, None])
     c, sn = np.cos(heading)[:, None], np.sin(heading)[:, None]
     x, y = x0[:, None] + c * u - sn * v, y0[:, None] + sn * u + c * v
-    tall = rng.uniform(5, 14, count)
-    builder.houses.append(Houses(x, y, tall, facade_rows(rng, builder.area.shops, count), across))
+    high = rng.uniform(*tall, count)
+    builder.houses.append(Houses(x, y, high, facade_rows(rng, builder.area.shops, count), across))
+
+
+def garages(builder: WorldBuilder, road: Road, side: int) -> None:
+    """One to six in a row, by the sidewalk or behind it, where the area asks for them."""
+    rng = builder.rng
+    for s in _along(builder, road, _count(builder, builder.area.garages, road)) if builder.area.garages > 0 else ():
+        count, wide = int(rng.integers(1, 7)), rng.uniform(2.8, 3.4)
+        start, near = s + wide * np.arange(count), _edge(road) + rng.uniform(0.2, 6.0)
+        deep = np.full(count, rng.uniform(5, 7))
+        tall = (2.3, 2.5) if rng.random() < 0.7 else (2.6, 3.8)
+        _houses(builder, road, side, start, np.full(count, wide), np.full(count, near), deep, tall=tall)
 
 
 def facade_rows(rng: np.random.Generator, shops: float, count: int) -> Array:

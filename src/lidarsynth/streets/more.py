@@ -1,4 +1,5 @@
-"""What a street has more of when it is asked for: people in groups, parked motorcycles, road works, cyclists.
+"""What a street has more of when it is asked for: people in groups, parked motorcycles, road works, cyclists, heavy
+vehicles, fences and walls, crash barriers, panels.
 
 All of it is drawn after everything else, so that the rest of a world is the same with and without.
 """
@@ -11,13 +12,19 @@ from lidarsynth.streets.builder import WorldBuilder
 from lidarsynth.streets.ground import Road
 from lidarsynth.streets.world import WALK
 
+FENCES = ("board fence", "board fence", "mesh fence", "railed wall", "high wall", "overgrown fence")
+VEHICLES = ("car", "van", "truck", "bus", "lorry", "coach", "trailer")
+ROOM = {"lorry": 10.5, "coach": 10.0, "trailer": 6.0}  # metres from one's middle to that of any other vehicle
+
 
 def more(builder: WorldBuilder) -> None:
     """Draws what the area asks for, per 100 m and side; an area that asks for nothing draws nothing."""
     for road in builder.ground.roads:
         for side in (-1, 1):
             for per_100, put in ((builder.area.groups, _group), (builder.area.motorcycles, _motorcycles),
-                                 (builder.area.works, _works), (builder.area.cyclists, _cyclists)):  # fmt: skip
+                                 (builder.area.works, _works), (builder.area.cyclists, _cyclists),
+                                 (builder.area.heavy, _heavy), (builder.area.walls, _walls),
+                                 (builder.area.barriers, _barriers), (builder.area.panels, _panels)):  # fmt: skip
                 if per_100 > 0:
                     count = int(builder.rng.poisson(per_100 * (road.stop - road.start) / 100))
                     for s in builder.rng.uniform(road.start, road.stop, count):
@@ -57,6 +64,50 @@ def _cyclists(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
     x, y, along = road.at(place, np.full(len(place), side * aside))
     yaw = along + sway + (np.pi if side > 0 else 0.0)
     builder.put("bicyclist", x, y, yaw, up=builder.ground.kerb, clear=0.0, size=(0.96, 1.04), pace=WALK)
+
+
+def _heavy(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """A lorry, coach or trailer in the parking lane, or else beyond the sidewalk, where no vehicle stands yet."""
+    rng = builder.rng
+    kind = str(rng.choice(["lorry", "lorry", "coach", "trailer"]))
+    lane = road.parking[0 if side < 0 else 1]
+    beyond = road.half + road.walk + rng.uniform(1.6, 4.0)
+    x, y, along = road.at(np.array([s]), np.array([side * (road.half - 1.2 if lane else beyond)]))
+    taken = [group.rows for group in builder.groups if group.kind in VEHICLES]
+    gap = min((np.hypot(rows[:, 0] - x, rows[:, 1] - y).min() for rows in taken if len(rows)), default=np.inf)
+    turn = rng.choice([0.0, 0.0, 0.0, np.pi]) + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.02)
+    if gap > ROOM[kind]:
+        clear = None if lane else 0.2
+        builder.put(kind, x, y, along + turn, up=0.0, clear=clear, size=(0.94, 1.06))
+
+
+def _walls(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """6 to 40 m of a fence or wall along the sidewalk, here and there with gaps."""
+    rng = builder.rng
+    kind, pieces = str(rng.choice(FENCES)), int(rng.integers(3, 21))
+    out = road.half + road.walk + rng.choice([0.3, rng.uniform(0.3, 5.0)])
+    place = s + 1 + 2.0 * np.arange(pieces)
+    place = place[(rng.random(pieces) > 0.05) & (place < road.stop)]
+    x, y, along = road.at(place, np.full(len(place), side * out))
+    builder.put_row(kind, x, y, along, (int(rng.integers(0, 64)), rng.uniform(0.85, 1.15), rng.normal()))
+
+
+def _barriers(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """30 to 120 m of crash barrier beside the carriageway."""
+    rng = builder.rng
+    kind = str(rng.choice(["guard rail", "guard rail", "concrete barrier"]))
+    place = np.arange(s, min(s + rng.uniform(30, 120), road.stop), 2.0)
+    x, y, along = road.at(place, np.full(len(place), side * (road.half + rng.uniform(0.45, 1.0))))
+    turn = 0.0 if side > 0 else np.pi
+    builder.put_row(kind, x, y, along + turn, (int(rng.integers(0, 64)), rng.uniform(0.9, 1.1), rng.normal()))
+
+
+def _panels(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
+    """One that looks at the traffic of its side."""
+    rng = builder.rng
+    out = road.half + rng.uniform(0.9, max(road.walk, 1.5) + 1.5)
+    x, y, along = road.at(np.array([s]), np.array([side * out]))
+    builder.put("panel", x, y, along + (np.pi if side < 0 else 0.0) + rng.normal(0, 0.25), clear=0.3)
 
 
 def _works(builder: WorldBuilder, road: Road, side: int, s: float) -> None:

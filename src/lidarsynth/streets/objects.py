@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lidarsynth.streets import shapes, works
+from lidarsynth.streets import shapes, wayside, works
 from lidarsynth.streets.shapes import Mesh, box, extrusion, frustum, join, leaves, moved, wheel
 
 
@@ -296,4 +296,7 @@ def library() -> dict[str, list[Mesh]]:
                 box((-0.7, 0.7), (-0.5, 0.5), (0, 1.3), "door", "unlabeled"),
                 box((-0.35, 0.35), (-0.2, 0.2), (0, 1.5), "canvas", "unlabeled")],
         **works.things(),
+        **wayside.vehicles(),
+        "coach": [bus(9.0), bus(13.5)],
+        **wayside.furniture(rng),
     }  # fmt: skip

@@ -76,7 +76,9 @@ def draw_recording(rng: np.random.Generator) -> VirtualSensor:
 
 
 def draw_density(rng: np.random.Generator) -> Density:
-    """More green, people, riders and works than usual, and kerbs of 2 to 14 cm."""
+    """More green, people, riders and works than usual, and kerbs of 2 to 14 cm; since 2026-11-25 also heavy vehicles,
+    fences of more kinds, crash barriers, panels and garages, in the same worlds."""
+    later = rng.spawn(1)[0]
     return Density(
         traffic=float(rng.choice([1, 1.5, 2])),
         pedestrians=float(rng.choice([1, 2, 4])),
@@ -85,4 +87,9 @@ def draw_density(rng: np.random.Generator) -> Density:
         motorcycles=float(rng.choice([0, 1])),
         works=float(rng.choice([0, 0, 0.7])),
         kerbs=float(rng.uniform(0.15, 1.2)),
+        heavy=float(later.choice([0, 0.5, 1.5])),
+        walls=float(later.choice([0, 1, 2, 3])),
+        barriers=float(later.choice([0, 0, 0.5, 1.5])),
+        panels=float(later.choice([0, 0.7, 2])),
+        garages=float(later.choice([0, 0, 1])),
     )
