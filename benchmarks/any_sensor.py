@@ -28,6 +28,7 @@ from lidarsynth.streets.virtual import SHARING, VirtualStreets
 
 RIVALS = ("nearest", "bilinear", "bicubic")
 NEAR, FREE = 5.0, 1.25  # metres; a truth so many times as far, or none, proves a near point wrong
+ON_GROUND = 0.25  # metres above flat ground under the sensor, at most, of what lies on it
 HELD_OUT = 777_001  # a seed that nothing was trained on
 loaded = cache(ls.load)
 
@@ -78,20 +79,23 @@ def errors(paths: Sequence[Path], models: Sequence[str], returned: bool = False)
 
 
 def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
-    """Hidden pixels filled nearer than 5 m where the truth is empty, or where it is a quarter farther."""
-    counts: dict[str, list[tuple[int, int]]] = {word: [] for word in ("bilinear", *models)}
+    """Hidden pixels filled nearer than 5 m where the truth is empty, or where it is a quarter farther; how many of the
+    first lie on flat ground, from which a ray came back to nobody; and how many of both the median scan has."""
+    counts: dict[str, list[tuple[int, int, int]]] = {word: [] for word in ("bilinear", *models)}
     for image in map(own_image, paths):
         known = every(image, 4)
         for word, found in counts.items():
             filled = completed(word, image, known)
             near = filled.mask & (filled.range < NEAR) & ~known
             farther = near & image.mask & (image.range > FREE * filled.range)
-            found.append((int((near & ~image.mask).sum()), int(farther.sum())))
-    yield "| model | pixels nearer than 5 m per scan: where nothing returned | where the truth is farther |"
-    yield "|---|---|---|"
+            height = filled.sensor.points(filled.range)[..., 2] + filled.sensor.mount
+            empty = near & ~image.mask
+            found.append((int(empty.sum()), int((empty & (height < ON_GROUND)).sum()), int(farther.sum())))
+    yield "| model | nearer than 5 m, where nothing returned | on the ground | where the truth is farther | median scan |"
+    yield "|---|---|---|---|---|"
     for word, found in counts.items():
-        empty, far = np.mean(found, 0)
-        yield f"| {word} | {empty:.0f} | {far:.0f} |"
+        nothing, ground, far = np.mean(found, 0)
+        yield f"| {word} | {nothing:.0f} | {ground:.0f} | {far:.0f} | {np.median(np.array(found)[:, ::2].sum(1)):.0f} |"
 
 
 def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
