@@ -91,7 +91,7 @@ def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
             height = filled.sensor.points(filled.range)[..., 2] + filled.sensor.mount
             empty = near & ~image.mask
             found.append((int(empty.sum()), int((empty & (height < ON_GROUND)).sum()), int(farther.sum())))
-    yield "| model | nearer than 5 m, where nothing returned | on the ground | where the truth is farther | median scan |"
+    yield "| model | nearer than 5 m, where nothing returned | on the ground | where the truth is farther | median |"
     yield "|---|---|---|---|---|"
     for word, found in counts.items():
         nothing, ground, far = np.mean(found, 0)

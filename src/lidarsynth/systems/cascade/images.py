@@ -95,6 +95,12 @@ def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
     return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask, label=label)
 
 
+def textured(drawn: list[RangeImage], even: np.ndarray, rng: list[torch.Generator]) -> list[RangeImage]:
+    """Images as recorded: their reflectances `even` (B, H, W) on average, with the speckle, the roughness and the noise
+    of what they show, by their labels."""
+    return [noisy(as_read(image, of, one), one) for image, of, one in zip(drawn, even, rng, strict=True)]
+
+
 def texture(label: np.ndarray) -> np.ndarray:
     """(H, W) classes whose texture a sample in the making has."""
     return np.where(label < TEXTURE, label, label // TEXTURE)

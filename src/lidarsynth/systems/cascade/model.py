@@ -33,13 +33,13 @@ from lidarsynth.systems.cascade.images import (
     Grain,
     agreed,
     answered,
-    as_read,
     drawn,
     grid_of,
     noisy,
     parts,
     placed,
     shades_of,
+    textured,
     with_doubts,
 )
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered
@@ -279,8 +279,9 @@ class CascadeModel(ScanModel):
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
-        """Grids (B, R, C) as whole images. Reflectances are the likeliest, then get the speckle of their class. Of 16
-        beams, first these are filled, then all between: at once, most would know nothing above or below."""
+        """Grids (B, R, C) as whole images. Of 16 beams, first these are filled, then all between: at once, most would
+        know nothing above or below. Reflectances are the likeliest, then get the speckle of their class, by which
+        ranges are rough: first of the classes that the fill draws, then of those that are seen in the result."""
         own = replace(self, sensor=written_out(self.sensor))
         told = metres.cpu().numpy(), reflectance.cpu().numpy()
         if len(rows) > ROWS:  # little is left to say
@@ -292,11 +293,13 @@ class CascadeModel(ScanModel):
         if len(rows) == ROWS < self.sensor.height:
             told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
             drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
-        shades = shades_of(drawn, calm)
-        read = map(as_read, drawn, shades, rng)
-        return self._named(
-            [noisy(replace(image, sensor=self.sensor), one) for image, one in zip(read, rng, strict=True)]
-        )
+        drawn, shades = [replace(image, sensor=self.sensor) for image in drawn], shades_of(drawn, calm)
+        recorded = textured(drawn, shades, rng)
+        if self.network.classes is None:
+            return self._named(recorded)
+        seen = named(self.network.classes, recorded, self.response, self.sensor, self.precision)
+        recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
+        return recorded if self.labelled else self._named(recorded)
 
     def _named(self, images: list[RangeImage]) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for."""
