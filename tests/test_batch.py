@@ -2,6 +2,8 @@
 
 import errno
 import json
+import multiprocessing
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +15,7 @@ from test_recognise import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.data.windows import in_window
+from lidarsynth.data.workers import in_order
 from lidarsynth.experiment.folder import save
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.frame import parse_transform, transformed
@@ -167,6 +170,14 @@ def test_processes_answer_in_order():
     make = partial(partial, pow, 2)
     assert list(in_window(make, iter(range(20)), 2)) == [2**i for i in range(20)]
     assert list(in_window(make, iter(range(5)), 0)) == [2**i for i in range(5)]
+
+
+def test_workers_in_the_midst_of_long_items_are_left_at_once():
+    begun = time.monotonic()
+    made = in_order(time.sleep, [0, 60, 60], 2, abandon=True)
+    next(made)
+    made.close()
+    assert time.monotonic() - begun < 30 and not multiprocessing.active_children()
 
 
 def test_arrays_are_scans():

@@ -28,6 +28,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.verbs.generation import cut, processes
 from lidarsynth.weights.load import load
 
 
@@ -124,6 +125,23 @@ def test_scans_are_the_same_bytes_whatever_the_batch_and_the_count(run: Run, tin
     assert a == b
     assert {name: a[name] for name in c} == c
     assert len(set(a.values())) == 5 + 1
+
+
+def test_processes_generate_what_one_does(run: Run, tiny: Path, tmp_path: Path):
+    words = ("generate", "-n", 3, "--model", tiny, "--steps", 2, "--format", "npz", "--no-picture", "--seed", 5)
+    for workers in (1, 2):
+        assert run(*words, "--workers", workers, "--out", tmp_path / str(workers)).code == 0
+    for name in ("000000.npz", "000001.npz", "000002.npz"):
+        one, two = (np.load(tmp_path / workers / name) for workers in ("1", "2"))
+        np.testing.assert_allclose(one["range"], two["range"], rtol=1e-4)
+
+
+def test_runs_are_cut_where_blocks_end_and_each_process_has_one():
+    assert cut([range(3, 20), range(40, 41)], 16) == [range(3, 16), range(16, 20), range(40, 41)]
+    model = load("default")
+    for runs, asked, found in (([range(64)], 3, 3), ([range(64)], 9, 4), ([range(16)], None, 1), ([], 2, 1)):
+        assert processes(model, runs, asked) == found
+    assert processes(model, [range(64)]) == min(4, os.cpu_count() or 1)
 
 
 def test_generate_makes_only_what_lacks(run: Run, tiny: Path, tmp_path: Path):
@@ -425,6 +443,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("generate --seed -1", "--seed of at least 0, found -1"),
         ("generate --seed 99999999999999999999999", "--seed"),
         ("generate --batch-size 0", "--batch-size"),
+        ("generate --workers 0", "--workers of at least 1, found 0"),
         ("generate --sampler euler", "'euler'"),
         ("generate --format docx", "'docx'"),
         ("generate --model nothing", "nothing: expected"),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, SensorWord, Source, arg
-from lidarsynth.cli.terminal import at_least, load_with_bar, say, step_bar
+from lidarsynth.cli.terminal import at_least, load_with_bar, say, scan_bar, step_bar
 
 
 def generate(
@@ -21,19 +22,21 @@ def generate(
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one.")] = 4,
     device: Device = "cpu",
+    workers: Annotated[
+        int | None, arg(metavar="INT", help="processes; default one per core, where each has a block of scans to draw.")
+    ] = None,
     picture: Picture = True,
 ) -> None:
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.generation import claim, endings_of, generate_into, missing
+    from lidarsynth.verbs.generation import Drawing, claim, endings_of, generate_into, missing, processes
 
-    at_least(1, {"count": count, "steps": steps, "batch-size": batch_size})
+    at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers})
     at_least(0, {"seed": seed})
     endings = endings_of(format, labels, picture)
-    loaded = load_with_bar(model, device)
-    loaded = loaded.into(sensor) if sensor else loaded
-    loaded = loaded.with_labels() if labels else loaded
+    source = Drawing(model, device, sensor, labels)
+    loaded = source.of(load_with_bar(model, device))
     calls = loaded.generation_steps(steps, sampler)
     used = loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": used, "seed": seed}
@@ -41,6 +44,12 @@ def generate(
     with only_writer(out, "generation"):
         claim(out, settings)
         runs, size = missing(out, count, endings), loaded.at_once(batch_size)
-        with step_bar("generate", sum(-(-len(run) // size) for run in runs) * calls) as on_step:
-            new = sum(1 for _ in generate_into(out, loaded, runs, batch_size, endings, steps, sampler, seed, on_step))
+        workers, scans = processes(loaded, runs, workers), sum(map(len, runs))
+        make = partial(generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)
+        if workers < 2:
+            with step_bar("generate", sum(-(-len(run) // size) for run in runs) * calls) as on_step:
+                new = sum(1 for _ in make(on_step))
+        else:
+            with scan_bar("generate", scans) as on_scan:
+                new = sum(1 for _ in make(on_step=on_scan, workers=workers, source=source))
     say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -20,24 +20,31 @@ LARGEST = 1 << 25  # bytes, of MMAP; what glibc allows at most
 _make: list[Callable[[int], Any]] = []  # of this worker process; sent once, not with every item
 
 
-def in_order(make: Callable[[int], Any], items: Sequence[int], workers: int) -> Generator[Any, None, None]:
+def in_order(
+    make: Callable[[int], Any], items: Sequence[int], workers: int, abandon: bool = False
+) -> Generator[Any, None, None]:
     """make(item) of each item, in order, by `workers` processes, or by this one where fewer than two have work.
 
     `make` must be picklable where there are workers. What it raises is raised here. Closing the generator ends the
-    workers after their present item. Raises OSError when a worker is gone.
+    workers after their present item, or, with `abandon`, at once, as items that take a minute ask for. Raises OSError
+    when a worker is gone.
     """
     workers = min(workers, len(items))
     if workers < 2:
         yield from map(make, items)
         return
     # Not fork: threads of torch in this process would be copied in whatever state they are.
+    others, done = set(multiprocessing.active_children()), False
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start, (make,))
     try:
         yield from pool.map(_work, items)
+        done = True
     except BrokenProcessPool:
         raise OSError(f"expected {workers} worker processes to stay, found one gone (out of memory?); the same command "
                       "goes on, and --workers 1 needs the least") from None  # fmt: skip
     finally:
+        for worker in set(multiprocessing.active_children()) - others if abandon and not done else ():
+            worker.terminate()
         pool.shutdown(cancel_futures=True)
 
 

@@ -7,10 +7,15 @@ scan last, so that a kill at any moment leaves whole files only. `generate.json`
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from lidarsynth.data.workers import in_order
 from lidarsynth.files.formats import WRITERS, write, write_labels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.small_file import read_json
@@ -20,6 +25,7 @@ from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 RECORD = "generate.json"
+MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
 LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
 
 
@@ -76,6 +82,36 @@ def missing(folder: Path, count: int, endings: tuple[str, ...]) -> list[range]:
     return runs
 
 
+def processes(model: ScanModel, runs: list[range], asked: int | None = None) -> int:
+    """How many processes make the scans of `runs`: as many as asked, at most one for each block of scans that the model
+    draws together; without a number one per processor core, where it draws more than one, and one on a GPU."""
+    blocks = len(cut(runs, model.together))
+    if asked is not None:
+        return max(1, min(asked, blocks))
+    on_cpu = next(model.network.parameters()).device.type == "cpu"
+    return max(1, min(os.cpu_count() or 1, MOST, blocks)) if on_cpu and model.together > 1 else 1
+
+
+def cut(runs: list[range], together: int) -> list[range]:
+    """The same scans in runs that end where blocks of so many end."""
+    return [range(max(run.start, start), min(run.stop, start + together))
+            for run in runs for start in range(run.start - run.start % together, run.stop, together)]  # fmt: skip
+
+
+class Drawing(NamedTuple):
+    """Which model draws, as `load` takes it, and scans of which sensor, with labels or without."""
+
+    model: str = "default"
+    device: str = "cpu"
+    sensor: str | None = None
+    labels: bool = False
+
+    def of(self, model: ScanModel) -> ScanModel:
+        """A loaded model with images of that sensor, with labels or without."""
+        model = model.into(self.sensor) if self.sensor else model
+        return model.with_labels() if self.labels else model
+
+
 def generate_into(
     folder: Path,
     model: ScanModel,
@@ -86,13 +122,66 @@ def generate_into(
     sampler: str | None = None,
     seed: int = 0,
     on_step: OnStep = None,
+    workers: int = 1,
+    source: Drawing | None = None,
 ) -> Iterator[Path]:
-    """Make the scans of `runs`, a batch in memory at a time, and yield each file when it and its picture are there."""
+    """Make the scans of `runs`, a batch in memory at a time, and yield each file when it and its picture are there.
+
+    workers  processes, where there is a `source` from which each loads the same model; each has its share of the
+             processor's cores, and `on_step` is called after each scan
+    """
     sweep(folder)
-    for run in runs:
-        images = model.stream(run.stop, steps, seed, sampler, batch_size, run.start, on_step)
-        for i, image in zip(run, images, strict=True):
-            yield _store(folder, f"{i:06d}", image, endings)
+    make = partial(_make, folder, batch_size, endings, steps, sampler, seed)
+    if workers < 2 or source is None:
+        for run in runs:
+            yield from make(model, run, on_step)
+        return
+    pieces = cut(runs, model.together)
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    with closing(
+        in_order(partial(_piece, make, source, pieces, threads), range(len(pieces)), workers, abandon=True)
+    ) as made:
+        for path in chain.from_iterable(made):
+            yield path
+            (on_step or (lambda: None))()
+
+
+def _make(
+    folder: Path,
+    batch_size: int,
+    endings: tuple[str, ...],
+    steps: int | None,
+    sampler: str | None,
+    seed: int,
+    model: ScanModel,
+    run: range,
+    on_step: OnStep,
+) -> Iterator[Path]:
+    images = model.stream(run.stop, steps, seed, sampler, batch_size, run.start, on_step)
+    for i, image in zip(run, images, strict=True):
+        yield _store(folder, f"{i:06d}", image, endings)
+
+
+def _piece(
+    make: Callable[[ScanModel, range, OnStep], Iterator[Path]],
+    source: Drawing,
+    pieces: list[range],
+    threads: int,
+    k: int,
+) -> list[Path]:
+    """In a worker: the files of one run."""
+    return list(make(_opened(source, threads), pieces[k], None))
+
+
+@lru_cache(maxsize=1)
+def _opened(source: Drawing, threads: int) -> ScanModel:
+    """In a worker: its model, loaded once."""
+    import torch
+
+    from lidarsynth.weights.load import load
+
+    torch.set_num_threads(threads)
+    return source.of(load(source.model, device=source.device))
 
 
 def _store(folder: Path, name: str, image: RangeImage, endings: tuple[str, ...]) -> Path:
