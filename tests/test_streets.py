@@ -288,8 +288,8 @@ def test_heavy_vehicles_walls_barriers_panels_and_garages_come_beside_what_is_th
 
 
 def test_lorries_and_trailers_have_boxes_and_their_own_classes():
-    made = LabelledStreets(3, 32, SMALL, Options(density=Density(heavy=6)))
-    seen = [(box.kind, box.points, frame.raw) for frame in (made[k] for k in range(0, 32, 4)) for box in frame.boxes]
+    made = LabelledStreets(3, 64, SMALL, Options(density=Density(heavy=8)))
+    seen = [(box.kind, box.points, frame.raw) for frame in (made[k] for k in range(0, 64, 4)) for box in frame.boxes]
     raws = {"lorry": 18, "coach": 13, "trailer": 20}
     for kind, raw in raws.items():
         found = [words for word, points, words in seen if word == kind and points > 5]

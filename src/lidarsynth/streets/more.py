@@ -67,18 +67,33 @@ def _cyclists(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
 
 
 def _heavy(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
-    """A lorry, coach or trailer in the parking lane, or else beyond the sidewalk, where no vehicle stands yet."""
+    """A lorry, coach or trailer in the parking lane, or else beyond the sidewalk, where no vehicle or house stands: the
+    first such place of ten."""
     rng = builder.rng
     kind = str(rng.choice(["lorry", "lorry", "coach", "trailer"]))
-    lane = road.parking[0 if side < 0 else 1]
-    beyond = road.half + road.walk + rng.uniform(1.6, 4.0)
-    x, y, along = road.at(np.array([s]), np.array([side * (road.half - 1.2 if lane else beyond)]))
-    taken = [group.rows for group in builder.groups if group.kind in VEHICLES]
-    gap = min((np.hypot(rows[:, 0] - x, rows[:, 1] - y).min() for rows in taken if len(rows)), default=np.inf)
+    lane = road.parking[0 if side < 0 else 1] and rng.random() < 0.7
+    out = road.half - 1.2 if lane else road.half + road.walk + rng.uniform(1.6, 8.0)
     turn = rng.choice([0.0, 0.0, 0.0, np.pi]) + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.02)
-    if gap > ROOM[kind]:
-        clear = None if lane else 0.2
-        builder.put(kind, x, y, along + turn, up=0.0, clear=clear, size=(0.94, 1.06))
+    taken = [group.rows for group in builder.groups if group.kind in VEHICLES]
+    axle = np.linspace(-0.8, 0.8, 9) * ROOM[kind]
+    for place in (s, *rng.uniform(road.start, road.stop, 9)):
+        x, y, along = road.at(np.array([place]), np.array([side * out]))
+        gap = min((np.hypot(rows[:, 0] - x, rows[:, 1] - y).min() for rows in taken if len(rows)), default=np.inf)
+        free = gap > ROOM[kind] and builder.ground.carriageway(x, y)[0] > (-1.5 if lane else 1.4)
+        if free and not _indoors(builder, x + axle * np.cos(along), y + axle * np.sin(along)):
+            builder.put(kind, x, y, along + turn, clear=None, size=(0.94, 1.06))
+            return
+
+
+def _indoors(builder: WorldBuilder, x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether any of the places (N,) is in a house, or nearer than 1.5 m to it."""
+    for houses in builder.houses:
+        along_x, along_y = (np.roll(corners, -1, 1) - corners for corners in (houses.x, houses.y))
+        aside = along_x[..., None] * (y - houses.y[..., None]) - along_y[..., None] * (x - houses.x[..., None])
+        aside = aside / np.maximum(np.hypot(along_x, along_y), 1e-6)[..., None]  # (H, 4, N) metres beside each wall
+        if ((aside > -1.5).all(1) | (aside < 1.5).all(1)).any():
+            return True
+    return False
 
 
 def _walls(builder: WorldBuilder, road: Road, side: int, s: float) -> None:
