@@ -23,7 +23,7 @@ HEIGHT, WIDTH = 64, 256  # of a crop: higher sensors show a window of beams, low
 FARTHEST = 250.0  # metres
 AS_FAR = (0.3, 0.03)  # metres, and share of the range, by which what was measured is of a surface and not behind it
 ACROSS = (-2, -1, 1, 2)  # columns of a ring whose speckle is averaged
-APART = 0.12  # standard deviation, at most, of the natural logarithm of how bright each class is for others' sensors
+APART = (0.05, 0.25)  # standard deviation of the natural logarithm of how bright each class is where others drive
 ALIKE, FLAT = 0.05, 0.1  # share of the range by which neighbours of one surface differ; and the ground from flat ground
 
 
@@ -173,7 +173,7 @@ def _otherwise(
 ) -> np.ndarray:
     """Reflectance (H, W) of another response, each class's a little of its own; with a chance `calm` without speckle;
     at times none."""
-    power, scale, apart = rng.uniform(0.75, 1.3), rng.uniform(0.75, 1.25), rng.uniform(0, APART)
+    power, scale, apart = rng.uniform(0.75, 1.3), rng.uniform(0.75, 1.25), rng.uniform(*APART)
     each = np.exp(rng.normal(0, apart, len(CLASSES)))
     told = dim if rng.random() < 0.7 else 0
     shade = np.maximum(image.reflectance + dim, 0) ** power * scale * each[label]

@@ -299,7 +299,7 @@ class CascadeModel(ScanModel):
             return self._named(recorded)
         seen = named(self.network.classes, recorded, self.response, self.sensor, self.precision)
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
-        return recorded if self.labelled else self._named(recorded)
+        return self._named(recorded)
 
     def _named(self, images: list[RangeImage]) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for."""

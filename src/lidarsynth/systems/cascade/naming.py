@@ -26,16 +26,26 @@ JUDGED = 12_000  # pixels of a batch that the Lovasz-softmax sees
 THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 29.7, 161, 25.5, 66.8, 9.8, 3.8)
 
 
+# How much of the logarithm of its weight in learning is taken off a class's logit: so rare ones are named less often
+# than learned, and right more often (docs/training-default.md).
+FAIR = 0.5
+
+
+def weights() -> np.ndarray:
+    """(20,) of classes in learning, 1 on average over pixels; rare ones weigh more (Paszke et al. 2016)."""
+    shares = np.array(THOUSAND) / 1000
+    each = 1 / np.log(1.02 + shares)
+    return each / (each * shares).sum()
+
+
 class NamingObjective(nn.Module):
-    """`objective(batch)` -> `named` (n,): cross-entropies in which rare classes weigh more (Paszke et al. 2016), and
-    the Lovasz-softmax of the batch; the cuts' ends, beyond which their turns would go on, are not judged."""
+    """`objective(batch)` -> `named` (n,): cross-entropies by `weights`, and the Lovasz-softmax of the batch; the cuts'
+    ends, beyond which their turns would go on, are not judged."""
 
     def __init__(self, network: ClassUNet):
         super().__init__()
         self.network = network
-        shares = np.array(THOUSAND) / 1000
-        weights = 1 / np.log(1.02 + shares)
-        self.register_buffer("weights", torch.from_numpy(weights / (weights * shares).sum()).float(), persistent=False)
+        self.register_buffer("weights", torch.from_numpy(weights()).float(), persistent=False)
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         lessons = batch.lessons
@@ -72,7 +82,8 @@ def _classes(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays
     parts = known.metres, known.reflectance, torch.from_numpy(around), *rays
     metres, shade, near, *told = (part.to(device) for part in parts)
     logits = network(around_the_turn(class_inputs(metres, shade, near, Rays(*told))))
-    return logits[0, 1:, :height, :width].argmax(0).cpu().numpy() + 1  # 0, unlabeled, is no answer
+    fair = FAIR * torch.from_numpy(np.log(weights())).to(logits)[:, None, None]
+    return (logits[0] - fair)[1:, :height, :width].argmax(0).cpu().numpy() + 1  # 0, unlabeled, is no answer
 
 
 def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
