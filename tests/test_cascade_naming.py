@@ -14,7 +14,7 @@ from lidarsynth.networks.class_unet import MULTIPLE, RAYS, ClassUNet, around_the
 from lidarsynth.streets.varied import VariedStreets
 from lidarsynth.systems.cascade.examples import CascadeBatch
 from lidarsynth.systems.cascade.lessons import HEIGHT, WIDTH, Lessons, Pixels, _filled_in, lesson, lessons
-from lidarsynth.systems.cascade.naming import NamingObjective, _on_true_beams, named
+from lidarsynth.systems.cascade.naming import THOUSAND, NamingObjective, _on_true_beams, named, weights
 from lidarsynth.systems.cascade.response import AS_STREETS
 from lidarsynth.systems.cascade.scores import SEAM, lovasz
 
@@ -169,3 +169,14 @@ def test_what_is_filled_in_lies_as_high_as_what_was_measured_around():
     assert np.abs((filled.points() - xyz)[plain][:, 2]).max() > 0.15
     assert np.abs((_on_true_beams(filled).points() - xyz)[plain][:, 2]).max() < 0.02
     assert _on_true_beams(image) is image
+
+
+def test_of_classes_that_look_alike_the_common_one_is_named():
+    """Learned with more weight, a rare class would be named too often."""
+    torch.manual_seed(0)
+    network = ClassUNet(8).eval()
+    torch.nn.init.zeros_(network.classes.weight)
+    torch.nn.init.zeros_(network.classes.bias)
+    (image,) = named(network, [kerb(WIDE)], AS_STREETS, WIDE)
+    assert image.label is not None and (image.label[image.mask] == int(np.argmax(THOUSAND))).all()
+    assert (weights() * np.array(THOUSAND)).sum() == pytest.approx(1000)

@@ -44,12 +44,12 @@ def generate(
     with only_writer(out, "generation"):
         claim(out, settings)
         runs, size = missing(out, count, endings), loaded.at_once(batch_size)
-        workers, scans = processes(loaded, runs, workers), sum(map(len, runs))
+        workers = processes(loaded, runs, workers)
         make = partial(generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)
         if workers < 2:
             with step_bar("generate", sum(-(-len(run) // size) for run in runs) * calls) as on_step:
                 new = sum(1 for _ in make(on_step))
         else:
-            with scan_bar("generate", scans) as on_scan:
+            with scan_bar("generate", sum(map(len, runs))) as on_scan:
                 new = sum(1 for _ in make(on_step=on_scan, workers=workers, source=source))
     say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -27,6 +27,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
+from lidarsynth.streets.areas import MORE
 from lidarsynth.streets.drawing import bev_with_boxes, strips
 from lidarsynth.streets.frame import LabelledStreets
 
@@ -105,20 +106,7 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    later: dict[str, Any] = {
-        "perfect": False,
-        "groups": 0,
-        "motorcycles": 0,
-        "works": 0,
-        "kerbs": 1,
-        "rough": 1,
-        "cyclists": 0,
-        "heavy": 0,
-        "walls": 0,
-        "barriers": 0,
-        "panels": 0,
-        "garages": 0,
-    }
+    later: dict[str, Any] = {"perfect": False, "kerbs": 1, "rough": 1} | dict.fromkeys(MORE, 0)
     for of in (options, options["density"], options["optics"]):
         for name in later.keys() & of.keys():
             if of[name] == later[name]:

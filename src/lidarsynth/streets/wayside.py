@@ -14,7 +14,7 @@ from lidarsynth.streets.shapes import Mesh, box, frustum, join, moved, wheel
 def vehicles() -> dict[str, list[Mesh]]:
     """Heavy ones, metres, x forward, wheels on the ground."""
     load = wheel(1.15, 7.6, "canvas", "truck", sides=14)
-    tank = moved(shapes.moved(load, yaw=np.pi / 2), -1.4, 0, 2.2)
+    tank = moved(load, -1.4, 0, 2.2, yaw=np.pi / 2)
     return {
         "lorry": [
             join(_cab(6.6, 3.7), _body(-9.6, 4.0, (1.15, 4.0), "truck"), _axles("truck", (-8.2, -6.9, -5.6, 4.0, 5.7))),
