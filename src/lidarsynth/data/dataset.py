@@ -103,15 +103,16 @@ class CachedImages:
 class SeveralCaches:
     """The images of several caches of one sensor as one, of each equally many: those of a small cache come again.
 
-    Used like `CachedImages`. Raises ValueError when the caches' sensors or projections differ.
+    Used like `CachedImages`. Raises ValueError when the caches' sensors or projections
+    differ; streets, which are cast into the sensor's rays, have none and suit any.
     """
 
     def __init__(self, folders: Sequence[str | Path]):
         self._parts = [CachedImages(folder) for folder in folders]
         first, sources = self._parts[0], [part.source for part in self._parts]
-        projection = sources[0].get("projection")
+        projection = next(filter(None, (source.get("projection") for source in sources)), None)
         for folder, part in zip(folders, self._parts, strict=True):
-            if part.sensor != first.sensor or part.source.get("projection") != projection:
+            if part.sensor != first.sensor or part.source.get("projection") not in (projection, None):
                 raise ValueError(
                     f"{folder}: expected the sensor and the projection of {folders[0]}, {first.sensor.name} of "
                     f"{first.sensor.height} x {first.sensor.width} and {projection}, found {part.sensor.name} of "
