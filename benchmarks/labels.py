@@ -1,12 +1,13 @@
 """How good the classes are that `--labels` gives: of generated scans by another network, of known ones by the truth.
 
-python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--model default] [--by-class]
+python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--model default] [--by-class] [--least P...]
 
 generated  scans from noise: how often street-1's RangeNet, which saw the same scan, gives the same class
 streets    held-out worlds as hdl-64e-kitti sees them: whole, and of every fourth beam alone, against the truth; beside
            them the RangeNet on the whole scans
 real       folders of labelled real scans, read as `benchmarks/street.py --classes` reads them
 by-class   the IoU of each class, of streets and real scans that are wholly known
+least      of streets and real scans: how many pixels keep a class with so much confidence, and how many are right
 
 mIoU is over the classes that occur in the truth, or, of generated scans, that the RangeNet finds.
 """
@@ -14,7 +15,7 @@ mIoU is over the classes that occur in the truth, or, of generated scans, that t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,9 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.metrics.reconstruction import class_iou, confusion_matrix
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.naming import named
+from lidarsynth.systems.cascade.response import response_of
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.segmentation.training import classify
 from lidarsynth.weights.load import load, load_parts
@@ -81,6 +85,19 @@ def rows(model: ScanModel, args: argparse.Namespace) -> Iterator[str]:
         yield f"| {name}, RangeNet of {WORD} | {cells((i, classify(network, i)) for i in images)} |"
     for name, images in sets.items() if args.by_class else ():
         yield by_class(name, ((i, answered(model, i)) for i in images))
+    yield from ("", "| at least so sure | kept | right |", "|---|---:|---:|") if args.least else ()
+    for name, images in sets.items():
+        yield from (f"| {name}, {least:g} | {sure_cells(model, images, least)} |" for least in args.least)
+
+
+def sure_cells(model: ScanModel, images: Sequence[RangeImage], least: float) -> str:
+    """Two cells: how many labelled pixels keep a class of so much confidence, and how many of these are right."""
+    assert isinstance(model, CascadeModel) and model.network.classes is not None
+    network, (first, *_) = model.network.classes, images
+    answers = named(network, images, response_of(first, first.mask), first.sensor, least=least)
+    counts = counted(zip(images, answers, strict=True))[1:]
+    kept = counts[:, 1:].sum()
+    return f"{100 * kept / counts.sum():.1f} % | {100 * np.trace(counts[:, 1:]) / max(kept, 1):.1f} %"
 
 
 def main() -> None:
@@ -90,6 +107,7 @@ def main() -> None:
     parser.add_argument("--real", type=Path, nargs="+", default=[], help="folders of labelled scans")
     parser.add_argument("--model", default="default")
     parser.add_argument("--by-class", action="store_true")
+    parser.add_argument("--least", type=float, nargs="+", default=[])
     args = parser.parse_args()
     torch.set_num_threads(1)
     for line in rows(load(args.model).into(SENSOR).with_labels(), args):

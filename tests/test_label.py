@@ -67,6 +67,25 @@ def test_bags_keep_their_columns(place: Path):
     assert cloud.given["label"].min() >= 1
 
 
+def test_classes_that_are_not_sure_are_left_out(place: Path, capsys: pytest.CaptureFixture[str]):
+    scan, model = read("scan.ply"), load("model")
+    all_of_them = model.label(scan, "own.toml").label
+    counts = []
+    for least in (0.0, 0.06, 0.07, 0.1, 1.0):
+        label = model.label(scan, "own.toml", least=least).label
+        assert ((label == 0) | (label == all_of_them)).mean() > 0.99  # a point may take that of a surer pixel beside it
+        counts.append(int((label > 0).sum()))
+    assert counts == sorted(counts, reverse=True) and counts[0] == len(scan) and counts[-1] == 0
+    main(["label", "scan.ply", "--out", "sure.ply", "--min-confidence", "0.07", *WORDS])
+    np.testing.assert_array_equal(read("sure.ply").label, model.label(scan, "own.toml", least=0.07).label)
+    for words in (["--min-confidence", "1.5"], ["--min-confidence", "-0.1"]):
+        with pytest.raises(SystemExit) as refused:
+            main(["label", "scan.ply", "--out", "no.ply", *words, *WORDS])
+        assert refused.value.code == 2 and "expected --min-confidence of 0 to 1" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="expected a least confidence of 0 to 1, found 2"):
+        model.label(scan, "own.toml", least=2)
+
+
 def test_pictures_show_classes(place: Path):
     main(["label", "scan.ply", "--out", "named.ply", *WORDS[:-1]])
     assert Path("named.png").stat().st_size > 10_000

@@ -181,19 +181,24 @@ class ScanModel(ABC):
         """Raises ValueError for a model that cannot `realise`."""
         raise self._lacks("which rays return")
 
-    def label(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None) -> Scan:
+    def label(
+        self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0
+    ) -> Scan:
         """The scan, bit by bit, with the class of each point: SemanticKITTI's 1-19, 0 out of the sensor's view or
         limits.
 
         scan    points, as a scan or an array (N, 3) x y z
         sensor  that made the scan; None = recognised from the points, or that of `into`
+        least   points of whose class the network is less sure get 0 too; 0 to 1
 
-        Labels that it had are replaced. Raises ValueError for a model that has learned no classes, and where no point
-        is in view.
+        Labels that it had are replaced. Raises ValueError for a model that has learned no classes, where no point is in
+        view, and for a `least` outside 0 to 1.
         """
-        return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor).to_scan()
+        if not 0 <= least <= 1:
+            raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
+        return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
 
-    def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None) -> RangeImage:
+    def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`."""
         raise self._lacks("classes")
 

@@ -45,7 +45,7 @@ class Job:
     corrupt    recipe to hide a part first, of complete
     sensor     that made the scans, None = recognised
     into       sensor of the result, of upsample
-    least      confidence of new points of complete and upsample, None = all
+    least      confidence of new points of complete and upsample, of classes of label, None = all
     times      as many beams as the scan's own, of upsample; None = the model's own number
     projection, width  of project
     transform  (4, 4) that was applied to the points, to be undone in the result, or None
@@ -208,7 +208,7 @@ def _made(
         return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor)
-        named = label_scan(model, scan, sensor, job.how.precision)
+        named = label_scan(model, scan, sensor, job.how.precision, job.least)
         return named, found(named.points, sensor)
     sensor = named_sensor(scan, path, "--from", job.sensor)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)

@@ -14,9 +14,12 @@ from lidarsynth.verbs.completion import Filled
 MOST = 4  # classes that are told
 
 
-def label_scan(model: ScanModel, scan: Scan, sensor: Sensor, precision: str | None = None) -> Filled:
-    """A scan of `sensor` with a class for every point. Raises ValueError as `ScanModel.label` does."""
-    named = (model if precision is None else model.at_precision(precision)).named(scan, sensor)
+def label_scan(
+    model: ScanModel, scan: Scan, sensor: Sensor, precision: str | None = None, least: float | None = None
+) -> Filled:
+    """A scan of `sensor` with a class for every point, or for those whose class has a `least` confidence. Raises
+    ValueError as `ScanModel.label` does."""
+    named = (model if precision is None else model.at_precision(precision)).named(scan, sensor, least or 0.0)
     return Filled(named, lambda: {"classes": named}, {})
 
 

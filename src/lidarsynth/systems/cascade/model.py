@@ -249,7 +249,7 @@ class CascadeModel(ScanModel):
         answer = model._answers(unanswered(image, padded(model.sensor)), generators(seed, 1), surely=image.range[None])
         return observed(scan, image, answer[0], projection)
 
-    def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None) -> RangeImage:
+    def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`, with the classes of its pixels."""
         scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
         model = self.with_labels()
@@ -259,7 +259,7 @@ class CascadeModel(ScanModel):
         if not image.mask.any():
             raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
         model = replace(model, response=response_of(image, image.mask))
-        (image,) = model._named([image])
+        (image,) = model._named([image], least)
         return replace(image, completed=replace(scan, label=class_of_points(scan.xyz, image, pixels)))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
@@ -301,12 +301,12 @@ class CascadeModel(ScanModel):
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         return self._named(recorded)
 
-    def _named(self, images: list[RangeImage]) -> list[RangeImage]:
+    def _named(self, images: list[RangeImage], least: float = 0.0) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for."""
         if not self.labelled:
             return [replace(image, label=None) for image in images]
         assert self.network.classes is not None
-        return named(self.network.classes, images, self.response, self.sensor, self.precision)
+        return named(self.network.classes, images, self.response, self.sensor, self.precision, least)
 
     def _between(
         self,

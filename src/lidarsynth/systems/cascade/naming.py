@@ -61,19 +61,25 @@ class NamingObjective(nn.Module):
 
 @torch.inference_mode()
 def named(
-    network: ClassUNet, images: Sequence[RangeImage], response: Response, sensor: Sensor, precision: str = "fp32"
+    network: ClassUNet,
+    images: Sequence[RangeImage],
+    response: Response,
+    sensor: Sensor,
+    precision: str = "fp32",
+    least: float = 0.0,
 ) -> list[RangeImage]:
     """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
-    there is none."""
+    there is none, or where the network is less sure of it than `least`."""
     rays = response.told(rays_told(sensor))
     with torch.autocast(next(network.parameters()).device.type, torch.bfloat16, enabled=precision == "bf16"):
-        labels = [_classes(network, image, response.even(image.reflectance), rays) for image in images]
+        labels = [_classes(network, image, response.even(image.reflectance), rays, least) for image in images]
     return [replace(image, label=label * image.mask) for image, label in zip(images, labels, strict=True)]
 
 
-def _classes(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays) -> np.ndarray:
-    """(H, W) of every ray, of reflectances (H, W) as the streets' sensor would report them. One image at a time: four
-    at once take a quarter longer, and longer sums may round otherwise."""
+def _classes(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays, least: float = 0.0) -> np.ndarray:
+    """(H, W) of every ray, of reflectances (H, W) as the streets' sensor would report them; 0 where all are less
+    likely than `least`. One image at a time: four at once take a quarter longer, and longer sums may round otherwise.
+    """
     device, size = next(network.parameters()).device, (rays.elevation.shape[2], rays.elevation.shape[3])
     known = known_of(image.range[None], even[None], image.mask[None], True, size)
     (height, width), columns = image.shape, np.arange(size[1]) % image.shape[1]
@@ -83,7 +89,11 @@ def _classes(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays
     metres, shade, near, *told = (part.to(device) for part in parts)
     logits = network(around_the_turn(class_inputs(metres, shade, near, Rays(*told))))
     fair = FAIR * torch.from_numpy(np.log(weights())).to(logits)[:, None, None]
-    return (logits[0] - fair)[1:, :height, :width].argmax(0).cpu().numpy() + 1  # 0, unlabeled, is no answer
+    each = (logits[0] - fair)[1:, :height, :width]  # 0, unlabeled, is no answer
+    label = each.argmax(0) + 1
+    if least > 0:
+        label = label * (each.float().softmax(0).amax(0) >= least)
+    return label.cpu().numpy()
 
 
 def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
