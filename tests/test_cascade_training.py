@@ -12,11 +12,12 @@ from torch.testing import assert_close
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.coarse_unet import BINS, CoarseUNet, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.column_neighbours import known_grid, spoilt
 from lidarsynth.networks.fill_unet import Filled, Known
 from lidarsynth.networks.rays import encode_range, rays_of
+from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import training as cascade_training
 from lidarsynth.systems.cascade.examples import crop, mixed, pattern
@@ -226,6 +227,44 @@ def test_with_a_base_the_fills_of_one_sensor_alone_are_learned_and_kept(tmp_path
     before, after = (load(source).network.state_dict() for source in ("default", tmp_path / "run"))
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert changed == {"likeliest", "observer"}
+
+
+@pytest.mark.slow
+def test_classes_of_ones_own_are_learned_from_labels_and_kept_beside_a_base(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    from lidarsynth import load
+
+    monkeypatch.setattr(monitor, "IMAGES", 1)
+    few = {"training.batch_size": 2, "training.steps": 1, "training.warmup": 0, "model.observer_channels": 0}
+    tuned = with_fields(preset("tuned"), few | {"model.own_classes": True})
+    for progress in run(tuned, "recordings", tmp_path / "run", options=Options(workers=0)):
+        assert progress.step == 0 or set(progress.losses) == {"loss", "likeliest", "named"}
+    kept = load_file(tmp_path / "run" / "model.safetensors")
+    assert {name.split(".")[0] for name in kept} == {"likeliest", "classes"}
+    network = load(tmp_path / "run").network
+    for name, value in kept.items():
+        torch.testing.assert_close(network.state_dict()[name], value, atol=0, rtol=0)
+    classes = load("default").network.classes.state_dict()
+    assert any(not torch.equal(network.classes.state_dict()[name], value) for name, value in classes.items())
+    judged = cascade_training.judge(tuned, network, [SyntheticStreets(3, 1).image(0)])
+    assert 0 < judged["classes"] <= 1
+
+
+def test_an_arc_of_another_scan_brings_its_labels():
+    class Two:
+        def __len__(self) -> int:
+            return 2
+
+        def take(self, indices: list[int]) -> list[RangeImage]:
+            return [other for _ in indices]
+
+    metres = np.full((4, 64), 5.0, np.float32)
+    sensor = Sensor("four", (2.0, 0.0, -2.0, -4.0), 64)
+    image = RangeImage(metres, metres / 10, metres > 0, sensor)
+    other = RangeImage(2 * metres, metres / 10, metres > 0, sensor, np.full(metres.shape, 9))
+    both = mixed(image, Two(), 1.0, np.random.default_rng(0))
+    assert both.label is not None and 0 < (both.label == 9).mean() < 1
+    np.testing.assert_array_equal(both.label == 9, both.range == 10)
+    assert set(np.unique(both.label)) == {0, 9}
 
 
 def test_what_columns_are_told_of_their_neighbours_is_spoilt_at_times_and_never_what_they_learn():

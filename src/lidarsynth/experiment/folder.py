@@ -16,7 +16,8 @@ from lidarsynth.lidar.whole_file import whole_file
 
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
 OWN = ("likeliest.", "observer.")  # how the weights begin that a model with a base does not share with it
-OWN_PARTS = ("likeliest", "observer_channels")  # what a record says of them
+CLASSES = "classes."  # and those that it may have of its own
+OWN_PARTS = ("likeliest", "observer_channels", "own_classes")  # what a record says of them
 
 
 def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
@@ -29,7 +30,7 @@ def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: b
     dtype = torch.float16 if half else torch.float32
     # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
     exact = {name for name, _ in network.named_buffers()}
-    own = {k: v for k, v in network.state_dict().items() if not experiment.base or k.startswith(OWN)}
+    own = {k: v for k, v in network.state_dict().items() if not experiment.base or k.startswith(owned(experiment))}
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in own.items()}
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
@@ -37,10 +38,16 @@ def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: b
     return folder
 
 
+def owned(experiment: Experiment) -> tuple[str, ...]:
+    """How the weights begin that a model with a base has of its own."""
+    return (*OWN, CLASSES) if experiment.model.own_classes else OWN
+
+
 def on_base(experiment: Experiment, base: Experiment) -> Experiment:
     """The record of a model with a base, of the networks that its base has now: those that it shares may have changed
     since it was saved."""
-    own = {name: getattr(experiment.model, name) for name in OWN_PARTS}
+    kept = (*OWN_PARTS, "class_channels") if experiment.model.own_classes else OWN_PARTS
+    own = {name: getattr(experiment.model, name) for name in kept}
     return replace(experiment, model=replace(base.model, **own))
 
 

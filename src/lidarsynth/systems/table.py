@@ -9,7 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from lidarsynth.experiment.folder import OWN, RECORD, WEIGHTS, on_base, read_experiment
+from lidarsynth.experiment.folder import RECORD, WEIGHTS, on_base, owned, read_experiment
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
@@ -151,4 +151,5 @@ def _base(experiment: Experiment, folder: str) -> tuple[Experiment, dict[str, Te
     base = None if home is None else read_experiment(home)
     if home is None or base is None or base.base:
         raise ValueError(f"{folder}: expected a base of shipped weights that have none, found {experiment.base!r:.60}")
-    return base, {name: value for name, value in load_file(home / WEIGHTS).items() if not name.startswith(OWN)}
+    own = owned(experiment)
+    return base, {name: value for name, value in load_file(home / WEIGHTS).items() if not name.startswith(own)}

@@ -96,9 +96,16 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     return CascadeBatch(
         Crops(Known(*known), rays, truth[0], truth[1], truth[2], seeds, count),
         *parts,
-        lessons=lessons(taken, seeds),
+        lessons=lessons(_all_mixed(experiment, images, taken, seeds), seeds),
         seen=_all_seen(experiment, images, taken, seeds) if observed else None,
     )
+
+
+def _all_mixed(
+    experiment: Experiment, images: Images, taken: list[RangeImage], seeds: tuple[int, ...]
+) -> list[RangeImage]:
+    rngs = [np.random.default_rng((number, 6)) for number in seeds]
+    return [mixed(image, images, experiment.data.mix, rng) for image, rng in zip(taken, rngs, strict=True)]
 
 
 def _all_seen(experiment: Experiment, images: Images, taken: list[RangeImage], seeds: tuple[int, ...]) -> Seen:
@@ -124,6 +131,7 @@ def mixed(image: RangeImage, images: Images, share: float, rng: np.random.Genera
         np.where(taken, other.reflectance, image.reflectance),
         np.where(taken, other.mask, image.mask),
         image.sensor,
+        np.where(taken, *(np.zeros(a.shape, int) if a.label is None else a.label for a in (other, image))),
     )
 
 

@@ -184,10 +184,10 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
     if network.observer is not None:
         objective = ObserverObjective(network.observer, network.surest, shining=not experiment.base)
         own = (*likeliest, Phase(objective, "observer", every=EVERY))
+    if network.classes is not None and (experiment.model.own_classes or not experiment.base):
+        own = (*own, Phase(NamingObjective(network.classes), "classes"))
     if experiment.base:
         return own
-    if network.classes is not None:
-        own = (*own, Phase(NamingObjective(network.classes), "classes"))
     if bool((network.coarse.standard[1] == 1).all()):
         streets = VirtualStreets(experiment.training.seed + 1, FITTED)
         fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
@@ -212,7 +212,7 @@ def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.op
     if not experiment.base:
         learned["fill"] = torch.optim.AdamW(network.fill.parameters(), **options)
         learned["coarse"] = torch.optim.AdamW([coarse], **options)
-    classes = None if experiment.base else network.classes
+    classes = network.classes if experiment.model.own_classes or not experiment.base else None
     for name, own in (("likeliest", network.likeliest), ("observer", network.observer), ("classes", classes)):
         if own is not None:
             learned[name] = torch.optim.AdamW(own.parameters(), **options)
@@ -221,7 +221,8 @@ def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.op
 
 @torch.no_grad()
 def judge(experiment: Experiment, network: nn.Module, images: Sequence[RangeImage]) -> dict[str, float]:
-    """Mean absolute errors of hidden pixels, in metres, with every second and every fourth beam known."""
+    """Mean absolute errors of hidden pixels, in metres, with every second and every fourth beam known; with `classes`
+    of its own, the share of labelled returns that get theirs."""
     assert isinstance(network, Cascade)
     errors: dict[str, float] = {}
     for every in (2, 4):
@@ -232,7 +233,18 @@ def judge(experiment: Experiment, network: nn.Module, images: Sequence[RangeImag
             filled = model.complete(image.keep(known), known)
             error = float(np.abs(filled.range - image.range)[~known].mean())
             errors[f"beams_{every}"] = errors.get(f"beams_{every}", 0.0) + error / len(images)
-    return errors
+    return errors | (_named_rightly(experiment, network, images) if experiment.model.own_classes else {})
+
+
+def _named_rightly(experiment: Experiment, network: Cascade, images: Sequence[RangeImage]) -> dict[str, float]:
+    """`classes`, where images have labels."""
+    right = []
+    for image in images:
+        known = image.mask & (0 if image.label is None else image.label > 0)
+        named = CascadeModel(network, image.sensor, experiment).with_labels().complete(image, np.ones_like(image.mask))
+        right.append((named.label == image.label)[known.astype(bool)])
+    every = np.concatenate(right)
+    return {"classes": float(every.mean())} if len(every) else {}
 
 
 def pictures(
