@@ -214,19 +214,19 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_with_a_base_the_fills_of_one_sensor_alone_are_learned_and_kept(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_with_a_base_what_one_sensor_has_of_its_own_alone_is_learned_and_kept(tmp_path, monkeypatch: pytest.MonkeyPatch):
     from lidarsynth import load
 
     monkeypatch.setattr(monitor, "IMAGES", 1)
     few = {"training.batch_size": 2, "training.steps": 2, "training.warmup": 0}
     for progress in run(with_fields(preset("kitti"), few), "virtual", tmp_path / "run", options=Options(workers=0)):
-        parts = {"likeliest", "observed"} if progress.step == 1 else {"likeliest"}  # every fourth step
+        parts = {"likeliest", "named", *(["observed"] if progress.step == 1 else [])}  # every fourth step
         assert progress.step == 0 or set(progress.losses) == {"loss", *parts}
     kept = load_file(tmp_path / "run" / "model.safetensors")
-    assert kept and {name.split(".")[0] for name in kept} == {"likeliest", "observer"}
+    assert kept and {name.split(".")[0] for name in kept} == {"likeliest", "observer", "classes"}
     before, after = (load(source).network.state_dict() for source in ("default", tmp_path / "run"))
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
-    assert changed == {"likeliest", "observer"}
+    assert changed == {"likeliest", "observer", "classes"}
 
 
 @pytest.mark.slow

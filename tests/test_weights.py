@@ -433,11 +433,19 @@ def test_a_base_is_of_the_shipped_weights_that_have_none(tmp_path, base):
 
 def test_a_model_follows_its_base_whose_networks_have_changed_since(tmp_path):
     experiment, network = load_parts("kitti")
-    before = replace(
-        experiment, model=replace(experiment.model, guide_channels=32, column_channels=0, class_channels=8)
-    )
-    save(tmp_path / "m", before, network, half=True)
+    before = replace(experiment.model, guide_channels=32, column_channels=0)
+    save(tmp_path / "m", replace(experiment, model=before), network, half=True)
     found, again = load_parts(tmp_path / "m")
     assert found == experiment
     for name, value in network.state_dict().items():
         torch.testing.assert_close(again.state_dict()[name], value, atol=0, rtol=0)
+
+
+def test_classes_are_of_the_base_where_a_model_has_none_of_its_own(tmp_path):
+    experiment, network = load_parts("kitti")
+    assert experiment.model.own_classes
+    before = replace(experiment.model, own_classes=False, class_channels=8)
+    save(tmp_path / "m", replace(experiment, model=before), network, half=True)
+    _, again = load_parts(tmp_path / "m")
+    for name, value in load_parts("default")[1].classes.state_dict().items():
+        torch.testing.assert_close(again.classes.state_dict()[name], value, atol=0, rtol=0)
