@@ -25,7 +25,8 @@ from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.networks.interpolation import METHODS
 from lidarsynth.networks.pointnet import PointNet
 from lidarsynth.systems.gan.build import build_discriminator
-from lidarsynth.systems.table import GANS, build_network
+from lidarsynth.systems.gan.family import GAN
+from lidarsynth.systems.table import SYSTEMS, build_network
 from lidarsynth.systems.upsampling.model import queries_at
 
 ROWS = (
@@ -44,7 +45,7 @@ def call_of(experiment: Experiment, network: nn.Module, count: int, device: str)
     """One evaluation for `count` scans."""
     word, height, width = experiment.model.network, experiment.data.height, experiment.data.width
     image = torch.randn(count, 2, height, width, device=device)
-    if word in GANS:
+    if SYSTEMS[word] is GAN:
         z = torch.randn(count, network.latent_channels, device=device)  # type: ignore[arg-type]
         return lambda: network(z, torch.full((1, 1, 1, 1), 0.5, device=device))
     if word == "conditional-unet":
@@ -104,7 +105,7 @@ def row(name: str, scans: int, repeats: int, device: str) -> tuple[str, float, f
     network = build_network(experiment).to(device)
     flop, seconds = measured(call_of(experiment, network, scans, device), repeats, device)
     words = f"{count(network):,}"
-    if experiment.model.network in GANS:
+    if SYSTEMS[experiment.model.network] is GAN:
         words += f" + {count(build_discriminator(experiment)):,}"
     assert build_sensor(experiment).width == 1024
     return words, flop / scans / 1e9, seconds / scans * 1e3

@@ -31,6 +31,7 @@ from lidarsynth.systems.cascade.known import spread
 from lidarsynth.systems.cascade.layout import DRAFT, draft, one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.surfaces import straightened
+from lidarsynth.weights.load import load_parts
 
 SMALL = Sensor("small", tuple(np.linspace(5, -25, 24).tolist()), 256, 0.5, 120.0, mount=1.8)
 
@@ -589,3 +590,15 @@ def test_columns_are_drawn_in_one_thread_and_all_else_as_before(model: CascadeMo
     finally:
         torch.set_num_threads(before)
     assert seen == [1] * 128 + [2]
+
+
+def test_a_drawn_scan_which_is_one_of_many_has_no_confidence(model: CascadeModel):
+    sure = load_parts("default")[0].confidence
+    model = replace(model, experiment=replace(model.experiment, confidence=sure))
+    rows, columns = np.arange(SMALL.height), np.arange(0, SMALL.width, 4)
+    grid = torch.full((1, len(rows), len(columns)), 9.0)
+    (image,) = model._filled_grids(grid, 0.02 * grid, rows, columns, generators(0, 1))
+    assert image.confidence is None and image.mask.any()
+    known = np.zeros(image.shape, bool)
+    known[::2] = True
+    assert model.complete(image.keep(known), known).confidence is not None

@@ -1,6 +1,7 @@
 """The house rules of docs/design.md as tests: who imports whom, how long, how named, how loud, how light."""
 
 import ast
+import importlib
 import resource
 import statistics
 import subprocess
@@ -281,3 +282,11 @@ def test_help_answers_in_half_a_second():
     asked = statistics.median(cpu_seconds("-m", "lidarsynth", "--help") for _ in range(3))
     slow = max(bare / 0.025, 1.0)  # a bare Python takes 15 to 25 ms; more, and the machine is slow or crowded
     assert asked < 0.5 * slow, f"--help took {asked:.2f} s, a bare python {bare:.3f} s"
+
+
+@pytest.mark.parametrize("path", sorted((REPO_ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_what_a_benchmark_imports_is_there(path: Path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("lidarsynth."):
+            there = importlib.import_module(node.module)
+            assert [alias.name for alias in node.names if not hasattr(there, alias.name)] == []

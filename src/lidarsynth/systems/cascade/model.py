@@ -293,7 +293,7 @@ class CascadeModel(ScanModel):
         if len(rows) == ROWS < self.sensor.height:
             told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
             drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
-        drawn, shades = [replace(image, sensor=self.sensor) for image in drawn], shades_of(drawn, calm)
+        drawn, shades = [replace(a, sensor=self.sensor, confidence=None) for a in drawn], shades_of(drawn, calm)
         recorded = textured(drawn, shades, rng)
         if self.network.classes is None:
             return self._named(recorded)
