@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.lidar.recognition import FAR, elevations_of
+from lidarsynth.lidar.recognition import FAR, elevations_of, rings_in_order
 from lidarsynth.lidar.sensor import Sensor
 
 MARGIN = 1.0  # degrees
@@ -13,13 +13,13 @@ MARGIN = 1.0  # degrees
 OUTSIDE, BELOW = 0.04, 0.25
 LOWEST = 0.002  # of the points are left out to find the lowest
 FEW = 5  # points: a ring that has fewer is a wrong number
+MISCOUNTED = 1.25  # as many rings may be counted by the points' order alone
 
 
 def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> str | None:
-    """What points (N, 3) beyond 3 m, of rings (N,) where these are said, have that the sensor's could not, in words,
-    or None."""
-    rings = 0 if ring is None else int((np.unique(ring, return_counts=True)[1] >= FEW).sum())
-    if rings > sensor.height:
+    """What points (N, 3) beyond 3 m, of rings (N,) where these are said, else of those of their order, have that the
+    sensor's could not, in words, or None."""
+    if ring is not None and (rings := _count(ring)) > sensor.height:
         return f"them on {rings} rings, more than its {sensor.height} beams (of two sensors? --rings A-B takes one)"
     lift = float(np.mean(sensor.offsets)) if sensor.offsets else 0.0
     far = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR] - np.array([0, 0, lift], np.float32)
@@ -30,4 +30,12 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
     if outside > OUTSIDE:
         return f"{outside:.0%} of them outside its view of {bottom:+.1f} to {top:+.1f} degrees"
     below = int((np.array(sensor.elevations) < np.quantile(elevation, LOWEST) - MARGIN).sum())
-    return f"none on its {below} lowest beams of {sensor.height}" if below > BELOW * sensor.height else None
+    if below > BELOW * sensor.height:
+        return f"none on its {below} lowest beams of {sensor.height}"
+    turns = rings_in_order(xyz) if ring is None else None
+    rings = 0 if turns is None else _count(turns)
+    return f"them on {rings} rings, more than its {sensor.height} beams" if rings > MISCOUNTED * sensor.height else None
+
+
+def _count(ring: np.ndarray) -> int:
+    return int((np.unique(ring, return_counts=True)[1] >= FEW).sum())
