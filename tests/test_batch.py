@@ -63,6 +63,26 @@ def test_one_broken_file_is_named_and_counted(scans: Path, tmp_path: Path, capsy
     assert all(row["seconds"] > 0 for row in report["scans"])
 
 
+@pytest.mark.parametrize("name", ["x.db3", "y.pcap", "z.las", "d3.zip", "w.csv", "v.tar.gz", "U.E57"])
+def test_a_kind_that_is_not_written_is_no_folder(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+):
+    with pytest.raises(SystemExit) as end:
+        main(["project", str(scans), "--out", str(tmp_path / name), *WORDS])
+    line = capsys.readouterr().err.split("\r")[-1]
+    assert end.value.code == 2 and line.count("\n") == 1
+    assert f"{name}: expected the name of a folder for 5 scans, found that of a file; written are .bin, " in line
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("name", ["run.v2", "2026.11.25", "there.las"])
+def test_a_folder_may_have_a_dot(scans: Path, tmp_path: Path, name: str):
+    if name == "there.las":
+        (tmp_path / name).mkdir()
+    main(["project", str(scans / "d2"), "--out", str(tmp_path / name), *WORDS])
+    assert names(tmp_path / name) == ["000.npz", "001.npz", "report.json"]
+
+
 def test_what_is_there_is_skipped(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = ["--out", str(tmp_path / "o"), *WORDS]
     main(["project", str(scans / "d2"), *out])
@@ -214,3 +234,8 @@ def test_a_model_that_was_tuned_to_another_sensor_says_so(scans: Path, tmp_path:
         words = f"{model} was tuned to hdl-64e-kitti, and this is a scan of vlp-16; use --model default"
         assert words in said[model]
     assert "this is a scan of" not in said["default"]
+    named = ["--sensor", "hdl-64e-kitti", "--out", str(tmp_path / "o.ply"), WORDS[0]]
+    main(["complete", str(scans / "d1" / "000.pcd"), "--model", "kitti", *named])
+    assert "was tuned to" not in capsys.readouterr().err, "the user says whose scan it is"
+    main(["label", str(scans / "d1" / "000.pcd"), "--model", "kitti", "--out", str(tmp_path / "named.ply")])
+    assert "kitti was tuned to hdl-64e-kitti, and this is a scan of vlp-16" in capsys.readouterr().err

@@ -53,6 +53,52 @@ def test_a_bin_gets_a_file_of_raw_ids_and_a_folder_is_worked_through(place: Path
     assert (read_words(Path("out/a.label"), 6144) > 0).all()
 
 
+@pytest.mark.parametrize("verb", ["label", "realise", "complete --labels", "upsample --labels"])
+@pytest.mark.parametrize("to", ["d/odo.bin --out d/odo.npy", "d --out d --format npy", "d/odo.ply --out d/odo.bin"])
+def test_labels_of_the_source_are_never_replaced(place: Path, capsys: pytest.CaptureFixture[str], verb: str, to: str):
+    source = Path("d/odo.ply" if "ply" in to else "d/odo.bin")
+    source.parent.mkdir()
+    write(source, replace(perfect(SMALL), ring=None))
+    words = np.arange(6144, dtype=np.uint32)
+    words.tofile("d/odo.label")
+    sensor = ("--from", "own.toml") if "upsample" in verb else ("--sensor", "own.toml")
+    with pytest.raises(SystemExit) as end:
+        main([*verb.split(), *to.split(), *sensor, "--model", "model", "--no-picture"])
+    assert end.value.code == 2
+    line = capsys.readouterr().err.split("\r")[-1]
+    assert f"expected a name whose .label is not that of {source}, found d/odo.label" in line and line.count("\n") == 1
+    np.testing.assert_array_equal(read_words(Path("d/odo.label"), 6144), words)
+    assert sorted(Path("d").iterdir()) == sorted([source, Path("d/odo.label")])
+
+
+def test_what_a_former_run_wrote_beside_is_replaced(place: Path, capsys: pytest.CaptureFixture[str]):
+    write("odo.bin", replace(perfect(SMALL), ring=None)[np.arange(6144) % 2 == 0])
+    for words in (
+        "label scan.ply --out scan.bin",
+        "complete odo.bin --out odo.npy --labels",
+        "complete odo.bin --out o.npy",
+    ):
+        for _ in range(2):
+            main([*words.split(), *WORDS])
+    said = capsys.readouterr().out
+    assert said.count("wrote scan.bin, with .label beside it\n") == 2
+    assert said.count("wrote odo.npy, with .new, .label beside it\n") == 2
+    assert said.count("wrote o.npy, with .new beside it\n") == 2
+
+
+def test_marks_and_raw_labels_of_the_source_are_never_replaced(place: Path, capsys: pytest.CaptureFixture[str]):
+    scan = replace(perfect(SMALL), ring=None)
+    write("a.bin", replace(scan, extra={"new": np.zeros(len(scan), np.uint8)}))
+    write("b.ply", replace(scan, extra={"raw_label": np.full(len(scan), 40, np.uint32)}))
+    Path("b.label").write_bytes(b"mine")
+    for words, ending in (("a.bin --out a.npy", "new"), ("b.ply --out b.npy", "label")):
+        with pytest.raises(SystemExit):
+            main(["complete", *words.split(), *WORDS])
+        assert f"expected a name whose .{ending} is not that of {words[:5]}" in capsys.readouterr().err
+    assert Path("a.new").stat().st_size == len(scan) and Path("b.label").read_bytes() == b"mine"
+    assert not Path("a.npy").exists() and not Path("b.npy").exists()
+
+
 def test_bags_keep_their_columns(place: Path):
     pytest.importorskip("rosbags")
     from lidarsynth.verbs.inputs import Reading, inputs_of

@@ -74,6 +74,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     transform = read_transform(many.transform, many.mount, many.axes)
     rings = parse_rings(many.rings)
     inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings))
+    if many.topic is not None and not inputs.streams:
+        raise ValueError(f"expected a bag or a capture for --topic {many.topic}, found none")
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
@@ -84,6 +86,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     if many.keep_topics:
         raise ValueError(f"{out}: expected a .mcap or .bag to keep topics in, found another kind of output")
     if inputs.single and not any(is_stream(path) for path in paths) and (out.suffix or out.is_file()):
+        if many.format is not None:
+            raise ValueError(f"{out}: expected a folder with --format {many.format}, found the name of a file")
         return _one(job, inputs, out)
     return _into_folder(job, inputs, out, many)
 
@@ -109,7 +113,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
     from lidarsynth.verbs.batch import run
     from lidarsynth.verbs.output_files import works
 
-    work = list(works(inputs, out, "ply"))
+    work = list(works(inputs, out, "ply", beside=job.beside))
     model = _model(job)
     calls = 1 if model is None or job.verb in ("realise", "label") else model.calls(model.resolved(job.how))
     with step_bar(work[0].item.path.name, calls) as on_step:
@@ -130,7 +134,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many) -> list[Result
     ending = many.format or ("npz" if job.verb == "project" else "ply")
     if shard[1] == 1:  # other machines may be writing there else
         sweep(out, deep=True, token=TOKEN)
-    stream = works(inputs, out, ending, shard, many.skip_existing, skipped)
+    stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside)
     first = next(stream, None)
     model = _model(job) if first is not None else None
     count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
@@ -206,7 +210,8 @@ def _tell(result: Result, picture: bool) -> None:
     if result.note:
         say(f"{result.source}: {result.note}")
     if result.target is not None:
-        say(f"wrote {result.target}" + (f" and {result.target.with_suffix('.png')}" if picture else ""))
+        beside = f", with {', '.join(result.beside)} beside it" if result.beside else ""
+        say(f"wrote {result.target}" + (f" and {result.target.with_suffix('.png')}" if picture else "") + beside)
 
 
 def _tell_of_many(result: Result, picture: bool, each: bool, number: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarsynth.data.bags import Cloud
 from lidarsynth.data.windows import in_window
-from lidarsynth.files.formats import BARE, write, write_labels
+from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
@@ -26,6 +26,7 @@ from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
+from lidarsynth.verbs.companions import LABEL, check_companions
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
@@ -70,6 +71,12 @@ class Job:
     picture: bool = True
     labels: bool = False
 
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """Endings of the files that a .bin or .npy of this job may get beside it, as far as the job tells."""
+        marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample") else ()
+        return (*marks, LABEL) if self.labels or self.verb == "realise" else marks
+
 
 @dataclass(frozen=True)
 class Work:
@@ -91,6 +98,7 @@ class Result:
     note      what was done, in words
     errors    of hidden pixels by method, where a corruption was asked for
     cloud     for a bag
+    beside    endings of what was written beside the target
     """
 
     name: str
@@ -104,6 +112,7 @@ class Result:
     note: str = ""
     errors: Mapping[str, Errors] = field(default_factory=dict)
     cloud: Cloud | None = None
+    beside: tuple[str, ...] = ()
 
 
 def run(job: Job, works: Iterable[Work], workers: int = 1, model: ScanModel | None = None,
@@ -137,13 +146,13 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         loaded = work.item.read()
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         done, note = _made(job, model, work, loaded.scan, on_step)
-        cloud = None
+        cloud, beside = None, ()
         if work.target is None:
             points = _points(done, loaded, job.transform)
             fields = FIELDS.get(job.verb, message_fields)(points, loaded.given)
             cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields)
         else:
-            _store(work.target, done, loaded, job)
+            beside = _store(work.target, work.item.path, done, loaded, job)
     except (ValueError, FloatingPointError) as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT):
             raise  # that is no fault of the scan, and the next ones would not fit either
@@ -152,7 +161,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
     whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
-    return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud)
+    return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud, beside)
 
 
 def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
@@ -178,11 +187,12 @@ def _misfit(scan: Scan, job: Job) -> str | None:
 
 def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:
     """That a model of one sensor, or one that was tuned to one, gets another's scan, in one line."""
-    if not work.check or job.verb != "complete" or model is None:
+    if not work.check or job.verb not in ("complete", "label", "realise") or model is None:
         return None
     own = model.experiment.card.sensor if model.any_sensor else model.sensor.name
-    name, _ = recognise(scan, work.item.path) if own else (None, "")
-    if name is None or name.removesuffix("-kitti") == own.removesuffix("-kitti"):
+    named = None if job.sensor is None else get_sensor(job.sensor).name
+    name = named or (recognise(scan, work.item.path)[0] if own else None)
+    if not own or name is None or name.removesuffix("-kitti") == own.removesuffix("-kitti"):
         return None
     knows = f"was tuned to {own}" if model.any_sensor else f"knows {own} alone"
     return f"{work.item.path}: {job.model} {knows}, and this is a scan of {name}; use --model default"
@@ -223,15 +233,22 @@ def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | N
     return back_in_place(done.points, loaded, transform)
 
 
-def _store(target: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) -> None:
+def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) -> tuple[str, ...]:
+    """Write the result, and return the endings of what is beside a .bin or .npy."""
+    beside: tuple[str, ...] = ()
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
         write(target, image)
     else:
         placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
-        if target.suffix.lower() in BARE and (job.labels or "raw_label" in placed.extra):
+        if target.suffix.lower() in BARE:
+            beside = tuple(f".{name}" for name in BESIDE if name in placed.extra)
+            beside += (LABEL,) if job.labels or "raw_label" in placed.extra else ()
+        check_companions(target, source, beside)  # again: only the points tell of raw labels in a .ply
+        if LABEL in beside:
             write_labels(label_path(target), placed)
         write(target, without_places(placed))
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
+    return beside

@@ -22,6 +22,8 @@ from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.small_file import LARGEST, check_regular
 
+FARTHEST = 1e9  # metres; no two frames on Earth are as far apart, and points there still have squares in float32
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -145,14 +147,16 @@ class BrokenInput:
 class Inputs:
     """Scans to come, in order.
 
-    single  True where one file was named, whose result may go to a file of any name
-    count   how many there are, or None where only reading tells (captures)
-    stream  gives them; from the start each time
+    single   True where one file was named, whose result may go to a file of any name
+    count    how many there are, or None where only reading tells (captures)
+    stream   gives them; from the start each time
+    streams  whether bags or captures are among them
     """
 
     single: bool
     count: int | None
     stream: Callable[[], Iterator[Input]]
+    streams: bool
 
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
@@ -179,7 +183,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
                     raise
                 yield BrokenInput(path.stem, path, str(error))  # the others go on
 
-    return Inputs(single, count, stream)
+    return Inputs(single, count, stream, bool(streams))
 
 
 def is_stream(path: Path) -> bool:
@@ -223,7 +227,8 @@ def _names(expanded: list[Path], given: Sequence[Path]) -> Iterator[tuple[str, P
     root = Path(os.path.commonpath([path.absolute().parent for path in files]))
     names = [str(path.absolute().parent.relative_to(root) / stem(path)) for path in files]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"expected scans of different names, found two named {twice[0]}")
+        one, other = [path for name, path in zip(names, files, strict=True) if name == twice[0]][:2]
+        raise ValueError(f"expected scans of different names, found two named {twice[0]}: {one} and {other}")
     return iter(zip(names, files, strict=True))
 
 
@@ -269,12 +274,15 @@ def read_transform(text: str | None, mount: float | None = None, axes: str = "fl
     mount  height of the sensor above the points' z = 0, such as the ground
     axes   where the points' own x, y and z point, as `parse_axes` reads it; undone first
     None of them is no transform at all.
-    Raises ValueError for anything that is no rigid motion.
+    Raises ValueError for anything that is no rigid motion, and for a shift that is not finite or beyond FARTHEST.
     """
     turned = parse_axes(axes)
     if text is None and mount is None and np.array_equal(turned, np.eye(4)):
         return None
     matrix = np.eye(4) if text is None else _matrix_file(Path(text)) if Path(text).is_file() else parse_transform(text)
+    for option, given, shift in (("transform", text, matrix[:3, 3]), ("mount", mount, mount or 0.0)):
+        if not (np.abs(shift) <= FARTHEST).all():
+            raise ValueError(f"expected --{option} of finite metres, at most {FARTHEST:g}, found {given}")
     down = np.eye(4)
     down[2, 3] = -(mount or 0.0)
     return down @ matrix @ turned

@@ -19,6 +19,7 @@ PAGE = 1 << 30  # bytes of a page that are read to count its scans
 PICTURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG", b"GIF8": "GIF"}
 ARCHIVES = {b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip", b"\xfd7zXZ\x00": "xz", b"BZh": "bzip2",
             b"\x28\xb5\x2f\xfd": "zstd", b"7z\xbc\xaf\x27\x1c": "7z"}  # fmt: skip
+PACKED = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".zst", ".7z", ".rar")  # endings of archives
 ENTRIES = '"entries": '  # before the list of a page's scans
 TAR = 257, b"ustar"  # of a tar that is not packed: where it says so
 

@@ -6,9 +6,13 @@ import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from lidarsynth.files.formats import WRITERS
+from lidarsynth.data.bag_writer import FORMATS
+from lidarsynth.files.formats import READERS, WRITERS
 from lidarsynth.verbs.batch import EVERY, FIRST, Work
+from lidarsynth.verbs.companions import check_companions
+from lidarsynth.verbs.file_kinds import STREAMS
 from lidarsynth.verbs.inputs import Inputs
+from lidarsynth.verbs.other_files import PACKED
 
 
 def works(
@@ -18,17 +22,21 @@ def works(
     shard: tuple[int, int] = (1, 1),
     skip: bool = False,
     skipped: list[Path] | None = None,
+    beside: tuple[str, ...] = (),
 ) -> Iterator[Work]:
     """Each scan of this shard with its file: `out` for a single one that names a file, else out/NAME.ending.
 
     skip     leave out scans whose file is there already; they are added to `skipped`
-    Raises ValueError where `out` cannot be written, is a scan's own file, or names one file for several scans.
+    beside   endings of the files that are written beside a .bin or .npy
+    Raises ValueError where `out` cannot be written, is a scan's own file, or names one file for several scans, and
+    where a file beside it is a scan's own.
     """
     named = bool(out.suffix or out.is_file())
     one = inputs.single and named and (_is(WRITERS, out) or not out.is_dir())
-    if not one and (_is(WRITERS, out) or out.is_file()):
+    if not one and _names_a_file(out):
         raise ValueError(
-            f"{out}: expected the name of a folder for {inputs.count or 'several'} scans, found that of a file"
+            f"{out}: expected the name of a folder for {inputs.count or 'several'} scans, found that of a file; "
+            f"written are {', '.join(WRITERS)} of one scan, and {' and '.join(FORMATS)} of a bag"
         )
     part, parts = shard
     for number, item in enumerate(inputs.stream()):
@@ -39,12 +47,18 @@ def works(
             if skipped is not None:
                 skipped.append(file)
             continue
+        check_companions(file, item.path, beside)
         yield Work(item, file, looked_at(number), number)
 
 
 def looked_at(number: int) -> bool:
     """Whether the frame of scan `number` is looked at: of the first ones, and every so many."""
     return number < FIRST or number % EVERY == 0
+
+
+def _names_a_file(out: Path) -> bool:
+    """Whether `out` is a file, or has the ending of a kind that we write, or read, or of an archive."""
+    return out.is_file() or _is(WRITERS, out) or (_is([*READERS, *STREAMS, *PACKED], out) and not out.is_dir())
 
 
 def _is(kinds: Collection[str], path: Path) -> bool:

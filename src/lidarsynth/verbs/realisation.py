@@ -13,8 +13,13 @@ from lidarsynth.verbs.completion import Filled
 
 
 def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) -> Filled:
-    """A perfect scan as `sensor` would have reported it. Raises ValueError as `ScanModel.realise` does."""
+    """A perfect scan as `sensor` would have reported it.
+
+    Raises ValueError as `ScanModel.realise` does, and where nothing returns.
+    """
     real = model.realised(scan, sensor, seed)
+    if not real.mask.any():
+        raise ValueError(f"expected points of which some return, found that none of {len(scan)} does")
     return Filled(real, lambda: {"simulated": project(scan, real.sensor), f"as {sensor.name} sees it": real}, {})
 
 
