@@ -211,3 +211,9 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
         write(tmp_path / "scan.bin", SCAN)
     assert [p.name for p in tmp_path.iterdir()] == ["scan.bin"]
     assert (tmp_path / "scan.bin").read_bytes() == BODY
+
+
+def test_write_refuses_what_is_no_scan(tmp_path: Path):
+    with pytest.raises(files.FileError, match=r"scan.bin: expected a Scan or a RangeImage, found ndarray"):
+        files.write(tmp_path / "scan.bin", np.zeros((5, 4), np.float32))  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())

@@ -214,7 +214,9 @@ def test_a_run_trains_both_stages_and_goes_on(tmp_path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_with_a_base_what_one_sensor_has_of_its_own_alone_is_learned_and_kept(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_with_a_base_what_one_sensor_has_of_its_own_alone_is_learned_and_kept(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+):
     from lidarsynth import load
 
     monkeypatch.setattr(monitor, "IMAGES", 1)

@@ -283,7 +283,7 @@ def test_complete_takes_several_scans_or_a_folder(run: Run, tiny: Path, tmp_path
     refused(run("complete", scans, "--out", tmp_path / "z.ply", *words), "the name of a folder for 2 scans")
     refused(run("complete", tmp_path / "x" / "..", "--out", tmp_path / "c.ply", *words), "the name of a folder")
     write(scans / "c.bin", street())
-    refused(run("complete", scans, "--out", tmp_path / "z", *words), "found two named c")
+    refused(run("complete", scans, "--out", tmp_path / "z", *words), "found two named c: ", "c.bin and ", "c.ply\n")
     refused(run("complete", "--out", tmp_path / "z", *words), "found none")
 
 
@@ -436,6 +436,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
     ("words", "said"),
     [
         ("gnerate", "gnerate"),
+        ("compete SCAN", "found 'compete'; was complete meant?"),
         ("generate -n x", "'x'"),
         ("generate -n 0", "--count of at least 1, found 0"),
         ("generate -n -3", "-3"),
@@ -468,6 +469,11 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("complete SCAN --out d.ply --model TINY --steps 0", "--steps"),
         ("complete SCAN --out d.ply --model TINY --resamples 0", "--resamples"),
         ("complete SCAN --out d.ply --intensity percent", "'percent'"),
+        ("complete SCAN --out d.ply --format xyz", "expected a folder with --format xyz, found the name of a file"),
+        ("complete SCAN --out d.ply --topic /a", "expected a bag or a capture for --topic /a, found none"),
+        ("complete SCAN --out d.ply --mount nan", "expected --mount of finite metres"),
+        ("project SCAN --out d --transform=nan:0:0:0:0:0", "of finite numbers, found 'nan:0:0:0:0:0'"),
+        ("view SCAN --out d.html --mount inf", "expected --mount of finite metres"),
         ("complete none.bin --out d.ply --model TINY", "No such file"),
         ("complete none --out d --model TINY", "none"),
         ("upsample SCAN --out d.docx", "expected a name"),

@@ -19,7 +19,7 @@ from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation import evaluate as evaluation
 from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.evaluation.pairs import Pairs
-from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING
+from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING, STREET_1
 from lidarsynth.evaluation.statistics import load_statistics
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import thin
@@ -427,6 +427,20 @@ def test_other_beams_have_no_report_per_beam():
     assert report.beams is None and report.values["no return, per beam"] is None
     assert report.values["JSD x1e2"] is not None
     assert any("other beams" in warning for warning in report.warnings)
+
+
+def test_points_of_another_sensor_are_noted(tmp_path: Path):
+    kinds = {name: SENSORS[name].resized(width=256) for name in ("hdl-64e-kitti", "vlp-16")}
+    real, sparse = (saved(tmp_path / name, [street(i, kinds[name]) for i in range(2)], "ply") for name in kinds)
+    for protocol in (BEV_1, replace(STREET_1, networks=(), rows=BEV_1.rows)):
+        (note,) = (text for text in ls.evaluate(sparse, real, protocol).warnings if "points of" in text)
+        assert note == (
+            "the points of samples of vlp-16 and the reference of hdl-64e-kitti are drawn into images of "
+            f"{protocol.sensor}: other beams"
+        )
+        assert not any("other beams" in text for text in ls.evaluate(real, real, protocol).warnings)
+    assert any("other beams" in text for text in ls.evaluate(sparse, sparse).warnings), "than the protocol's"
+    assert not any("other beams" in text for text in ls.evaluate(sparse, sparse, sensor="vlp-16").warnings)
 
 
 def test_an_image_set_tells_where_it_comes_from(tmp_path: Path, real: Path):

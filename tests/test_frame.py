@@ -1,5 +1,6 @@
 """A scan that was moved, tilted or written in other axes is found out; nobody's correct scan is."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, 
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.lidar.view import misfit
 from lidarsynth.verbs.inputs import read_transform
 
@@ -108,6 +109,9 @@ def test_points_that_a_named_sensor_could_not_see():
     assert misfit(scan.xyz, SENSORS["hdl-32e"], ring) is None
     two = np.concatenate([scan.xyz, scan.xyz]), np.concatenate([ring, ring + 64])
     assert "on 64 rings, more than its 32 beams" in str(misfit(two[0], SENSORS["hdl-32e"], two[1]))
+    turn = street("hdl-64e-kitti", rings=False).xyz  # one ring after the other, which nobody has numbered
+    assert "rings, more than its 32 beams" in str(misfit(turn, SENSORS["hdl-32e"]))
+    assert misfit(turn, Sensor("mine", tuple(np.linspace(5, -26, 60).tolist()))) is None
 
 
 def test_points_on_no_beams_have_no_stand():
@@ -182,6 +186,22 @@ def test_transforms_from_files(tmp_path: Path):
         read_transform(str(tmp_path / "t.txt"))
     with pytest.raises(ValueError, match="found '1:2'"):
         read_transform("1:2")
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e+30"])
+def test_shifts_and_turns_are_finite(number: str, tmp_path: Path):
+    matrix = np.eye(4)
+    matrix[1, 3] = float(number)
+    np.savetxt(tmp_path / "t.txt", matrix)
+    with pytest.raises(ValueError, match="expected --mount of finite metres, at most .*, found " + re.escape(number)):
+        read_transform(None, mount=float(number))
+    for text in (f"{number}:0:0:0:0:0", str(tmp_path / "t.txt")):
+        with pytest.raises(ValueError, match="expected .*transform .*of finite .*, found '?" + re.escape(text)):
+            read_transform(text)
+    if "e" not in number:
+        with pytest.raises(ValueError, match=f"of finite numbers, found '0:0:0:0:0:{number}'"):
+            parse_transform(f"0:0:0:0:0:{number}")
+    assert read_transform("1e9:0:0:0:0:0", mount=-1e9) is not None
 
 
 @pytest.mark.parametrize("name", ["test/kitti360_000000.bin", "test/odometry_000964.bin", "test/odometry08_000000.bin",

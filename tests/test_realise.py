@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from test_cascade import SMALL, perfect
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write, write_labels
 from lidarsynth.files.labels import read_words
+from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.verbs.realisation import realise_scan
 from lidarsynth.weights.load import load
 
 WORDS = ("--sensor", "own.toml", "--no-picture")
@@ -151,6 +156,14 @@ def test_a_model_that_cannot_is_refused_before_any_work(place: Path, capsys: pyt
         said = capsys.readouterr().err
         assert stop.value.code == 2 and said.count("expected a model that has learned") == 1
     assert not Path("o").exists()
+
+
+def test_a_scan_of_which_nothing_returns_is_refused():
+    scan = perfect(SMALL)[:1]
+    real = project(scan, SMALL)
+    model = cast(ScanModel, SimpleNamespace(realised=lambda *_: real.keep(np.zeros(real.shape, bool))))
+    with pytest.raises(ValueError, match="expected points of which some return, found that none of 1 does"):
+        realise_scan(model, scan, SMALL)
 
 
 def test_labels_of_generated_scans(place: Path):

@@ -87,6 +87,9 @@ def test_points_of_no_spinning_sensor_are_asked_for():
     assert name is None and "at least 100 points" in reason and "found 50" in reason
     near = Scan(xyz * np.float32(0.01), np.zeros(5000, np.float32))
     assert recognise(near)[0] is None
+    above = Scan(xyz + np.float32([0, 0, 1e9]), near.reflectance)  # straight above, all of them
+    name, reason = recognise(above)
+    assert name is None and "from +90.0 to +90.0 degrees" in reason
 
 
 @pytest.mark.parametrize(

@@ -235,6 +235,8 @@ def test_weather_takes_far_returns_and_adds_near_ones():
 def test_wrong_options_are_named():
     with pytest.raises(ValueError, match="and a rate of 0"):
         Options(rate=0)
+    with pytest.raises(ValueError, match=r"\(0.36 to 216 km/h\), found -5.55556 m/s \(-20 km/h\)"):
+        Options(frames=2, speed=-20 / 3.6)
     with pytest.raises(ValueError, match="expected rain of 0 to 200"):
         Weather(rain=-1)
     with pytest.raises(ValueError, match="expected a drive of at most"):

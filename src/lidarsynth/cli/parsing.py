@@ -34,7 +34,7 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
         with _refusals(verbs[word]):
             return tyro.cli(_later(verbs[word]), prog=f"lidarsynth {word}", args=argv[1:])
     if not word.startswith("-"):
-        raise ValueError(f"expected a verb of {', '.join(verbs)}, found {word!r}{_meant(word, verbs)}")
+        raise ValueError(f"expected a verb of {', '.join(verbs)}, found {word!r}{_meant(word, tuple(verbs))}")
     with _refusals(None):
         told = {name: (inspect.getdoc(verb) or "").partition("\n\nArgs:")[0] for name, verb in verbs.items()}
         named = [tyro.conf.subcommand(name, description=text) for name, text in told.items()]

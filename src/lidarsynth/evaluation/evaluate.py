@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -21,8 +21,9 @@ from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
-from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.weights.download import cache_folder
@@ -158,7 +159,7 @@ class _Run:
 def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
     files, real_files = _statistics_files(samples), _statistics_files(reference)
     warnings, hashes, told = (), {}, {}
-    real, truth = None, None
+    real, truth, judged = None, None, None
     if real_files:
         real, warnings = merged(real_files, run.protocol)
         told["reference"] = ", ".join(map(str, real_files))
@@ -186,6 +187,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         real_files = [kept] if kept else []
     assert real
     report = report_of(fake, real, loaded.missing, seed, run.on_images)
+    warnings += _unlike_sensors({"samples": judged, "the reference": truth}, fake.sensor)
     if real_files:
         told["reference statistics"] = ", ".join(map(str, real_files))
         hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
@@ -207,7 +209,8 @@ def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> 
     pairs = run.pairs(judged, truth, sensor, loaded)
     report = pairs.report(loaded.missing, loaded.weights)
     sources = {"samples": judged.source, "reference": truth.source}
-    warnings = report.warnings + _unlike_pairs(judged.names, truth.names)
+    warnings = report.warnings + _unlike_sensors({"samples": judged, "the reference": truth}, sensor)
+    warnings += _unlike_pairs(judged.names, truth.names)
     return replace(report, sources=sources, warnings=warnings, images=_size_of(sensor))
 
 
@@ -218,6 +221,18 @@ def _unlike_pairs(names: Sequence[str], true_names: Sequence[str]) -> tuple[str,
         return ()
     first = " with ".join(other[0])
     return (f"{len(other)} of {len(names)} samples are compared with a reference of another name, first {first}",)
+
+
+def _unlike_sensors(sides: Mapping[str, ImageSet | None], drawn: Sensor) -> tuple[str, ...]:
+    """A warning where points, by the first scan of each side, are of other sensors than the one whose images they are
+    drawn into, or than the other side's; of images their own beams tell."""
+    firsts = {side: images.item(0) for side, images in sides.items() if images}
+    taken = {side: name for side, scan in firsts.items() if isinstance(scan, Scan) and (name := recognise(scan)[0])}
+    known = {*taken.values(), *({drawn.name} & SENSORS.keys())}  # a user's own may be a unit of any of them
+    if not taken or len({name.removesuffix("-kitti") for name in known}) == 1:
+        return ()
+    told = " and ".join(f"{side} of {name}" for side, name in taken.items())
+    return (f"the points of {told} are drawn into images of {drawn.name}: other beams",)
 
 
 def _size_of(sensor: Sensor) -> str:

@@ -130,9 +130,11 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     points. `.bin` and `.npy` hold x y z reflectance only, and of a filled scan `new` beside them in a `.new` file, a
     byte a point, and `confidence` in a `.confidence` file, a float32 a point; the others hold ring, time, label and
     every further field too. The file appears whole or not at all: it is written beside its place, then
-    renamed. Raises FileError.
+    renamed. Raises FileError, also for anything else, such as an array.
     """
     path = Path(path)
+    if not isinstance(scan, Scan | RangeImage):
+        raise FileError(f"{path}: expected a Scan or a RangeImage, found {type(scan).__name__}")
     if path.name.lower().endswith(".pcd.bin"):
         raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found .pcd.bin")
     suffix = _suffix(path, WRITERS, "write")

@@ -221,15 +221,17 @@ def parse_axes(text: str) -> np.ndarray:
 def parse_transform(text: str) -> np.ndarray:
     """(4, 4) from x:y:z:roll:pitch:yaw (metres, degrees: roll about x, then pitch about y, then yaw about z).
 
-    Raises ValueError for anything but six numbers.
+    Raises ValueError for anything but six finite numbers.
     """
     try:
-        x, y, z, *angles = (float(word) for word in text.split(":"))
+        x, y, z, *angles = numbers = [float(word) for word in text.split(":")]
         roll, pitch, yaw = np.radians(angles)
     except ValueError:
         raise ValueError(
             f"expected a transform x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers, found {text!r}"
         ) from None
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"expected a transform x:y:z:roll:pitch:yaw of finite numbers, found {text!r}")
     (a, b), (c, d), (e, f) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
     about_x = np.array([[1, 0, 0], [0, a, -b], [0, b, a]])
     about_y = np.array([[c, 0, d], [0, 1, 0], [-d, 0, c]])

@@ -92,7 +92,7 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     if count < sensor.height // 2 or count > 2 * sensor.height:
         raise ValueError(
             f"unfolding expects about {sensor.height} rings, one after the other, found {count}; "
-            "use --projection spherical"
+            "use the spherical projection"
         )
     if scan.ring is not None:
         return np.where(ring < sensor.height, ring, -1)

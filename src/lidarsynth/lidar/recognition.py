@@ -182,8 +182,10 @@ def rings_by_elevation(xyz: np.ndarray) -> np.ndarray | None:
     far = np.hypot(xyz[:, 0], xyz[:, 1]) > FAR
     edges = np.arange(-90, 90.01, 0.02)
     count = np.histogram(elevation[far], edges)[0]
+    if not count.any():  # none is far, or all are straight above or below
+        return None
     smooth = np.convolve(count, np.ones(5) / 5, "same")
-    crowded = smooth > max(0.15 * float(np.quantile(smooth[smooth > 0], 0.9)), 2) if far.any() else smooth > 0
+    crowded = smooth > max(0.15 * float(np.quantile(smooth[smooth > 0], 0.9)), 2)
     starts = np.flatnonzero(np.diff(np.concatenate([[0], crowded.astype(int)])) == 1)
     ends = np.flatnonzero(np.diff(np.concatenate([crowded.astype(int), [0]])) == -1)
     if not 8 <= len(starts) <= 256 or count[crowded].sum() < 0.9 * far.sum():

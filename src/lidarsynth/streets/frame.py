@@ -56,7 +56,8 @@ class Options:
             raise ValueError("expected the frames of a drive with a speed or deskewed points, found none: scans of "
                              "places stand still")  # fmt: skip
         if self.speed is not None and not 0.1 <= self.speed <= 60:
-            raise ValueError(f"expected a speed of 0.1 to 60 m/s, found {self.speed}")
+            raise ValueError(f"expected a speed of 0.1 to 60 m/s (0.36 to 216 km/h), found {self.speed:g} m/s "
+                             f"({3.6 * self.speed:g} km/h)")  # fmt: skip
 
 
 @dataclass(frozen=True)

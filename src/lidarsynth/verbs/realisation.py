@@ -18,7 +18,7 @@ def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) ->
     Raises ValueError as `ScanModel.realise` does, and where nothing returns.
     """
     real = model.realised(scan, sensor, seed)
-    if not real.mask.any():
+    if not len(real.to_scan()):
         raise ValueError(f"expected points of which some return, found that none of {len(scan)} does")
     return Filled(real, lambda: {"simulated": project(scan, real.sensor), f"as {sensor.name} sees it": real}, {})
 
