@@ -19,10 +19,12 @@ from lidarsynth.lidar.sensor import from_dict
 
 COLUMNS: tuple[str, ...] = ("x", "y", "z", "intensity", "ring")
 MAX_HEADER = 1 << 16
+# What zipfile and what it unpacks with raise of damaged archives: RuntimeError is also of other packings, and of a
+# password; ValueError also of wrong text, and FileError.
 ZIP_ERRORS = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, RuntimeError,
-    ValueError, OSError, KeyError, IndexError,
-)  # fmt: skip
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError),
+    *(LookupError, OSError, RuntimeError, ValueError),
+)
 PRINTABLE = frozenset(b"\t\n\r" + bytes(range(32, 127)))
 
 
@@ -154,9 +156,9 @@ def unzip(data: bytes) -> dict[str, np.ndarray]:
                 raise FileError(f"expected 1 to 64 arrays of at most {MAX_BYTES} bytes in all, found {len(members)} "
                                 f"of {sum(m.file_size for m in members)}")  # fmt: skip
             return {m.filename[:-4]: _member(archive, m) for m in members}
+    except FileError:
+        raise
     except ZIP_ERRORS as error:
-        if isinstance(error, FileError):
-            raise
         raise FileError(f"expected an npz (a zip of numpy arrays), found {_first_line(error)}") from None
 
 

@@ -108,7 +108,7 @@ def holds_image(path: str | Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {f"{name}.npy" for name in arrays.NEEDED} <= set(archive.namelist())
-    except (OSError, *arrays.ZIP_ERRORS):
+    except arrays.ZIP_ERRORS:
         return False
 
 
