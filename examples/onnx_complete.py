@@ -37,6 +37,8 @@ feed = {name: np.zeros((1, 1, len(elevations), width), np.float32) for name in (
 for name, values in zip(feed, (metres, light, np.ones_like(metres)), strict=True):
     feed[name][0, 0, row[inside], column[inside]] = values[inside]
 
+for more in session.get_inputs()[3:]:  # the noise of `kitti-streets`
+    feed[more.name] = np.random.default_rng(0).standard_normal(more.shape, np.float32)
 full, shade, *sure = (out[0, 0] for out in session.run(None, feed))
 rows, columns = np.nonzero((full > 0) & (feed["known"][0, 0] == 0))  # the new points, along their pixels' rays
 azimuth, elevation = np.pi - (columns + 0.5) / width * 2 * np.pi, np.radians(elevations[rows])

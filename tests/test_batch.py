@@ -4,6 +4,7 @@ import errno
 import json
 import multiprocessing
 import time
+import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -213,6 +214,14 @@ def test_arrays_are_scans():
             model.complete(wrong)
 
 
+@pytest.mark.parametrize("verb", ["complete", "upsample", "label", "realise"])
+def test_what_is_no_scan_is_said_in_a_line(verb: str):
+    with pytest.raises(ValueError, match="expected a scan or an array of points, found a list"):
+        getattr(load("default"), verb)([[1.0, 2.0, 3.0]])
+    with pytest.raises(ValueError, match="nearest: expected a model such as default for 4 times as many beams"):
+        load("nearest").upsample(turn(SENSORS["vlp-16"]), times=4)
+
+
 def test_a_model_says_what_it_is_and_saves_itself(tmp_path: Path):
     model = load("default")
     assert isinstance(model, ScanModel)
@@ -237,5 +246,18 @@ def test_a_model_that_was_tuned_to_another_sensor_says_so(scans: Path, tmp_path:
     named = ["--sensor", "hdl-64e-kitti", "--out", str(tmp_path / "o.ply"), WORDS[0]]
     main(["complete", str(scans / "d1" / "000.pcd"), "--model", "kitti", *named])
     assert "was tuned to" not in capsys.readouterr().err, "the user says whose scan it is"
-    main(["label", str(scans / "d1" / "000.pcd"), "--model", "kitti", "--out", str(tmp_path / "named.ply")])
-    assert "kitti was tuned to hdl-64e-kitti, and this is a scan of vlp-16" in capsys.readouterr().err
+    for verb, *more in (["label"], ["upsample", "--times", "2"]):
+        out = ["--out", str(tmp_path / "named.ply"), *more]
+        main([verb, str(scans / "d1" / "000.pcd"), "--model", "kitti", *out])
+        assert "kitti was tuned to hdl-64e-kitti, and this is a scan of vlp-16" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["kitti", "kitti-streets"])
+def test_the_library_warns_of_another_sensor_as_the_verbs_do(word: str):
+    model, scan = load(word), turn(SENSORS["vlp-16"])
+    with pytest.warns(UserWarning, match=r"hdl-64e-kitti.*, and this is a scan of vlp-16; use load\("):
+        model.complete(scan, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load("nearest").upsample(scan, "vlp-16")  # made to
+        model.complete(street("hdl-64e-kitti"))

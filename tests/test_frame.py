@@ -1,6 +1,7 @@
 """A scan that was moved, tilted or written in other axes is found out; nobody's correct scan is."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, 
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.lidar.view import misfit
 from lidarsynth.verbs.inputs import read_transform
 
@@ -111,7 +112,19 @@ def test_points_that_a_named_sensor_could_not_see():
     assert "on 64 rings, more than its 32 beams" in str(misfit(two[0], SENSORS["hdl-32e"], two[1]))
     turn = street("hdl-64e-kitti", rings=False).xyz  # one ring after the other, which nobody has numbered
     assert "rings, more than its 32 beams" in str(misfit(turn, SENSORS["hdl-32e"]))
-    assert misfit(turn, Sensor("mine", tuple(np.linspace(5, -26, 60).tolist()))) is None
+    some = [beam for beam in range(64) if beam % 16 != 8]
+    assert misfit(turn, SENSORS["hdl-64e-kitti"].rows(some)) is None, "more rings counted than there are"
+
+
+@pytest.mark.parametrize("other", ["os1-128", "pandar64"])
+def test_a_sensor_of_as_many_beams_or_more_that_lie_elsewhere_is_another_one(other: str):
+    turn = street("hdl-64e-kitti", rings=False).xyz
+    assert misfit(turn, SENSORS[other]) == "them on the beams of hdl-64e-kitti"
+    for same in ("hdl-64e-kitti", "hdl-64e"):
+        assert misfit(turn, SENSORS[same]) is None
+    table = SENSORS["hdl-64e-kitti"]
+    own = replace(table, name="mine", elevations=tuple((np.array(table.elevations) + 0.2).tolist()))
+    assert misfit(turn, own) is None, "a unit's beams are a little off the table's"
 
 
 def test_points_on_no_beams_have_no_stand():

@@ -53,6 +53,12 @@ def test_a_bin_gets_a_file_of_raw_ids_and_a_folder_is_worked_through(place: Path
     assert (read_words(Path("out/a.label"), 6144) > 0).all()
 
 
+def test_labels_get_a_folder_beside_that_of_the_scans(place: Path):
+    write("scan.bin", replace(perfect(SMALL), ring=None))
+    main(["label", "scan.bin", "--out", "new/velodyne/000.bin", *WORDS])
+    assert (read_words(Path("new/labels/000.label"), 6144) > 0).all()
+
+
 @pytest.mark.parametrize("verb", ["label", "realise", "complete --labels", "upsample --labels"])
 @pytest.mark.parametrize("to", ["d/odo.bin --out d/odo.npy", "d --out d --format npy", "d/odo.ply --out d/odo.bin"])
 def test_labels_of_the_source_are_never_replaced(place: Path, capsys: pytest.CaptureFixture[str], verb: str, to: str):

@@ -398,6 +398,19 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert old.read_text() == "old"
 
 
+def test_a_topic_is_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
+    write(tmp_path / "a.pcd", turn())
+    bag(tmp_path / "a.mcap", [10**18])
+    for verb, *more in (["view", "--out", str(tmp_path / "a.html")], ["sensor", "--out", str(tmp_path / "a.toml")]):
+        with pytest.raises(SystemExit, match="2"):
+            main([verb, str(tmp_path / "a.pcd"), "--topic", "/points", *more])
+        assert "expected a bag or a capture for --topic /points, found none" in capsys.readouterr().err
+    for one, other in (("a.pcd", "a.mcap"), ("a.mcap", "a.pcd")):
+        series = compared([tmp_path / one], tmp_path / other, Reading(topic="/points"))
+        assert [scans[0].scan.xyz.shape[1] for scans in series.values()] == [3, 3]
+
+
 def test_too_many_for_a_file_are_refused_before_any_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for i in range(49):
         (tmp_path / f"{i}.npy").write_bytes(b"never read")

@@ -74,8 +74,6 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     transform = read_transform(many.transform, many.mount, many.axes)
     rings = parse_rings(many.rings)
     inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings))
-    if many.topic is not None and not inputs.streams:
-        raise ValueError(f"expected a bag or a capture for --topic {many.topic}, found none")
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,11 @@ POINTS = 8_000  # of a scan are enough, where each is compared with each beam
 POINTWISE = 0.25
 
 
-def recognise(scan: Scan, path: str | Path | None = None) -> tuple[str | None, str]:
-    """The name in SENSORS of the sensor that took the scan, or None, and the reason in words, one line.
+def recognise(
+    scan: Scan, path: str | Path | None = None, among: Mapping[str, Sensor] = SENSORS
+) -> tuple[str | None, str]:
+    """The name in SENSORS, or `among` others, of the sensor that took the scan, or None, and the reason in words, one
+    line.
 
     Rings come from `scan.ring`, else from the order of the points (KITTI's files hold one ring after the other). A scan
     of at least nine tenths of a sensor's beams matches it beam by beam within half a degree; one of fewer beams must
@@ -32,13 +36,18 @@ def recognise(scan: Scan, path: str | Path | None = None) -> tuple[str | None, s
         return None, f"{where}expected at least 100 points to tell the sensor, found {len(scan)}: name it with --sensor"
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
     told = ring is not None and ring.min() < ring.max()
-    name, reason = _by_rings(scan.xyz, ring) if told else _by_points(scan.xyz)  # type: ignore[arg-type]
+    name, reason = _by_rings(scan.xyz, ring, among) if told else _by_points(scan.xyz, among)  # type: ignore[arg-type]
     if name is None and told and scan.ring is None:  # the order may miscount them
-        name, other = _by_points(scan.xyz)
+        name, other = _by_points(scan.xyz, among)
         reason = reason if name is None else other
     if name is None:
-        reason = f"expected the beams of {', '.join(SENSORS)}, found {reason}: name the sensor with --sensor"
+        reason = f"expected the beams of {', '.join(among)}, found {reason}: name the sensor with --sensor"
     return name, where + reason
+
+
+def same_kind(name: str, other: str) -> bool:
+    """Whether two names are of one kind of sensor: `hdl-64e-kitti` is an `hdl-64e`, whose beams are where they are."""
+    return name.removesuffix("-kitti") == other.removesuffix("-kitti")
 
 
 def elevations_of(xyz: np.ndarray) -> np.ndarray:
@@ -63,7 +72,9 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
     return None if best is None else np.concatenate([[0], np.cumsum(best)])
 
 
-def _by_rings(xyz: np.ndarray, ring: np.ndarray, whole: bool = False) -> tuple[str | None, str]:
+def _by_rings(
+    xyz: np.ndarray, ring: np.ndarray, among: Mapping[str, Sensor], whole: bool = False
+) -> tuple[str | None, str]:
     """`whole`: of at least nine tenths of the sensor's beams only."""
     beams = _beams(xyz, ring)
     if len(beams) < 2:
@@ -72,15 +83,15 @@ def _by_rings(xyz: np.ndarray, ring: np.ndarray, whole: bool = False) -> tuple[s
     order = np.argsort(-middle, kind="stable")
     beams, middle = beams[order], middle[order]
     found = f"{len(beams)} rings from {middle[0]:+.1f} to {middle[-1]:+.1f} degrees"
-    errors = {n: e for n, s in SENSORS.items() if (e := _whole_error(beams, middle, s)) is not None and e < UNIT}
+    errors = {n: e for n, s in among.items() if (e := _whole_error(beams, middle, s)) is not None and e < UNIT}
     if errors:
         name = min(errors, key=lambda n: errors[n])
-        return name, f"{found}, {errors[name]:.2f} from the {SENSORS[name].height} beams of {name}"
-    errors = {} if whole else {name: _subset_error(beams, s) for name, s in SENSORS.items()}
+        return name, f"{found}, {errors[name]:.2f} from the {among[name].height} beams of {name}"
+    errors = {} if whole else {name: _subset_error(beams, s) for name, s in among.items()}
     shares = {name: e for name, e in errors.items() if e is not None and e < SUBSET}
     if shares:
         name = min(shares, key=lambda n: shares[n])
-        return name, f"{found}, on {len(beams)} of the {SENSORS[name].height} beams of {name}"
+        return name, f"{found}, on {len(beams)} of the {among[name].height} beams of {name}"
     return None, found
 
 
@@ -145,17 +156,17 @@ def _spacing(sensor: Sensor) -> np.ndarray:
     return np.minimum(np.concatenate([gaps[:1], gaps]), np.concatenate([gaps, gaps[-1:]]))
 
 
-def _by_points(xyz: np.ndarray) -> tuple[str | None, str]:
+def _by_points(xyz: np.ndarray, among: Mapping[str, Sensor]) -> tuple[str | None, str]:
     far = _far(xyz)
     elevation = elevations_of(far)
     few = far[np.random.default_rng(0).permutation(len(far))[:POINTS]]
-    shares = {name: _share_on_beams(few, sensor) for name, sensor in SENSORS.items()}
+    shares = {name: _share_on_beams(few, sensor) for name, sensor in among.items()}
     name = max(shares, key=lambda n: shares[n])
     found = f"no rings, and points from {elevation.min():+.1f} to {elevation.max():+.1f} degrees"
     if shares[name] >= POINTWISE:
         return name, f"{found}, {shares[name]:.0%} of them on the beams of {name}"
     ring = rings_by_elevation(xyz)  # of a unit whose beams lie off the table's
-    by_rings = None if ring is None else _by_rings(xyz, ring, whole=True)
+    by_rings = None if ring is None else _by_rings(xyz, ring, among, whole=True)
     return by_rings if by_rings is not None and by_rings[0] is not None else (None, found)
 
 

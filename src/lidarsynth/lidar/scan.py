@@ -64,6 +64,15 @@ def _chosen(values: np.ndarray, index: np.ndarray | slice) -> np.ndarray:
     return values.take(np.flatnonzero(index), axis=0) if len(index) == len(values) else values[index]
 
 
+def as_scan(points: Scan | np.ndarray) -> Scan:
+    """A scan as it is, an array as `scan_of` takes it. Raises ValueError for anything else."""
+    if isinstance(points, Scan):
+        return points
+    if not isinstance(points, np.ndarray):
+        raise ValueError(f"expected a scan or an array of points, found a {type(points).__name__}")
+    return scan_of(points)
+
+
 def scan_of(points: np.ndarray) -> Scan:
     """The scan of an array (N, 3) x y z in metres, or (N, 4) with a reflectance of 0 to 1; other columns are left out.
 

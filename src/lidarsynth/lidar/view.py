@@ -1,10 +1,11 @@
-"""Whether a scan's points can be of the sensor that is named: on its rings, in its view, down to its lower beams."""
+"""Whether a scan's points can be of the sensor that is named: on its rings and beams, in its view, to its lowest."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.lidar.recognition import FAR, elevations_of, rings_in_order
+from lidarsynth.lidar.recognition import FAR, elevations_of, recognise, rings_in_order, same_kind
+from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
 MARGIN = 1.0  # degrees
@@ -34,7 +35,17 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
         return f"none on its {below} lowest beams of {sensor.height}"
     turns = rings_in_order(xyz) if ring is None else None
     rings = 0 if turns is None else _count(turns)
-    return f"them on {rings} rings, more than its {sensor.height} beams" if rings > MISCOUNTED * sensor.height else None
+    if rings > MISCOUNTED * sensor.height:
+        return f"them on {rings} rings, more than its {sensor.height} beams"
+    return _of_another(Scan(xyz, ring=ring), sensor)
+
+
+def _of_another(scan: Scan, sensor: Sensor) -> str | None:
+    """That the points lie on the beams of a known sensor and not on this one's, which may have as many or more."""
+    other, _ = recognise(scan)
+    if other is None or same_kind(other, sensor.name) or recognise(scan, among={sensor.name: sensor})[0] is not None:
+        return None
+    return f"them on the beams of {other}"
 
 
 def _count(ring: np.ndarray) -> int:

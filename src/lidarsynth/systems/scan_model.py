@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,7 +17,8 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import occupied, pixel_of_points, project
-from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
+from lidarsynth.lidar.recognition import recognise, same_kind
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -137,6 +139,7 @@ class ScanModel(ABC):
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
         """
+        self._warn_of_stranger(scan)
         return self.filled(scan, Filling(method, steps, resamples, sampler, seed, precision), known, on_step)
 
     def upsample(
@@ -150,15 +153,23 @@ class ScanModel(ABC):
         resamples: int | None = None,
         sampler: str | None = None,
         precision: str | None = None,
+        times: int | None = None,
     ) -> RangeImage:
         """A sparse scan, of a sensor with fewer beams, as an image of this model's sensor; else as `complete`.
+
+        A model of any sensor gives, until `into`, an image of the scan's own sensor, whose rays stay, with `times` - 1
+        (default 3) new beams between each two.
 
         sensor_in  the sensor that made the scan; None = recognised from the points. Its beams tell which rows of the
                    image were looked at; points outside this model's view are kept by `to_scan()` alone.
 
-        Raises ValueError when the sensor is not recognised or sees nothing that the model does.
+        Raises ValueError when the sensor is not recognised or sees nothing that the model does, and for `times` as many
+        beams of a model that cannot make them.
         """
-        return self.upsampled(scan, Filling(method, steps, resamples, sampler, seed, precision), sensor_in, on_step)
+        if self.any_sensor:
+            self._warn_of_stranger(scan, sensor_in)
+        how = Filling(method, steps, resamples, sampler, seed, precision)
+        return self.upsampled(scan, how, sensor_in, on_step, times)
 
     def realise(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
         """A simulator's scan, in which every ray returns, as the real sensor would have reported it.
@@ -171,6 +182,7 @@ class ScanModel(ABC):
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
         """
+        self._warn_of_stranger(scan, sensor)
         return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
@@ -196,6 +208,7 @@ class ScanModel(ABC):
         """
         if not 0 <= least <= 1:
             raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
+        self._warn_of_stranger(scan, sensor)
         return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
@@ -217,7 +230,7 @@ class ScanModel(ABC):
         on_step: OnStep = None,
     ) -> RangeImage:
         """`complete` of a record."""
-        scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
+        scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
         model = self if how.precision is None else self.at_precision(how.precision)
         model = model.suited_to(scan) if isinstance(scan, Scan) else model
         if model is not self:
@@ -248,7 +261,7 @@ class ScanModel(ABC):
                              f"beams, found one with images of {self.sensor.name}")  # fmt: skip
         if how.precision is not None:
             return self.at_precision(how.precision).upsampled(scan, replace(how, precision=None), sensor_in, on_step)
-        scan = scan_of(scan) if isinstance(scan, np.ndarray) else scan
+        scan = as_scan(scan)
         how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
         sparse, known = sparse_image(scan, sensor_in, self.sensor)
         loose = replace(scan, ring=None)  # its rings are not the model's
@@ -290,6 +303,21 @@ class ScanModel(ABC):
     def tuned(self) -> bool:
         """Whether the network saw real scans of this very sensor last."""
         return self.experiment.card.sensor == self.sensor.name
+
+    def stranger(self, scan: Scan, sensor: Sensor | str | None = None) -> str | None:
+        """What a model that knows one sensor alone, or was tuned to one, has to say of another's scan, or None."""
+        own = self.experiment.card.sensor if self.any_sensor else self.sensor.name
+        if not own:
+            return None
+        name = recognise(scan)[0] if sensor is None else sensor if isinstance(sensor, str) else sensor.name
+        if name is None or same_kind(name, own):
+            return None
+        knows = f"was tuned to {own}" if self.any_sensor else f"knows {own} alone"
+        return f"{knows}, and this is a scan of {name}"
+
+    def _warn_of_stranger(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None) -> None:
+        if not isinstance(scan, RangeImage) and (text := self.stranger(as_scan(scan), sensor)) is not None:
+            warnings.warn(f'{self.experiment.name} {text}; use load("default")', stacklevel=3)
 
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""

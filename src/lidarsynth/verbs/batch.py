@@ -17,7 +17,6 @@ from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.view import misfit
@@ -187,15 +186,10 @@ def _misfit(scan: Scan, job: Job) -> str | None:
 
 def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:
     """That a model of one sensor, or one that was tuned to one, gets another's scan, in one line."""
-    if not work.check or job.verb not in ("complete", "label", "realise") or model is None:
+    if not work.check or model is None or (job.verb == "upsample" and not model.any_sensor):
         return None
-    own = model.experiment.card.sensor if model.any_sensor else model.sensor.name
-    named = None if job.sensor is None else get_sensor(job.sensor).name
-    name = named or (recognise(scan, work.item.path)[0] if own else None)
-    if not own or name is None or name.removesuffix("-kitti") == own.removesuffix("-kitti"):
-        return None
-    knows = f"was tuned to {own}" if model.any_sensor else f"knows {own} alone"
-    return f"{work.item.path}: {job.model} {knows}, and this is a scan of {name}; use --model default"
+    text = model.stranger(scan, None if job.sensor is None else get_sensor(job.sensor))
+    return text and f"{work.item.path}: {job.model} {text}; use --model default"
 
 
 def _made(
@@ -247,6 +241,7 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
             beside += (LABEL,) if job.labels or "raw_label" in placed.extra else ()
         check_companions(target, source, beside)  # again: only the points tell of raw labels in a .ply
         if LABEL in beside:
+            label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
         write(target, without_places(placed))
     if job.picture:

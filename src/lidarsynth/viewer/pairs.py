@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from lidarsynth.verbs.inputs import Reading
+from lidarsynth.verbs.inputs import Reading, is_stream
 from lidarsynth.viewer.page import Entry
 from lidarsynth.viewer.series import Files, Series, series_of
 
@@ -17,10 +18,11 @@ def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dic
 
     Raises ValueError where there is nothing to show, or the two differ in number.
     """
-    scans = series_of(paths, reading)
     if other is None:
-        return {_caption(paths): scans}
-    partners = series_of([other], reading)
+        return {_caption(paths): series_of(paths, reading)}
+    plain = replace(reading, topic=None)  # a topic is of whichever is a bag or a capture
+    scans = series_of(paths, plain if is_stream(other) and not any(map(is_stream, paths)) else reading)
+    partners = series_of([other], reading if is_stream(other) else plain)
     if isinstance(scans, Files) and isinstance(partners, Files):
         partners = _by_name(scans, partners)
     if None not in (scans.count, partners.count) and scans.count != partners.count:

@@ -16,7 +16,7 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.recognition import recognise
-from lidarsynth.lidar.scan import RangeImage, Scan, scan_of
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
@@ -187,28 +187,6 @@ class CascadeModel(ScanModel):
         (on_step or (lambda: None))()
         return own._named([filled])[0]
 
-    def upsample(
-        self,
-        scan: Scan | np.ndarray,
-        sensor_in: Sensor | str | None = None,
-        method: str = "auto",
-        steps: int | None = None,
-        seed: int = 0,
-        on_step: OnStep = None,
-        resamples: int | None = None,
-        sampler: str | None = None,
-        precision: str | None = None,
-        times: int | None = None,
-    ) -> RangeImage:
-        """A scan with `times` - 1 (default 3) new beams between each two of its own sensor's, whose rays stay.
-
-        After `into`, in the rays of that sensor.
-
-        sensor_in  the sensor that made the scan; None = recognised from the points
-        """
-        how = Filling(method, steps, resamples, sampler, seed, precision)
-        return self.upsampled(scan, how, sensor_in, on_step, times)
-
     def upsampled(
         self,
         scan: Scan | np.ndarray,
@@ -217,7 +195,10 @@ class CascadeModel(ScanModel):
         on_step: OnStep = None,
         times: int | None = None,
     ) -> RangeImage:
-        """`upsample` of a record; `to_scan()` gives every measured point bit by bit beside the new ones."""
+        """`upsample` of a record: of the scan's own sensor in `times` as many beams, or, after `into`, of that one.
+
+        `to_scan()` gives every measured point bit by bit beside the new ones.
+        """
         if not self.own:
             if times is not None:
                 raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
@@ -225,7 +206,7 @@ class CascadeModel(ScanModel):
         if how.precision is not None:
             model = self.at_precision(how.precision)
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
-        scan, times = scan_of(scan) if isinstance(scan, np.ndarray) else scan, TIMES if times is None else times
+        scan, times = as_scan(scan), TIMES if times is None else times
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
         model = self.into(written_out(own).denser(times))
@@ -238,7 +219,7 @@ class CascadeModel(ScanModel):
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
         self.check_realises()
-        scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
+        scan, projection = as_scan(scan), self.experiment.data.projection
         model = self.suited_to(scan) if sensor is None else self.into(sensor)
         model = model.into(fitting(scan, model.sensor, projection))
         network, grain = observing(self.network, model.tuned)
@@ -251,7 +232,7 @@ class CascadeModel(ScanModel):
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`, with the classes of its pixels."""
-        scan, projection = scan_of(scan) if isinstance(scan, np.ndarray) else scan, self.experiment.data.projection
+        scan, projection = as_scan(scan), self.experiment.data.projection
         model = self.with_labels()
         model = model.suited_to(scan) if sensor is None else model.into(sensor)
         pixels = pixel_of_points(scan, model.sensor, projection)
