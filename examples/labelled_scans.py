@@ -12,6 +12,8 @@ from lidarsynth.pictures.render import label_strip, save_png
 
 WIDTH, HEIGHT = 800, 150  # pixels of a strip
 
+if len(sys.argv) < 4 or len(sys.argv) % 2:
+    sys.exit(__doc__)
 target, *paths = sys.argv[1:]
 model, rows = ls.load("default"), []
 for left, right in zip(paths[::2], paths[1::2], strict=True):

@@ -9,6 +9,8 @@ import sys
 import numpy as np
 import onnxruntime
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 _, network, source, target = sys.argv
 session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
 sensor = json.loads(session.get_modelmeta().custom_metadata_map["sensor"])

@@ -42,6 +42,16 @@ def test_points_and_fields_stay_and_get_a_class(place: Path, capsys: pytest.Capt
     np.testing.assert_array_equal(again.label, after.label)
 
 
+def test_a_model_knows_the_sensor_that_it_was_tuned_on(place: Path, capsys: pytest.CaptureFixture[str]):
+    scan = read("scan.ply")
+    assert load("model").suited_to(scan).sensor.elevations == SMALL.elevations
+    with pytest.raises(ValueError, match=r"or take model.into\(sensor\)"):
+        load("default").suited_to(scan)
+    for verb in ("label", "complete", "upsample", "realise"):
+        main([verb, "scan.ply", "--model", "model", "--out", "o.ply", "--no-picture"])
+        assert "wrote o.ply" in capsys.readouterr().out
+
+
 def test_a_bin_gets_a_file_of_raw_ids_and_a_folder_is_worked_through(place: Path):
     Path("in").mkdir()
     for name in "ab":
@@ -161,7 +171,7 @@ def test_what_cannot_be_labelled_is_refused_in_one_line(place: Path, capsys: pyt
             "expected a model that has learned classes",
         ),
         (["label", "none.ply", "--out", "o.ply"], "none.ply"),
-        (["label", "scan.ply", "--out", "o.ply", "--model", "model"], "--sensor"),
+        (["label", "scan.ply", "--out", "o.ply"], "--sensor"),
     ):
         with pytest.raises(SystemExit) as stopped:
             main(words)

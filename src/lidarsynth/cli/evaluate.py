@@ -30,6 +30,8 @@ def evaluate(
     check_device(device)
     if not samples:
         raise ValueError("expected SAMPLES to judge: a folder, a cache or .safetensors parts, found none")
+    if part is None and side != "samples":
+        raise ValueError(f"expected --side {side} with --part, found no part")
     with image_bar() as on_images:
         if part is not None:
             evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, device, on_images, side, reference)

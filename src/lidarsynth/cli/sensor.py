@@ -21,7 +21,7 @@ def sensor(
     topic: Annotated[
         str | None, arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture.")
     ] = None,
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None,
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture: it tells all beams.")] = None,
     rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
     seed: NoSeed = 0,
     intensity: Intensity = "none",
@@ -35,8 +35,9 @@ def sensor(
 
     if out.suffix != ".toml":
         raise ValueError(f"{out}: expected a name that ends in .toml, found {out.name[-20:]!r}")
-    if len(scans) == 1 and (known := from_metadata(scans[0], out.stem)) is not None:
-        write_toml(out, sensor_toml(known, [f"from the metadata {scans[0].name}"]))
+    told = scans[0] if metadata is None and len(scans) == 1 else metadata
+    if told is not None and (known := from_metadata(told, out.stem)) is not None:
+        write_toml(out, sensor_toml(known, [f"from the metadata {told.name}"]))
         say(f"wrote {out}: {known.height} beams, {known.width} columns")
         return
     learned = learn(inputs_of(scans, Reading(intensity, topic, metadata, rings=parse_rings(rings))), out.stem)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,6 +70,9 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
     head = {"source": source, "sensor": sensor.to_dict(), "count": count, "step": step, "shards": {}}
     head = json.loads(json.dumps(head))
     if not (folder / INDEX).exists():
+        if others := sorted(path.name for path in folder.iterdir() if not _begun(path)):
+            raise ValueError(f"{folder}: expected an empty folder for a cache, or one that was begun, found "
+                             f"{others[0]!r:.80}; name another folder")  # fmt: skip
         return head
     index = read_index(folder)
     for key in ("source", "sensor"):
@@ -82,6 +86,11 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
             return head
     sweep(folder)
     return index | {"source": head["source"], "count": max(count, index["count"])}
+
+
+def _begun(path: Path) -> bool:
+    """Whether a file is of a cache whose index is not written yet: a shard, its report, or what is hidden."""
+    return path.name[0] == "." or path.name == REPORT or re.fullmatch(r"\d{7}\.npy", path.name) is not None
 
 
 def close_index(folder: Path, index: dict[str, Any]) -> None:

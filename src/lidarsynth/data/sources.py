@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from lidarsynth.data.kitti import kitti
 from lidarsynth.data.kitti360 import kitti360
 from lidarsynth.data.nuscenes import nuscenes
 from lidarsynth.lidar.projection import PROJECTIONS, project, thin
-from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
@@ -45,6 +46,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "files": Source(lambda root, split: scan_folder(root), "all", None, "auto", 1024),
 }
 
+LOOKED_AT = 16  # scans from everywhere, whether all are of one sensor
 SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
 
 
@@ -118,6 +120,8 @@ def cache_source(
     split, projection, width = split or own.split, projection or own.projection, _width(width, sensor, own.width)
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
+    if Path(root).resolve() == Path(folder).resolve():
+        raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
     reader, columns = _reader(name, Path(root), split, intensity), columns_of(projection, width)
     spec = _sensor(sensor or own.sensor or _recognised(reader), width)
     image = Projected(reader, spec, projection, columns)
@@ -167,17 +171,27 @@ def _reader(name: str, root: Path, split: str, intensity: str) -> Reader:
 
 
 def _recognised(reader: Reader) -> str:
-    """The sensor's word, by the first scan that can be read. Raises ValueError that asks for --sensor."""
-    for i in range(len(reader)):
-        try:
-            scan = reader[i]
-        except ValueError:
-            continue  # it will be skipped, and named in the report
-        word, reason = recognise(scan, "/".join(reader.name(i)[1:]))
-        if word is None:
-            raise ValueError(reason)
-        return word
-    return "hdl-64e-kitti"  # no scan can be read: whatever the sensor, the cache says so
+    """The sensor's word, by the first scan that can be read. Raises ValueError that asks for --sensor, also where some
+    scan, of those looked at from everywhere, is of another sensor."""
+    first = next(_sensors(reader, range(len(reader))), None)
+    if first is None:
+        return "hdl-64e-kitti"  # no scan can be read: whatever the sensor, the cache says so
+    word, reason, name = first
+    if word is None:
+        raise ValueError(reason)
+    for other, _, its in _sensors(reader, range(0, len(reader), max(1, len(reader) // LOOKED_AT))):
+        if other is not None and not same_kind(other, word):
+            raise ValueError(f"expected scans of one sensor, found {name} of {word} and {its} of {other}: "
+                             "name the sensor with --sensor")  # fmt: skip
+    return word
+
+
+def _sensors(reader: Reader, numbers: range) -> Iterator[tuple[str | None, str, str]]:
+    """`recognise` of those scans that can be read, and their names; others will be skipped, and named in the report."""
+    for i in numbers:
+        with suppress(ValueError):
+            name = "/".join(reader.name(i)[1:])
+            yield *recognise(reader[i], name), name
 
 
 def _sensor(name: str, width: int) -> Sensor:

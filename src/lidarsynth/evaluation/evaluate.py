@@ -19,9 +19,9 @@ from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, senso
 from lidarsynth.evaluation.pairs import Pairs, classes_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
-from lidarsynth.evaluation.report import Report, report_of
+from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
-from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
@@ -29,6 +29,7 @@ from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
+LOOKED_AT = 8  # scans of a set, from everywhere, whether all are of one sensor
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
 
@@ -187,7 +188,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         real_files = [kept] if kept else []
     assert real
     report = report_of(fake, real, loaded.missing, seed, run.on_images)
-    warnings += _unlike_sensors({"samples": judged, "the reference": truth}, fake.sensor)
+    warnings += _unlike_sensors({"samples": judged, "the reference": truth}, fake.sensor) + _one_set(judged, truth)
     if real_files:
         told["reference statistics"] = ", ".join(map(str, real_files))
         hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
@@ -224,15 +225,33 @@ def _unlike_pairs(names: Sequence[str], true_names: Sequence[str]) -> tuple[str,
 
 
 def _unlike_sensors(sides: Mapping[str, ImageSet | None], drawn: Sensor) -> tuple[str, ...]:
-    """A warning where points, by the first scan of each side, are of other sensors than the one whose images they are
+    """A warning where points, by some scans of each side, are of other sensors than the one whose images they are
     drawn into, or than the other side's; of images their own beams tell."""
-    firsts = {side: images.item(0) for side, images in sides.items() if images}
-    taken = {side: name for side, scan in firsts.items() if isinstance(scan, Scan) and (name := recognise(scan)[0])}
-    known = {*taken.values(), *({drawn.name} & SENSORS.keys())}  # a user's own may be a unit of any of them
-    if not taken or len({name.removesuffix("-kitti") for name in known}) == 1:
+    taken = {side: names for side, images in sides.items() if images and (names := _sensors_of(images))}
+    known = {name for names in taken.values() for name in names}
+    known |= {drawn.name} & SENSORS.keys()  # a user's own may be a unit of any of them
+    if not taken or all(same_kind(name, min(known)) for name in known):
         return ()
-    told = " and ".join(f"{side} of {name}" for side, name in taken.items())
+    told = " and ".join(f"{side} of {', '.join(names)}" for side, names in taken.items())
     return (f"the points of {told} are drawn into images of {drawn.name}: other beams",)
+
+
+def _sensors_of(images: ImageSet) -> list[str]:
+    """The sensors of those that are points, of some from everywhere, as recognised."""
+    some = (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
+    return list(dict.fromkeys(name for scan in some if isinstance(scan, Scan) and (name := recognise(scan)[0])))
+
+
+def _one_set(judged: ImageSet | None, truth: ImageSet | None) -> tuple[str, ...]:
+    """A warning where both sides are the same images."""
+    if (
+        judged is None
+        or truth is None
+        or not judged.stamp
+        or (judged.stamp, judged.names) != (truth.stamp, truth.names)
+    ):
+        return ()
+    return ("samples and reference are the same images: distances are 0, or as far as chance goes",)
 
 
 def _size_of(sensor: Sensor) -> str:
@@ -332,6 +351,9 @@ def check_out(out: Path) -> None:
     if out.suffix != ".json" or out.is_dir():
         raise ValueError(f"{out}: expected the name of a file that ends in .json, "
                          f"found {'a folder' if out.is_dir() else repr(out.name[-20:])}")  # fmt: skip
+    page = out.with_suffix(".md")
+    if page.exists() and (not page.is_file() or DEFINITIONS not in page.read_text("utf-8", "replace")):
+        raise ValueError(f"{out}: expected a name beside whose .md nothing is lost, found {page}, which is no report")
     out.parent.mkdir(parents=True, exist_ok=True)
     if not os.access(out.parent, os.W_OK | os.X_OK):
         raise ValueError(f"{out}: expected a folder that may be written to, found none of that right at {out.parent}")

@@ -95,6 +95,8 @@ def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) 
     stats = [(str(file.relative_to(path)), file.stat()) for file in files] if path.is_dir() else [("", path.stat())]
     stamp = sha256(repr([(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]).encode()).hexdigest()
     items = [(file, k) for file in files for k in _numbers(file)]
+    if not items:
+        raise ValueError(f"{path}: expected at least one range image, found {len(files)} files of none")
     names = tuple(str(file) if k is None else f"{file}[{k}]" for file, k in items)
     return ImageSet(names, lambda i: read_item(*items[i]), str(path), stamp)
 

@@ -14,6 +14,7 @@ from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 
+DEFINITIONS = "## Definitions"  # every page has them
 OnRow = Callable[[str, int, int], object] | None  # (what, rows done, rows in all), for progress bars
 
 
@@ -199,7 +200,7 @@ class Report:
             ("hash of ", self.hashes),
         ):
             lines += [f"- {title}{name}: {value}" for name, value in table.items()]
-        lines += [f"- definition: {definition(p)}", f"- wall time: {self.seconds:.1f} s", "", "## Definitions", ""]
+        lines += [f"- definition: {definition(p)}", f"- wall time: {self.seconds:.1f} s", "", DEFINITIONS, ""]
         lines += [f"- {row.name}: {row.formula}" for row in p.rows]
         lines += [f"- pixels: {p.near:g} < range < {p.far:g} m of {', '.join(p.gated)}"] if p.gated else []
         lines += [f"- {note}" for note in p.notes]

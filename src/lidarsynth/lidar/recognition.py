@@ -45,9 +45,16 @@ def recognise(
     return name, where + reason
 
 
+def lies_on(scan: Scan, sensor: Sensor) -> bool:
+    """Whether a scan's points lie on a sensor's beams, as `recognise` would have it of a known one."""
+    return recognise(scan, among={sensor.name: sensor})[0] is not None
+
+
 def same_kind(name: str, other: str) -> bool:
-    """Whether two names are of one kind of sensor: `hdl-64e-kitti` is an `hdl-64e`, whose beams are where they are."""
-    return name.removesuffix("-kitti") == other.removesuffix("-kitti")
+    """Whether two names are of one kind of sensor: `hdl-64e-kitti` is an `hdl-64e`, whose beams are where they are, and
+    so is `hdl-64e-kitti/16`, some of its rows."""
+    one, two = (word.partition("/")[0].removesuffix("-kitti") for word in (name, other))
+    return one == two
 
 
 def elevations_of(xyz: np.ndarray) -> np.ndarray:

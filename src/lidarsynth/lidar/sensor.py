@@ -220,6 +220,9 @@ def _runs(values: dict, source: str) -> tuple[tuple[int, ...], ...]:
     return tuple(map(tuple, runs))
 
 
+OUSTER = {"beam_intrinsics", "beam_altitude_angles"}  # what its metadata have, of any age
+
+
 def read_sensor(path: str | Path) -> Sensor:
     """A sensor of the user's own from a `.toml` or `.json` file. Raises ValueError for anything else."""
     path = Path(path)
@@ -227,7 +230,11 @@ def read_sensor(path: str | Path) -> Sensor:
         if path.suffix == ".toml":
             return from_dict(read_toml(path), str(path), path.stem)
         if path.suffix == ".json":
-            return from_dict(read_json(path), str(path), path.stem)
+            told = read_json(path)
+            if isinstance(told, dict) and OUSTER & told.keys():
+                raise ValueError(f"{path}: expected a sensor file, found the metadata of an Ouster; lidarsynth sensor "
+                                 f"{path} --out own.toml makes one of it")  # fmt: skip
+            return from_dict(told, str(path), path.stem)
     except OSError as error:
         raise ValueError(f"{path}: expected a readable sensor file, found {error.strerror}") from None
     raise ValueError(f"{path}: expected a .toml or .json sensor file, found {path.suffix or 'no suffix'}")

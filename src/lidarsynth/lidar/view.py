@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.lidar.recognition import FAR, elevations_of, recognise, rings_in_order, same_kind
+from lidarsynth.lidar.recognition import FAR, elevations_of, lies_on, recognise, rings_in_order, same_kind
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
@@ -43,7 +43,7 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
 def _of_another(scan: Scan, sensor: Sensor) -> str | None:
     """That the points lie on the beams of a known sensor and not on this one's, which may have as many or more."""
     other, _ = recognise(scan)
-    if other is None or same_kind(other, sensor.name) or recognise(scan, among={sensor.name: sensor})[0] is not None:
+    if other is None or same_kind(other, sensor.name) or lies_on(scan, sensor):
         return None
     return f"them on the beams of {other}"
 

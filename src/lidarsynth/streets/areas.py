@@ -103,6 +103,8 @@ class Density:
     More, per 100 m and side: groups of people, parked motorcycles, road works, cyclists beside the road; heavy vehicles
     that stand (lorries, coaches, trailers); walls and fences of more kinds; crash barriers; panels larger than signs;
     garages.
+
+    Raises ValueError for a factor outside 0 to 100.
     """
 
     traffic: float = 1.0  # moving vehicles and cyclists
@@ -120,13 +122,15 @@ class Density:
     panels: float = 0.0
     garages: float = 0.0
 
-    def of(self, area: Area) -> Area:
-        """The kind of street with these factors. Raises ValueError for a factor below 0."""
-        if self == TODAY:
-            return area
+    def __post_init__(self):
         for name, factor in vars(self).items():
             if not 0 <= factor <= 100:
                 raise ValueError(f"expected {name} of 0 to 100, found {factor}")
+
+    def of(self, area: Area) -> Area:
+        """The kind of street with these factors."""
+        if self == TODAY:
+            return area
         times = {"traffic": ("traffic",), "pedestrians": ("people",), "vegetation": ("trees", "garden", "thicket")}
         new = {f: _scaled(getattr(area, f), getattr(self, word)) for word, fields in times.items() for f in fields}
         low, high = _scaled(area.parked, self.parking)

@@ -17,7 +17,7 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import occupied, pixel_of_points, project
-from lidarsynth.lidar.recognition import recognise, same_kind
+from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.description import Description
@@ -310,7 +310,7 @@ class ScanModel(ABC):
         if not own:
             return None
         name = recognise(scan)[0] if sensor is None else sensor if isinstance(sensor, str) else sensor.name
-        if name is None or same_kind(name, own):
+        if name is None or same_kind(name, own) or (sensor is None and lies_on(scan, self.sensor)):
             return None
         knows = f"was tuned to {own}" if self.any_sensor else f"knows {own} alone"
         return f"{knows}, and this is a scan of {name}"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torch import nn
 
+from lidarsynth.data.dataset import SeveralCaches
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.training.examples import ENDLESS, Streets, open_images
@@ -32,6 +33,8 @@ class Monitor:
         self._images: list[RangeImage] = []
         if validation is not None:  # now, and not in 5,000 steps
             open_images(validation, experiment, VALIDATION_SEED)
+            if str(data) not in ENDLESS and str(validation) not in ENDLESS:
+                SeveralCaches([*str(data).split(","), *str(validation).split(",")])  # refuses another sensor's
 
     def look(self, network: nn.Module, step: int, journal: Journal) -> None:
         """The task's numbers and pictures of the averaged weights, into the journal."""

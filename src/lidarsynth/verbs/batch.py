@@ -17,6 +17,7 @@ from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.view import misfit
@@ -167,6 +168,8 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
     if not (work.check or job.strict):
         return None
     frame = check_frame(loaded.scan)
+    if frame.faults and job.sensor is not None and lies_on(loaded.scan, get_sensor(job.sensor)):
+        return None  # one that was learned in this frame
     alien = None if frame.faults else _misfit(loaded.scan, job)
     warning = alien or frame.warning()
     if warning is not None and (frame.faults or alien) and job.strict:
@@ -207,14 +210,14 @@ def _made(
         sensor = None if job.sensor is None else get_sensor(job.sensor)
         return complete_scan(model, scan, job.corrupt, job.how, on_step, sensor, job.least), ""
     if job.verb == "realise":
-        sensor = named_sensor(scan, path, "--sensor", job.sensor)
+        sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         filled = realise_scan(model, scan, sensor, job.how.seed + work.number)
         return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
     if job.verb == "label":
-        sensor = named_sensor(scan, path, "--sensor", job.sensor)
+        sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         named = label_scan(model, scan, sensor, job.how.precision, job.least)
         return named, found(named.points, sensor)
-    sensor = named_sensor(scan, path, "--from", job.sensor)
+    sensor = named_sensor(scan, path, "--from", job.sensor, model.sensor if model.any_sensor else None)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
     return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, reconstruction_errors
@@ -83,9 +83,10 @@ def complete_scan(
     if known.all():
         raise ValueError(f"expected a corruption that hides at least one pixel, found {recipe!r}")
     before = truth.keep(known)
-    filled = _sure(model.filled(before, how, known, on_step), least)
+    whole = model.filled(before, how, known, on_step)
+    filled = _sure(whole, least)
     shown = {f"input, {recipe}": before, "completed": filled, "truth": truth}
-    return Filled(filled, lambda: shown, judged(filled, before, known, truth))
+    return Filled(filled, lambda: shown, judged(whole, before, known, truth))  # what is left out would count as 0 m
 
 
 def check_confident(model: ScanModel, how: Filling, least: float | None) -> None:
@@ -145,10 +146,13 @@ def upsample_scan(
     return Filled(filled, drawn, {})
 
 
-def named_sensor(scan: Scan, path: Path, flag: str, given: str | None) -> Sensor:
-    """The sensor of a scan file: the given one, else as recognised. Raises ValueError that asks for the flag."""
+def named_sensor(scan: Scan, path: Path, flag: str, given: str | None, own: Sensor | None = None) -> Sensor:
+    """The sensor of a scan file: the given one, else as recognised, else a model's `own` where the points lie on its
+    beams. Raises ValueError that asks for the flag."""
     if given is None:
         given, reason = recognise(scan, path)
+        if given is None and own is not None and lies_on(scan, own):
+            return own
         if given is None:
             raise ValueError(reason.replace("--sensor", flag))
     return get_sensor(given)

@@ -15,7 +15,7 @@ from lidarsynth.diffusion.samplers import generators
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points, project
-from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.candidates import BEND
@@ -103,8 +103,10 @@ class CascadeModel(ScanModel):
             return self
         if sensor is None:
             sensor, reason = recognise(scan)
+            if sensor is None and lies_on(scan, self.sensor):
+                sensor = self.sensor  # the user's own, on which the model was tuned
             if sensor is None:
-                raise ValueError(reason)
+                raise ValueError(f"{reason}, or take model.into(sensor)")
         return self.into(sensor)
 
     def with_labels(self) -> CascadeModel:

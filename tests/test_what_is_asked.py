@@ -1,0 +1,127 @@
+"""What is asked for does not fit what is there: said before the work, in one line, and nothing is lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_frame import moved, street
+
+import lidarsynth as ls
+from lidarsynth.cli.main import main
+from lidarsynth.data.dataset import write_cache
+from lidarsynth.evaluation.evaluate import evaluate
+from lidarsynth.files.formats import write
+from lidarsynth.lidar.frame import parse_transform
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import SENSORS, Sensor
+
+SMALL = SENSORS["hdl-64e-kitti"].resized(16, 64)
+
+
+def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that the command line says of it."""
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line
+    return line
+
+
+def noise_image(i: int, sensor: Sensor = SMALL) -> RangeImage:
+    rng, shape = np.random.default_rng(i), (sensor.height, sensor.width)
+    mask = rng.random(shape) < 0.9
+    return RangeImage(rng.uniform(2, 60, shape).astype(np.float32) * mask, mask * np.float32(0.3), mask, sensor)
+
+
+@pytest.fixture
+def two_sensors(tmp_path: Path) -> Path:
+    folder = tmp_path / "mixed"
+    folder.mkdir()
+    for name, sensor in (("a", "hdl-64e-kitti"), ("b", "hdl-32e")):
+        write(folder / f"{name}.pcd", street(sensor))
+    return folder
+
+
+def test_a_cache_does_not_come_among_the_scans(two_sensors: Path, capsys: pytest.CaptureFixture[str]):
+    here, before = str(two_sensors), sorted(two_sensors.iterdir())
+    assert "other than that of the scans" in refused(["data", "files", here, here], capsys)
+    assert "expected an empty folder for a cache" in refused(["data", "synthetic", here, "-n", "1"], capsys)
+    assert sorted(two_sensors.iterdir()) == before
+
+
+def test_scans_of_two_sensors_are_no_set_of_one(two_sensors: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = ["data", "files", str(two_sensors), str(tmp_path / "cache"), "--workers", "0"]
+    line = refused(words, capsys)
+    assert "a.pcd of hdl-64e-kitti and" in line and "b.pcd of hdl-32e: name the sensor with --sensor" in line
+    main([*words, "--sensor", "hdl-64e-kitti"])
+    capsys.readouterr()
+    (tmp_path / "one").mkdir()
+    for name in "ab":
+        write(tmp_path / "one" / f"{name}.pcd", street("hdl-64e-kitti"))
+    report = evaluate(two_sensors, tmp_path / "one", "bev-1")
+    assert any("hdl-64e-kitti, hdl-32e" in text and "other beams" in text for text in report.warnings)
+
+
+def test_the_same_images_on_both_sides_are_noted(tmp_path: Path):
+    folder = tmp_path / "cache"
+    list(write_cache(folder, noise_image, 4, SMALL, {"name": "noise"}))
+    assert any("the same images" in text for text in evaluate(folder, folder, "bev-1").warnings)
+
+
+def test_a_batch_of_no_images_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    none = np.zeros((0, 16, 64), np.float32)
+    np.savez(tmp_path / "none.npz", range=none, reflectance=none, mask=none > 0)
+    words = ["evaluate", str(tmp_path / "none.npz"), "--reference", str(tmp_path / "none.npz")]
+    assert "expected at least one range image" in refused(words, capsys)
+
+
+def test_a_report_replaces_reports_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for k in (0, 1):
+        list(write_cache(tmp_path / f"c{k}", lambda i, k=k: noise_image(4 * k + i), 4, SMALL, {"name": f"noise {k}"}))
+    words = ["evaluate", str(tmp_path / "c0"), "--reference", str(tmp_path / "c1"), "--out", str(tmp_path / "r.json")]
+    main(words)
+    main(words)
+    (tmp_path / "r.md").write_text("# Notes of mine\n")
+    assert "which is no report" in refused(words, capsys)
+    assert (tmp_path / "r.md").read_text() == "# Notes of mine\n"
+    assert "expected --side reference with --part" in refused([*words, "--side", "reference"], capsys)
+
+
+@pytest.mark.parametrize("option", ["--traffic=-1", "--kerbs=nan", "--walls=1e6"])
+def test_streets_that_cannot_be_leave_no_folder_behind(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "set"
+    words = ["streets", "-n", "1", "--sensor", "vlp-16", "--out", str(out), "--workers", "1", "--no-picture"]
+    assert "of 0 to 100" in refused([*words, option], capsys)
+    assert not (out / "streets.json").exists()
+
+
+def test_validation_is_of_the_sensor_that_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    other = SENSORS["hdl-64e-kitti"].resized(16, 128)
+    list(write_cache(tmp_path / "a", noise_image, 4, SMALL, {"name": "noise"}))
+    list(write_cache(tmp_path / "b", lambda i: noise_image(i, other), 4, other, {"name": "noise"}))
+    words = ["train", "tiny", "--data", str(tmp_path / "a"), "--validation", str(tmp_path / "b"), "--workers", "0"]
+    assert "expected the sensor and the projection" in refused([*words, "--out", str(tmp_path / "run")], capsys)
+
+
+def test_a_sensor_that_was_learned_in_its_frame_is_not_told_to_move(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A roof's sensor whose points' origin is on the ground: its beams leave from 1.6 m above it."""
+    raised = moved(street("vlp-16"), parse_transform("0:0:1.61:0:0:0"))
+    write(tmp_path / "roof.pcd", raised)
+    main(["sensor", str(tmp_path / "roof.pcd"), "--out", str(tmp_path / "own.toml"), "--no-picture"])
+    capsys.readouterr()
+    words = ["complete", str(tmp_path / "roof.pcd"), "--out", str(tmp_path / "o.ply"), "--no-picture"]
+    main([*words, "--sensor", str(tmp_path / "own.toml")])
+    assert "above the origin" not in capsys.readouterr().err
+    main([*words, "--sensor", "vlp-16"])
+    assert "above the origin" in capsys.readouterr().err
+
+
+def test_what_is_left_out_for_doubt_is_no_error_of_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    write(tmp_path / "a.pcd", street("vlp-16"))
+    said = []
+    for more in ([], ["--min-confidence", "0.9"]):
+        words = ["complete", str(tmp_path / "a.pcd"), "--corrupt", "beams:2", "--out", str(tmp_path / "o.ply"), *more]
+        main([*words, "--no-picture"])
+        said.append(next(line for line in capsys.readouterr().out.splitlines() if "lidarsynth" in line))
+    assert said[0] == said[1]
+    assert len(ls.read(tmp_path / "o.ply")) < 16 * 1024
