@@ -1,5 +1,6 @@
 """What is asked for does not fit what is there: said before the work, in one line, and nothing is lost."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,13 @@ def test_the_same_images_on_both_sides_are_noted(tmp_path: Path):
     folder = tmp_path / "cache"
     list(write_cache(folder, noise_image, 4, SMALL, {"name": "noise"}))
     assert any("the same images" in text for text in evaluate(folder, folder, "bev-1").warnings)
+
+
+def test_ranges_that_are_no_metres_are_noted(tmp_path: Path):
+    near = [replace(image, range=image.range / 80) for image in map(noise_image, range(4))]
+    report = evaluate(near, [noise_image(i) for i in range(4, 8)], "bev-1")
+    assert [text for text in report.warnings if "ranges of samples are 0.75 m at most" in text]
+    assert not any("the reference are" in text for text in report.warnings)
 
 
 def test_a_batch_of_no_images_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

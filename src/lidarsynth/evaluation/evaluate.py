@@ -29,6 +29,7 @@ from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
+METRES = 1.5  # no outdoor scan ends so near
 LOOKED_AT = 8  # scans of a set, from everywhere, whether all are of one sensor
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
@@ -189,6 +190,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
     assert real
     report = report_of(fake, real, loaded.missing, seed, run.on_images)
     warnings += _unlike_sensors({"samples": judged, "the reference": truth}, fake.sensor) + _one_set(judged, truth)
+    warnings += _unlike_metres({"samples": judged, "the reference": truth})
     if real_files:
         told["reference statistics"] = ", ".join(map(str, real_files))
         hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
@@ -240,6 +242,17 @@ def _sensors_of(images: ImageSet) -> list[str]:
     """The sensors of those that are points, of some from everywhere, as recognised."""
     some = (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
     return list(dict.fromkeys(name for scan in some if isinstance(scan, Scan) and (name := recognise(scan)[0])))
+
+
+def _unlike_metres(sides: Mapping[str, ImageSet | None]) -> tuple[str, ...]:
+    """A warning where the images of a side, by the first and the last, have ranges as they come out of a network."""
+    warnings = []
+    for side, images in sides.items():
+        some = [images.item(i) for i in {0, len(images) - 1}] if images else []
+        farthest = max((float(item.range.max(initial=0)) for item in some if isinstance(item, RangeImage)), default=0)
+        if 0 < farthest <= METRES:
+            warnings.append(f"ranges of {side} are {farthest:.2f} m at most: expected metres, not shares of a limit")
+    return tuple(warnings)
 
 
 def _one_set(judged: ImageSet | None, truth: ImageSet | None) -> tuple[str, ...]:

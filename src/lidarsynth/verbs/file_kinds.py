@@ -20,6 +20,7 @@ from lidarsynth.files.formats import READERS, holds_image, read_image, read_with
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import from_dict
 from lidarsynth.verbs.inputs import has_scans, is_stream
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
@@ -132,10 +133,12 @@ def _capture(path: Path) -> Lines:
 
 
 def _cache(path: Path) -> Lines:
-    told = report(read_index(path))
-    return {"kind": "cache of range images, for training and as a reference", "images": str(told["stored"])} | {
-        key: str(len(told[key])) for key in ("sequences", "skipped", "missing")
-    }
+    index = read_index(path)
+    told, sensor = report(index), from_dict(index["sensor"], str(path), "own")
+    lines = {"kind": "cache of range images, for training and as a reference", "images": str(told["stored"])}
+    lines["sensor"] = f"{sensor.name}, {sensor.height} beams x {sensor.width} columns, to {sensor.max_range:g} m"
+    lines |= {"projection": index["source"]["projection"]} if "projection" in index["source"] else {}
+    return lines | {key: str(len(told[key])) for key in ("sequences", "skipped", "missing")}
 
 
 def _folder(path: Path) -> Lines:
