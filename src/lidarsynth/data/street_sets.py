@@ -81,10 +81,10 @@ class _Task:
         self._runs: list[list[int]] = []
 
     def chunks(self) -> list[list[int]]:
-        """Frames that are not there, in runs of one world."""
-        record, runs = LAYOUTS[self.layout].record, []
+        """Frames that are not there, or have lost their scan, in runs of one world."""
+        layout, runs = LAYOUTS[self.layout], []
         for index in range(len(self.streets)):
-            if (self.folder / record(self.streets, index)).exists():
+            if all((self.folder / part(self.streets, index)).exists() for part in (layout.record, layout.scan)):
                 continue
             group = (self.streets.place(index)[0], index // CHUNK)
             if not runs or runs[-1][0] != group:

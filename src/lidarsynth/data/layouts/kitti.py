@@ -26,10 +26,14 @@ def _record(_: LabelledStreets, index: int) -> str:
     return f"training/boxes/{index:06d}.json"
 
 
-def _files(_: LabelledStreets, index: int, frame: Frame) -> Content:
+def _scan(_: LabelledStreets, index: int) -> str:
+    return f"training/velodyne/{index:06d}.bin"
+
+
+def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     scan = frame.scan
     points = np.column_stack([scan.xyz, scan.reflectance]).astype("<f4").tobytes()
-    yield f"training/velodyne/{index:06d}.bin", points
+    yield _scan(streets, index), points
     lines = [line for box in frame.boxes if box.points and (line := label_line(box))]
     yield f"training/label_2/{index:06d}.txt", "".join(f"{line}\n" for line in lines).encode()
     yield f"training/calib/{index:06d}.txt", object_calibration().encode()
@@ -77,4 +81,4 @@ def _tables(streets: LabelledStreets, _: Path) -> Content:
         yield f"ImageSets/{name}.txt", "".join(f"{i:06d}\n" for i, there in enumerate(chosen) if there).encode()
 
 
-KITTI = Layout(_record, _files, _tables)
+KITTI = Layout(_record, _scan, _files, _tables)

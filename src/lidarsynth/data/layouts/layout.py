@@ -15,12 +15,14 @@ Content = Iterator[tuple[str, bytes | BinaryIO]]  # path below the folder, what 
 class Layout(NamedTuple):
     """How one kind of data set lies on disk.
 
-    record  the path of frame i's JSON, which is written last: where it is, the frame is there
+    record  the path of frame i's JSON, which is written last: where it and the scan are, the frame is there
+    scan    that of its points
     files   all files of frame i but the JSON
     tables  the files that tell about the whole set, written when all frames are there
     """
 
     record: Callable[[LabelledStreets, int], str]
+    scan: Callable[[LabelledStreets, int], str]
     files: Callable[[LabelledStreets, int, Frame], Content]
     tables: Callable[[LabelledStreets, Path], Content]
 

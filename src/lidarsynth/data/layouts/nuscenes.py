@@ -34,7 +34,7 @@ def _is_key(streets: LabelledStreets, index: int) -> bool:
     return not streets.options.frames or streets.place(index)[1] % every == 0
 
 
-def _file(streets: LabelledStreets, index: int) -> str:
+def _scan(streets: LabelledStreets, index: int) -> str:
     folder = "samples" if _is_key(streets, index) else "sweeps"
     return f"{folder}/LIDAR_TOP/streets__LIDAR_TOP__{index:06d}.pcd.bin"
 
@@ -49,7 +49,7 @@ def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     x, y, z = scan.xyz.T
     ring = streets.sensor.height - 1 - scan.ring  # counted from the lowest beam
     points = np.column_stack([-y, x, z, scan.reflectance * 255, ring]).astype("<f4")
-    yield _file(streets, index), points.tobytes()
+    yield _scan(streets, index), points.tobytes()
     if _is_key(streets, index):
         yield lidarseg_path(index), classes(frame).tobytes()
 
@@ -87,7 +87,7 @@ def _rows(streets: LabelledStreets, folder: Path, split: dict[str, list[str]]) -
         name = f"scene-{world:04d}"
         split["val" if is_held_out(world) else "train"].append(name)
         shots = [
-            Shot(i, _file(streets, i), _is_key(streets, i), read_record(folder / _record(streets, i))) for i in indices
+            Shot(i, _scan(streets, i), _is_key(streets, i), read_record(folder / _record(streets, i))) for i in indices
         ]
         yield from scene_rows(world, name, shots, streets.sensor.mount)
 
@@ -98,4 +98,4 @@ def _empty_map() -> bytes:
     return file.getvalue()
 
 
-NUSCENES = Layout(_record, _files, _tables)
+NUSCENES = Layout(_record, _scan, _files, _tables)

@@ -21,18 +21,22 @@ def _record(_: LabelledStreets, index: int) -> str:
     return f"{index:06d}.json"
 
 
-def _files(_: LabelledStreets, index: int, frame: Frame) -> Content:
+def _scan(_: LabelledStreets, index: int) -> str:
+    return f"{index:06d}.pcd"
+
+
+def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     table, scan = np.zeros(len(frame.scan), POINT), frame.scan
     table["x"], table["y"], table["z"] = scan.xyz.T
     table["intensity"], table["ring"], table["timestamp"] = scan.reflectance, scan.ring, scan.time
     table["label"], table["instance"] = scan.label, frame.raw >> 16
     file = BytesIO()
     write_table(file, table)
-    yield f"{index:06d}.pcd", file.getvalue()
+    yield _scan(streets, index), file.getvalue()
 
 
 def _tables(_: LabelledStreets, __: Path) -> Content:
     yield from ()
 
 
-PCD = Layout(_record, _files, _tables)
+PCD = Layout(_record, _scan, _files, _tables)

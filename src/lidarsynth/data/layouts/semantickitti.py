@@ -32,11 +32,16 @@ def _record(streets: LabelledStreets, index: int) -> str:
     return f"{sequence}/boxes/{name}.json"
 
 
+def _scan(streets: LabelledStreets, index: int) -> str:
+    sequence, name = _place(streets, index)
+    return f"{sequence}/velodyne/{name}.bin"
+
+
 def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     sequence, name = _place(streets, index)
     scan = frame.scan
     assert scan.ring is not None and scan.time is not None
-    yield f"{sequence}/velodyne/{name}.bin", np.column_stack([scan.xyz, scan.reflectance]).astype("<f4").tobytes()
+    yield _scan(streets, index), np.column_stack([scan.xyz, scan.reflectance]).astype("<f4").tobytes()
     yield f"{sequence}/labels/{name}.label", frame.raw.astype("<u4").tobytes()
     yield f"{sequence}/rings/{name}.bin", scan.ring.astype("<u2").tobytes()
     yield f"{sequence}/point_times/{name}.bin", scan.time.astype("<f4").tobytes()
@@ -70,4 +75,4 @@ def _tracks(boxes: dict[str, list[dict]]) -> dict[str, dict]:
     return tracks
 
 
-SEMANTICKITTI = Layout(_record, _files, _tables)
+SEMANTICKITTI = Layout(_record, _scan, _files, _tables)
