@@ -28,6 +28,7 @@ from lidarsynth.training.task import Images
 TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
+JOINED = 0.25  # of sparse patterns have holes besides
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -254,16 +255,14 @@ def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled
     """(H, W) bool, True = known, of a crop of a turn of `turn` columns.
 
     16 of the beams (what is `sampled`, most of the time), the coarse stage's grids, every k-th beam, any beams, points,
-    a lost sector, regions.
+    `_holed`; at times two of these at once, since sparse scans have holes, too.
     """
-    (height, width), kind = shape, rng.random()
+    height, kind = shape[0], rng.random()
     known = np.zeros(shape, bool)
     if sampled and kind < 0.45:
         known[grid_rows(height, rng.random())] = True
     elif kind < (0.6 if sampled else 0.12):
-        count, step = (16 if rng.random() < 0.75 else 8), max(1, round(turn / (128 if rng.random() < 0.8 else 256)))
-        rows = ((np.arange(count) + rng.random()) * height / count).astype(int)
-        known[np.ix_(np.unique(rows), np.arange(rng.integers(step), width, step))] = True
+        known = _gridded(shape, turn, rng)
     elif kind < 0.72:
         step = int(rng.choice((2, 2, 3, 4, 4, 4, 6, 8)))
         known = every_beam(shape, step, int(rng.integers(step)))
@@ -271,17 +270,37 @@ def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled
         known[rng.random(height) < rng.uniform(1 / 8, 1 / 2)] = True
     elif kind < 0.9:
         known[:] = rng.random(shape) < 0.02 * 30 ** rng.random()
-    elif kind < 0.95:
-        kept, shift = int(rng.integers(8, width // 2)), int(rng.integers(width))
-        known = without_columns(shape, range(shift, shift + kept))
     else:
-        known[:] = True
-        for _ in range(int(rng.integers(1, 4))):
-            tall, wide = int(rng.integers(2, height)), int(rng.integers(4, width // 3))
-            top, left = int(rng.integers(height - tall + 1)), int(rng.integers(width - wide))
-            known &= without_rectangle(shape, range(top, top + tall), range(left, left + wide))
+        known = _holed(shape, rng)
+    if kind < 0.9 and rng.random() < JOINED:
+        around = _holed(shape, rng)
+        inside = sampled and rng.random() < 0.5  # as `repaint` draws it
+        known = known & around | (_gridded(shape, turn, rng) & ~around & inside)
     if rng.random() < 0.08:
         known &= rng.random(shape) < rng.uniform(0.3, 1)
+    return known
+
+
+def _gridded(shape: tuple[int, int], turn: int, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool, True = known: 16 beams, at times 8, of 128 columns of a turn, at times 256."""
+    height, width = shape
+    count, step = (16 if rng.random() < 0.75 else 8), max(1, round(turn / (128 if rng.random() < 0.8 else 256)))
+    rows, known = ((np.arange(count) + rng.random()) * height / count).astype(int), np.zeros(shape, bool)
+    known[np.ix_(np.unique(rows), np.arange(rng.integers(step), width, step))] = True
+    return known
+
+
+def _holed(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool, True = known: all but a sector, or up to three regions."""
+    height, width = shape
+    if rng.random() < 0.5:
+        lost, shift = int(rng.integers(8, 3 * width // 4)), int(rng.integers(width))
+        return without_columns(shape, range(shift, shift + lost))
+    known = np.ones(shape, bool)
+    for _ in range(int(rng.integers(1, 4))):
+        tall, wide = int(rng.integers(2, height)), int(rng.integers(4, width // 3))
+        top, left = int(rng.integers(height - tall + 1)), int(rng.integers(width - wide))
+        known &= without_rectangle(shape, range(top, top + tall), range(left, left + wide))
     return known
 
 
