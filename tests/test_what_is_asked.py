@@ -47,6 +47,7 @@ def test_a_cache_does_not_come_among_the_scans(two_sensors: Path, capsys: pytest
     here, before = str(two_sensors), sorted(two_sensors.iterdir())
     assert "other than that of the scans" in refused(["data", "files", here, here], capsys)
     assert "expected an empty folder for a cache" in refused(["data", "synthetic", here, "-n", "1"], capsys)
+    assert "expected -n with synthetic" in refused(["data", "files", here, f"{here}-cache", "-n", "5"], capsys)
     assert sorted(two_sensors.iterdir()) == before
 
 

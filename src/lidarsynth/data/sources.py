@@ -46,6 +46,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "files": Source(lambda root, split: scan_folder(root), "all", None, "auto", 1024),
 }
 
+MANY = 1000  # synthetic scans, where nobody says how many
 LOOKED_AT = 16  # scans from everywhere, whether all are of one sensor
 SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
 
@@ -78,7 +79,7 @@ def prepare(
     projection: str | None = None,
     width: int | None = None,
     workers: int | None = 0,
-    count: int = 1000,
+    count: int = MANY,
     check: bool = False,
     seed: int = 0,
     intensity: str = "auto",
@@ -90,6 +91,8 @@ def prepare(
         return cache_synthetic(folder or root, count, spec, _width(width, spec, 1024), seed, workers, check, apart)
     if apart:
         raise ValueError(f"expected --apart with synthetic, whose scans share worlds, found it with {name}")
+    if count != MANY:
+        raise ValueError(f"expected -n with synthetic, of which there are endless ones, found it with {name}")
     if folder is None:
         raise ValueError(f"expected data {name} ROOT CACHE, found no CACHE")
     return cache_source(name, root, folder, split, sensor, projection, width, workers, check, intensity)
