@@ -177,6 +177,16 @@ def test_patterns_leave_something_known_and_something_to_learn():
     assert 0.1 < np.mean(shares) < 0.5
 
 
+def test_what_is_sparse_has_holes_at_times():
+    """A run of 24 columns without any known pixel, beside others that know some beams and not all."""
+    found = 0
+    for i in range(400):
+        known = pattern((64, 256), 1024, np.random.default_rng(i), False)
+        lost = np.convolve(known.any(0), np.ones(24), "valid").min() == 0
+        found += lost and known.any(1).sum() < 40 and known.any(1).sum() > 4 and known.mean() > 0.01
+    assert 10 < found < 120
+
+
 def test_standards_make_the_ground_as_wide_as_the_horizon():
     network = CoarseUNet(16, (1, 1, 1, 1), 1)
     streets = VirtualStreets(6, 64)

@@ -13,8 +13,9 @@ from lidarsynth.data.dataset import write_cache
 from lidarsynth.evaluation.evaluate import evaluate
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.frame import parse_transform
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.training.examples import folders_of
 
 SMALL = SENSORS["hdl-64e-kitti"].resized(16, 64)
 
@@ -125,12 +126,33 @@ def test_a_sensor_that_was_learned_in_its_frame_is_not_told_to_move(tmp_path: Pa
     assert "above the origin" in capsys.readouterr().err
 
 
+def test_an_upside_down_sensor_is_told_so_though_its_beams_are_as_many_above_as_below(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    sensor = SENSORS["os1-64"].resized(width=256)
+    rays = sensor.directions()
+    near = np.random.default_rng(0).uniform(1.5, 3, 16).repeat(16) / np.hypot(rays[..., 0], rays[..., 1])
+    rows, columns = (index.reshape(-1) for index in np.indices(near.shape))
+    xyz = sensor.points(near.astype(np.float32)).reshape(-1, 3) * np.float32([1, -1, -1])
+    write(tmp_path / "over.ply", Scan(xyz, ring=rows, time=columns / 2560))
+    words = ["complete", str(tmp_path / "over.ply"), "--out", str(tmp_path / "o.ply"), "--no-picture"]
+    main([*words, "--sensor", "os1-64"])
+    assert "upside down" in capsys.readouterr().err
+
+
+def test_a_folder_of_training_data_may_have_a_comma(tmp_path: Path):
+    (tmp_path / "a,b").mkdir()
+    assert folders_of(tmp_path / "a,b") == [str(tmp_path / "a,b")]
+    assert folders_of("cache/a,cache/b") == ["cache/a", "cache/b"]
+
+
 def test_what_is_left_out_for_doubt_is_no_error_of_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     write(tmp_path / "a.pcd", street("vlp-16"))
-    said = []
+    said, left = [], []
     for more in ([], ["--min-confidence", "0.9"]):
         words = ["complete", str(tmp_path / "a.pcd"), "--corrupt", "beams:2", "--out", str(tmp_path / "o.ply"), *more]
         main([*words, "--no-picture"])
         said.append(next(line for line in capsys.readouterr().out.splitlines() if "lidarsynth" in line))
-    assert said[0] == said[1]
+        left.append(len(ls.read(tmp_path / "o.ply")))
+    assert said[0] == said[1] and left[1] < left[0]
     assert len(ls.read(tmp_path / "o.ply")) < 16 * 1024

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from lidarsynth.cli.arguments import Count, Positional
+from lidarsynth.cli.arguments import Positional, arg
 from lidarsynth.cli.terminal import at_least, counted, say
 
 MOST = 10_000_000  # synthetic scans of one cache; more fit on no disk
@@ -20,7 +20,7 @@ def data(
     projection: str | None = None,
     width: int | None = None,
     workers: int | None = None,
-    count: Count = 1000,
+    count: Annotated[int | None, arg(aliases=["-n"])] = None,
     check: bool = False,
     seed: int = 0,
     intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
@@ -38,7 +38,7 @@ def data(
         projection: how points become rows: auto, spherical or unfolding.
         width: columns; below 1024 they are chosen from 1024, or 2048 when unfolding, as in R2DM.
         workers: processes, one per processor core if not given.
-        count: synthetic scans.
+        count: synthetic scans; 1000 if not given.
         check: also compare the checksums of what is there already, and make anew what is damaged.
         seed: of the synthetic streets.
         intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
@@ -48,7 +48,7 @@ def data(
 
     at_least(1, {"count": count})
     at_least(0, {"seed": seed, "workers": workers})
-    if count > MOST:
+    if count is not None and count > MOST:
         raise ValueError(f"expected --count of at most {MOST:,} synthetic scans, found {count:,}")
     more = (workers, count, check, seed, intensity, apart)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):

@@ -46,7 +46,6 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "files": Source(lambda root, split: scan_folder(root), "all", None, "auto", 1024),
 }
 
-MANY = 1000  # synthetic scans, where nobody says how many
 LOOKED_AT = 16  # scans from everywhere, whether all are of one sensor
 SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
 
@@ -79,19 +78,23 @@ def prepare(
     projection: str | None = None,
     width: int | None = None,
     workers: int | None = 0,
-    count: int = MANY,
+    count: int | None = None,
     check: bool = False,
     seed: int = 0,
     intensity: str = "auto",
     apart: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others."""
+    """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others.
+
+    count  of synthetic scans alone; None = 1000
+    """
     if name == "synthetic":
         spec = SYNTHETIC if sensor is None else sensor
-        return cache_synthetic(folder or root, count, spec, _width(width, spec, 1024), seed, workers, check, apart)
+        wide, many = _width(width, spec, 1024), 1000 if count is None else count
+        return cache_synthetic(folder or root, many, spec, wide, seed, workers, check, apart)
     if apart:
         raise ValueError(f"expected --apart with synthetic, whose scans share worlds, found it with {name}")
-    if count != MANY:
+    if count is not None:
         raise ValueError(f"expected -n with synthetic, of which there are endless ones, found it with {name}")
     if folder is None:
         raise ValueError(f"expected data {name} ROOT CACHE, found no CACHE")

@@ -257,12 +257,8 @@ def _unlike_metres(sides: Mapping[str, ImageSet | None]) -> tuple[str, ...]:
 
 def _one_set(judged: ImageSet | None, truth: ImageSet | None) -> tuple[str, ...]:
     """A warning where both sides are the same images."""
-    if (
-        judged is None
-        or truth is None
-        or not judged.stamp
-        or (judged.stamp, judged.names) != (truth.stamp, truth.names)
-    ):
+    one, other = ((images.stamp, images.names) if images else ("", ()) for images in (judged, truth))
+    if one != other or not one[0]:
         return ()
     return ("samples and reference are the same images: distances are 0, or as far as chance goes",)
 

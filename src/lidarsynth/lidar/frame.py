@@ -49,6 +49,11 @@ class Frame:
     hints: tuple[str, ...]
     transform: np.ndarray
 
+    @property
+    def lifted(self) -> bool:
+        """Whether all that is wrong is how high the origin is: of a sensor that was learned so, it is right."""
+        return bool(self.faults) and np.array_equal(self.transform[:3, :3], np.eye(3))
+
     def warning(self) -> str | None:
         """One line that says what the points are and what to do, or None."""
         found = [*self.faults, *self.hints]

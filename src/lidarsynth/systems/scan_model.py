@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -139,7 +139,7 @@ class ScanModel(ABC):
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
         """
-        self._warn_of_stranger(scan)
+        scan = self._noted(scan)
         return self.filled(scan, Filling(method, steps, resamples, sampler, seed, precision), known, on_step)
 
     def upsample(
@@ -166,8 +166,7 @@ class ScanModel(ABC):
         Raises ValueError when the sensor is not recognised or sees nothing that the model does, and for `times` as many
         beams of a model that cannot make them.
         """
-        if self.any_sensor:
-            self._warn_of_stranger(scan, sensor_in)
+        scan = self._noted(scan, sensor_in) if self.any_sensor else scan  # others are made to take another's
         how = Filling(method, steps, resamples, sampler, seed, precision)
         return self.upsampled(scan, how, sensor_in, on_step, times)
 
@@ -182,7 +181,7 @@ class ScanModel(ABC):
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
         """
-        self._warn_of_stranger(scan, sensor)
+        scan = self._noted(scan, sensor)
         return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
@@ -208,7 +207,7 @@ class ScanModel(ABC):
         """
         if not 0 <= least <= 1:
             raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
-        self._warn_of_stranger(scan, sensor)
+        scan = self._noted(scan, sensor)
         return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
@@ -310,14 +309,16 @@ class ScanModel(ABC):
         if not own:
             return None
         name = recognise(scan)[0] if sensor is None else sensor if isinstance(sensor, str) else sensor.name
-        if name is None or same_kind(name, own) or (sensor is None and lies_on(scan, self.sensor)):
+        if name is None or same_kind(name, own) or (self.sensor.name == own and lies_on(scan, self.sensor)):
             return None
         knows = f"was tuned to {own}" if self.any_sensor else f"knows {own} alone"
         return f"{knows}, and this is a scan of {name}"
 
-    def _warn_of_stranger(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None) -> None:
-        if not isinstance(scan, RangeImage) and (text := self.stranger(as_scan(scan), sensor)) is not None:
+    def _noted(self, scan: Any, sensor: Sensor | str | None = None) -> Any:
+        scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
+        if isinstance(scan, Scan) and (text := self.stranger(scan, sensor)) is not None:
             warnings.warn(f'{self.experiment.name} {text}; use load("default")', stacklevel=3)
+        return scan
 
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""

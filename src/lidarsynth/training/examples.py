@@ -90,9 +90,13 @@ def open_images(data: str | Path, experiment: Experiment, seed: int | None = Non
     if str(data) in ENDLESS:
         seed = experiment.training.seed if seed is None else seed
         return Streets(seed, build_sensor(experiment), str(data))
-    if "," in str(data) and not Path(data).exists():
-        return SeveralCaches(str(data).split(","))
-    return CachedImages(data)
+    folders = folders_of(data)
+    return CachedImages(data) if len(folders) == 1 else SeveralCaches(folders)
+
+
+def folders_of(data: str | Path) -> list[str]:
+    """The folders of caches that are named with commas between them; a folder of such a name is one."""
+    return [str(data)] if Path(data).exists() else str(data).split(",")
 
 
 @lru_cache(maxsize=4)

@@ -9,7 +9,7 @@ from torch import nn
 from lidarsynth.data.dataset import SeveralCaches
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.training.examples import ENDLESS, Streets, open_images
+from lidarsynth.training.examples import ENDLESS, Streets, folders_of, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.task import Task
 
@@ -34,7 +34,7 @@ class Monitor:
         if validation is not None:  # now, and not in 5,000 steps
             open_images(validation, experiment, VALIDATION_SEED)
             if str(data) not in ENDLESS and str(validation) not in ENDLESS:
-                SeveralCaches([*str(data).split(","), *str(validation).split(",")])  # refuses another sensor's
+                SeveralCaches([*folders_of(data), *folders_of(validation)])  # refuses another sensor's
 
     def look(self, network: nn.Module, step: int, journal: Journal) -> None:
         """The task's numbers and pictures of the averaged weights, into the journal."""

@@ -168,7 +168,7 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
     if not (work.check or job.strict):
         return None
     frame = check_frame(loaded.scan)
-    if frame.faults and job.sensor is not None and lies_on(loaded.scan, get_sensor(job.sensor)):
+    if frame.lifted and job.sensor is not None and lies_on(loaded.scan, get_sensor(job.sensor)):
         return None  # one that was learned in this frame
     alien = None if frame.faults else _misfit(loaded.scan, job)
     warning = alien or frame.warning()

@@ -167,7 +167,8 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
         raise ValueError("expected one scan or more, found none")
     expanded = [found for path in paths for found in _expanded(path)]
     streams = [path for path in expanded if is_stream(path)]
-    check_topic(reading, bool(streams))
+    if reading.topic is not None and not streams:
+        raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
     files = [FileInput(name, path, reading) for name, path in _names(expanded, paths)]
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)
@@ -186,12 +187,6 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
                 yield BrokenInput(path.stem, path, str(error))  # the others go on
 
     return Inputs(single, count, stream, bool(streams))
-
-
-def check_topic(reading: Reading, streams: bool) -> None:
-    """Raises ValueError for a topic where there is no stream of scans."""
-    if reading.topic is not None and not streams:
-        raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
 
 
 def is_stream(path: Path) -> bool:
