@@ -9,7 +9,7 @@ from full_scan import full_scan
 
 from lidarsynth.data.bag_writer import write_bag
 from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag, typestore
-from lidarsynth.files.fields import FileError, find, scan_from_fields
+from lidarsynth.files.fields import PLACE, FileError, find, scan_from_fields
 from lidarsynth.verbs.batch import Job, Work, run
 from lidarsynth.verbs.inputs import Reading, inputs_of
 
@@ -144,7 +144,7 @@ def test_one_of_the_sensors_of_a_topic_is_read_and_its_points_stay(tmp_path: Pat
     wanted = inputs_of([path], Reading(rings=(2, 5), transform=np.eye(4)))
     for one, cloud in zip(wanted.stream(), clouds, strict=True):
         loaded, ring = one.read(), cloud.fields[str(find(cloud.fields, "ring"))]
-        place = loaded.scan.extra["point"]
+        place = loaded.scan.extra[PLACE] - 1
         whole = scan_from_fields({**cloud.fields, "place": np.arange(len(ring))})[0].extra["place"]
         np.testing.assert_array_equal(place, whole[(ring[whole] >= 2) & (ring[whole] <= 5)])
         assert 0 < len(loaded.scan) < len(whole) and set(np.unique(loaded.scan.ring)) <= set(range(4))

@@ -75,14 +75,16 @@ def test_points_come_row_by_row_with_their_row_as_ring(model: LidarModel):
     assert (np.diff(azimuth)[np.diff(points.ring) == 0] <= 0).all()
 
 
-def test_points_out_of_view_come_last_and_leave_no_ring(model: LidarModel):
+def test_points_out_of_view_come_last_on_the_first_or_last_ring(model: LidarModel):
     scan = room(SENSORS["vlp-16"].resized(width=64))
     filled = upsample_scan(model, scan, SENSORS["vlp-16"])
-    assert filled.points.ring is None
+    assert filled.points.ring is not None
     assert np.isin(rows_of(scan), rows_of(filled.points)).all()
     above = scan.xyz[:, 2] > np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) * math.tan(math.radians(10))
     assert above.any()
-    assert np.isin(rows_of(scan[above]), rows_of(filled.points[slice(-len(scan), None)])).all()
+    last = filled.points[slice(-len(scan), None)]
+    assert np.isin(rows_of(scan[above]), rows_of(last)).all()
+    assert (last.ring[np.isin(rows_of(last), rows_of(scan[above]))] == 0).all()
 
 
 def test_with_measured_by_hand():
@@ -98,7 +100,7 @@ def test_with_measured_by_hand():
     points = with_measured(scan, measured, filled, pixel_of_points(scan, filled.sensor, "spherical"))
     np.testing.assert_array_equal(points.xyz, np.stack([2 * near, near, FLAT.points(distance)[3, 5], [1, 0, 9]]))
     np.testing.assert_array_equal(points.reflectance, np.float32([0.1, 0.2, 0.5, 0.3]))
-    assert points.ring is None
+    np.testing.assert_array_equal(points.ring, [1, 1, 3, 0])
     seen = with_measured(scan[:2], measured, filled, pixel_of_points(scan[:2], filled.sensor, "spherical"))
     np.testing.assert_array_equal(seen.ring, [1, 1, 3])
 

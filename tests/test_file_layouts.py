@@ -210,7 +210,7 @@ def test_las(suffix: str, scan: Scan, tmp_path: Path):
     found = read(tmp_path / f"scan{suffix}")
     check(found, scan, exact=False)
     np.testing.assert_array_equal(np.sort(found.extra["echo_width"]), np.arange(len(scan)))
-    assert list(found.extra) == ["echo_width", "classification"], "three numbers a point are no field of a scan"
+    assert list(found.extra) == ["ring", "echo_width", "classification"], "three numbers a point are no field of a scan"
     whole = (tmp_path / f"scan{suffix}").read_bytes()
     (tmp_path / f"cut{suffix}").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"^\S*: expected .* found"):

@@ -13,7 +13,7 @@ from typing import IO
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, Fields, FileError, rings_of_grid
+from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, Fields, FileError, rings_of_grid, written_names
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import from_dict
 
@@ -214,7 +214,7 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
 def scan_fields(scan: Scan) -> Fields:
     """Our own npz keys, xyz split into x, y, z."""
     fields = {axis: scan.xyz[:, i] for i, axis in enumerate("xyz")} | {"reflectance": scan.reflectance}
-    optional = {"ring": scan.ring, "time": scan.time, "label": scan.label, **scan.extra}
+    optional = {**scan.extra, "ring": scan.ring, "time": scan.time, "label": scan.label}
     return fields | {name: value for name, value in optional.items() if value is not None}
 
 
@@ -242,9 +242,8 @@ def write_npz(file: BufferedIOBase, scan: Scan | RangeImage) -> None:
         arrays["sensor"] = np.array(json.dumps(scan.sensor.to_dict()))
     else:
         own = {name: getattr(scan, name) for name in ("xyz", "reflectance", "ring", "time", "label")}
-        taken = ("file", "allow_pickle")  # arguments of savez
-        further = {f"file_{n}" if n in taken else n.replace("/", "_"): values for n, values in scan.extra.items()}
-        arrays = further | own
+        names = written_names(scan.extra, [*own, *"xyz", "sensor", "file", "allow_pickle"])  # the last two: np.savez's
+        arrays = dict(zip(names, scan.extra.values(), strict=True)) | own
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
         for name, array in arrays.items():
             if array is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from lidarsynth.lidar.scan import Scan
@@ -13,6 +15,8 @@ MAX_POINTS = 10_000_000  # one turn of the largest sensor is under a million poi
 MAX_BYTES = 1 << 28  # of one file, and of one array packed in a file
 MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coordinates, or coordinates of a map
 MAX_RINGS = 1024
+MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
+PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
 NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found wins; case does not matter
     "x": ("x", "points:0", "//x"),
@@ -52,8 +56,9 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     """The scan of N columns, and how many points it lost.
 
     Points with a non-finite coordinate or intensity, or at exactly (0, 0, 0) (no return), are dropped and counted.
-    `intensity`: see `reflectance_from`; `rings`: see `on_rings`. Raises FileError (without the path) for anything that
-    is not one LiDAR turn.
+    `intensity`: see `reflectance_from`; `rings`: see `on_rings`. Ring numbers that do not count from the top, and times
+    that are no seconds, stay among the further fields as the file has them. Raises FileError (without the path) for
+    anything that is not one LiDAR turn.
     """
     x, y, z = _coordinates(fields)
     if rings is not None:
@@ -76,15 +81,23 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     if (far := max(float(xyz.max()), -float(xyz.min()))) > MAX_METRES:
         raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}")
     xyz = xyz.astype(np.float32, copy=False)
+    if (half := float(np.median(np.abs(xyz).max(axis=1)))) > MEDIAN:
+        raise FileError(f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "
+                        "centimetres, or coordinates of a map?")  # fmt: skip
     values = reflectance_from(values[kept], "unit" if intensity == "none" else intensity)
     ring, time, label = (fields[key][kept] if (key := find(fields, n)) else None for n in ("ring", "time", "label"))
     classes = None if label is None else _training_classes(label)
-    taken = {find(fields, name) for name in NAMES if name != "label" or classes is not None}
+    from_top = None if ring is None else rings_from_top(ring, xyz)
+    seconds = None if time is None else seconds_from(time, find(fields, "time") in ("offset_ns", "offset_time"))
+    changed = [find(fields, name) for name, given, ours in (("ring", ring, from_top), ("time", time, seconds))
+               if given is not None and (given != ours).any()]  # fmt: skip
+    kept_too = {key for key in changed if f"file_{key}" not in fields}
+    taken = {find(fields, name) for name in NAMES if name != "label" or classes is not None} - kept_too
     return Scan(
         xyz,
         values,
-        ring=None if ring is None else rings_from_top(ring, xyz),
-        time=None if time is None else seconds_from(time, find(fields, "time") in ("offset_ns", "offset_time")),
+        ring=from_top,
+        time=seconds,
         label=classes,
         extra={key: column[kept] for key, column in fields.items() if key not in taken and column.dtype.kind in "biuf"},
     ), dropped
@@ -127,7 +140,7 @@ def _numbers(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def _listed(fields: Fields) -> str:
-    names = ", ".join(list(fields)[:12])
+    names = ", ".join([name for name in fields if name != PLACE][:12])
     return f"only {names}" if names else "no field at all"
 
 
@@ -233,10 +246,28 @@ def _storable(column: np.ndarray) -> np.ndarray:
     return column.astype(f"<{plain.get(kind, kind)}")
 
 
+def written_names(names: Iterable[str], taken: Iterable[str]) -> list[str]:
+    """Names that any file can hold, one for each: a word of printable ASCII, no two alike.
+
+    One of `taken` gets `file_` before it, and the second of a kind a number behind.
+    """
+    own, used, written = set(taken), set(taken), []
+    for name in names:
+        plain = "".join(c if c.isascii() and c.isprintable() and c not in " #/" else "_" for c in name) or "field"
+        word = plain = f"file_{plain}" if plain in own else plain
+        number = 1
+        while word in used:
+            number += 1
+            word = f"{plain}_{number}"
+        used.add(word)
+        written.append(word)
+    return written
+
+
 def scan_table(scan: Scan) -> np.ndarray:
     """Packed structured array (N,): x y z intensity float32; ring uint16, timestamp float64, label uint16 if known.
 
-    Further fields follow in their own types; one that has the name of one of these gets `file_` before it.
+    Further fields follow in their own types, under `written_names`.
     """
     columns = {axis: scan.xyz[:, i].astype("<f4") for i, axis in enumerate("xyz")}
     columns["intensity"] = scan.reflectance.astype("<f4")
@@ -247,9 +278,8 @@ def scan_table(scan: Scan) -> np.ndarray:
     ):
         if value is not None:
             columns[name] = value.astype(kind)
-    own = set(columns)
-    for name, value in scan.extra.items():
-        columns[f"file_{name}" if name in own else name] = _storable(value)
+    for name, value in zip(written_names(scan.extra, columns), scan.extra.values(), strict=True):
+        columns[name] = _storable(value)
     table = np.empty(len(scan), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         table[name] = column

@@ -141,12 +141,12 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     content = scan.to_scan() if isinstance(scan, RangeImage) and suffix != ".npz" else scan
     if path.is_dir():
         raise FileError(f"{path}: expected the name of a file to write, found a folder")
-    _put(path, lambda file: WRITERS[suffix](file, content))
-    if isinstance(content, Scan) and suffix in BARE:
+    if isinstance(content, Scan) and suffix in BARE:  # before the file itself: where that stands, all is whole
         for name, kind in BESIDE.items():
             if name in content.extra:
                 values = content.extra[name].astype(kind).tobytes()
                 _put(path.with_suffix(f".{name}"), lambda file, values=values: file.write(values))
+    _put(path, lambda file: WRITERS[suffix](file, content))
 
 
 def write_labels(path: str | Path, scan: Scan) -> None:

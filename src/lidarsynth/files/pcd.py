@@ -204,7 +204,7 @@ def write_table(file: BufferedIOBase, table: np.ndarray) -> None:
     header = [
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
-        f"FIELDS {' '.join(name.replace(' ', '_') for name in table.dtype.names or ())}",
+        f"FIELDS {' '.join(table.dtype.names or ())}",
         f"SIZE {' '.join(str(size) for _, size in kinds)}",
         f"TYPE {' '.join(kind for kind, _ in kinds)}",
         f"COUNT {' '.join('1' for _ in kinds)}",

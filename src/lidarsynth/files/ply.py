@@ -159,9 +159,7 @@ def _skip(data: bytes, at: int, element: Element, dtypes: dict[tuple[str, ...], 
 def write_ply(file: BufferedIOBase, scan: Scan) -> None:
     """The scan as binary PLY: x y z intensity (reflectance 0-1), and ring, timestamp, label where known."""
     table = scan_table(scan)
-    properties = [
-        f"property {WRITTEN[table.dtype[name].str[1:]]} {name.replace(' ', '_')}" for name in table.dtype.names or ()
-    ]
+    properties = [f"property {WRITTEN[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
     header = [
         "ply",
         "format binary_little_endian 1.0",

@@ -15,12 +15,12 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
 
     pixels  of the scan's points in the image
 
-
-    Points come row by row, each row from behind over the left; those above or below the view come last, and only
-    without any there is a `ring`, the row. A scan without reflectance takes that of its pixels. Every further field of
-    the scan stays with its points; new ones have 0 there, the label of their pixel, and the time of the points measured
-    in their direction. Labels of a filled image are those of measured points too, where the scan has none.
-    `extra["new"]` is 1 for new points; where the image has `confidence`, measured points have 1.
+    Points come row by row, each row from behind over the left; `ring` is the row. Those above or below the view come
+    last, with the ring of the first or last row. A scan without reflectance takes that of its pixels. Every further
+    field of the scan stays with its points, so do its rings where they are not the rows; new ones have 0 there, the
+    label of their pixel, and the time of the points measured in their direction. Labels of a filled image are those of
+    measured points too, where the scan has none. `extra["new"]` is 1 for new points, and for those that were new in
+    the scan; where the image has `confidence`, measured points have 1, those what they had.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row, column = pixels
@@ -31,20 +31,45 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
         label = np.where(row >= 0, filled.label[row, column], 0)
     assert new.ring is not None
     xyz = np.concatenate([scan.xyz, new.xyz])
-    ring = np.concatenate([np.where(row < 0, filled.sensor.height, row), new.ring])
+    ends = np.where(_elevation(scan.xyz) > np.mean(filled.sensor.elevations), 0, filled.sensor.height - 1)
+    own = np.where(row < 0, ends, row)
+    ring, place = (np.concatenate([part, new.ring]) for part in (own, np.where(row < 0, filled.sensor.height, row)))
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
-    order = np.argsort(10.0 * ring - azimuth, kind="stable")  # by ring, then azimuth: a turn is less than 10
+    order = np.argsort(10.0 * place - azimuth, kind="stable")  # by ring, then azimuth: a turn is less than 10
     both = Scan(
         xyz,
         np.concatenate([reflectance, new.reflectance]),
-        ring=None if (row < 0).any() else ring,
+        ring=ring,
         time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
         label=_labels(label, new),
-        extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)]) for name, values in scan.extra.items()}
-        | {"new": np.repeat(np.array([0, 1], np.uint8), [len(scan), len(new)])}
-        | {name: np.concatenate([np.ones(len(scan), np.float32), values]) for name, values in new.extra.items()},
-    )
+        extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)])
+               for name, values in _kept(scan, own).items()}
+        | {"new": np.concatenate([were_new(scan), np.ones(len(new), np.uint8)])}
+        | {name: np.concatenate([_sure(scan), values]) for name, values in new.extra.items()},
+    )  # fmt: skip
     return both[order]
+
+
+def were_new(scan: Scan) -> np.ndarray:
+    """(N,) uint8: 1 for points that the scan says were filled in, 0 for measured ones."""
+    return (scan.extra["new"] != 0).astype(np.uint8) if "new" in scan.extra else np.zeros(len(scan), np.uint8)
+
+
+def _sure(scan: Scan) -> np.ndarray:
+    """(N,) float32 confidences of a scan's own points: 1, or what was said of those that were filled in."""
+    said = scan.extra.get("confidence")
+    return np.where(were_new(scan) > 0, 1 if said is None else said, 1).astype(np.float32)
+
+
+def _kept(scan: Scan, row: np.ndarray) -> dict[str, np.ndarray]:
+    """The further fields of a scan, and its rings where they are not the rows and no field has them as they were."""
+    said = scan.ring is not None and not {"ring", "file_ring"} & set(scan.extra) and (scan.ring != row).any()
+    return {**scan.extra, **({"ring": scan.ring} if said else {})}  # type: ignore[dict-item]
+
+
+def _elevation(xyz: np.ndarray) -> np.ndarray:
+    """(N,) degrees above the horizon."""
+    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
 
 
 def _time_towards(xyz: np.ndarray, scan: Scan) -> np.ndarray:

@@ -41,8 +41,10 @@ class Scan:
             object.__setattr__(self, "reflectance", np.zeros(len(self.xyz), np.float32))
         own = {name: getattr(self, name) for name in ("reflectance", "ring", "time", "label")}
         for name, value in [*own.items(), *self.extra.items()]:
-            if value is not None and value.shape != (len(self.xyz),):
-                raise ValueError(f"{name} must be ({len(self.xyz)},) like xyz, got {value.shape}")
+            if value is not None and np.shape(value) != (len(self.xyz),):
+                raise ValueError(f"{name} must be ({len(self.xyz)},) like xyz, got {np.shape(value)}")
+            if value is not None and not isinstance(value, np.ndarray):
+                raise ValueError(f"{name} must be an array, got a {type(value).__name__}")
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -65,8 +67,10 @@ def _chosen(values: np.ndarray, index: np.ndarray | slice) -> np.ndarray:
 
 
 def as_scan(points: Scan | np.ndarray) -> Scan:
-    """A scan as it is, an array as `scan_of` takes it. Raises ValueError for anything else."""
+    """A scan as it is, an array as `scan_of` takes it. Raises ValueError for anything else, and as `scan_of` for points
+    that are not finite and reflectances in another scale."""
     if isinstance(points, Scan):
+        _check(points.xyz, points.reflectance)
         return points
     if not isinstance(points, np.ndarray):
         raise ValueError(f"expected a scan or an array of points, found a {type(points).__name__}")
@@ -82,15 +86,17 @@ def scan_of(points: np.ndarray) -> Scan:
         raise ValueError(f"expected points of (N, 3) x y z or (N, 4) x y z reflectance, found {points.shape} of "
                          f"{points.dtype}")  # fmt: skip
     xyz = np.ascontiguousarray(points[:, :3], np.float32)
+    light = points[:, 3].astype(np.float32) if points.shape[1] > 3 else np.zeros(len(xyz), np.float32)
+    _check(xyz, light, " in the fourth column")
+    return Scan(xyz, light)
+
+
+def _check(xyz: np.ndarray, light: np.ndarray, where: str = "") -> None:
     if not np.isfinite(xyz).all():
         raise ValueError("expected finite points, found NaN or infinite ones; leave them out")
-    if points.shape[1] == 3:
-        return Scan(xyz)
-    light = points[:, 3].astype(np.float32)
     if not (light.min(initial=0) >= 0 and light.max(initial=0) <= 1):
-        raise ValueError(f"expected a reflectance of 0 to 1 in the fourth column, found {light.min():g} to "
-                         f"{light.max():g}; divide it by its scale")  # fmt: skip
-    return Scan(xyz, light)
+        raise ValueError(f"expected a reflectance of 0 to 1{where}, found {light.min():g} to {light.max():g}; divide "
+                         "it by its scale")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -146,8 +146,9 @@ class Sensor:
 
         Raises ValueError for `times` below 2.
         """
-        if times < 2:
-            raise ValueError(f"expected at least 2 times as many beams, found {times}")
+        if times < 2 or times != int(times):
+            raise ValueError(f"expected a whole number of at least 2 times as many beams, found {times}")
+        times = int(times)
         own, place = np.arange(self.height), np.arange((self.height - 1) * times + 1) / times
         elevations = tuple(np.interp(place, own, self.elevations).tolist())
         offsets = tuple(np.interp(place, own, self.offsets).tolist()) if self.offsets else ()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +16,6 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import occupied, pixel_of_points, project
-from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.description import Description
@@ -25,6 +23,7 @@ from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.hub import push
 from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
+from lidarsynth.systems.notes import noted, stranger
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -139,7 +138,7 @@ class ScanModel(ABC):
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
         """
-        scan = self._noted(scan)
+        scan = noted(self, scan, filling=True)
         return self.filled(scan, Filling(method, steps, resamples, sampler, seed, precision), known, on_step)
 
     def upsample(
@@ -166,7 +165,9 @@ class ScanModel(ABC):
         Raises ValueError when the sensor is not recognised or sees nothing that the model does, and for `times` as many
         beams of a model that cannot make them.
         """
-        scan = self._noted(scan, sensor_in) if self.any_sensor else scan  # others are made to take another's
+        scan = (
+            noted(self, scan, sensor_in, filling=True) if self.any_sensor else scan
+        )  # others are made to take another's
         how = Filling(method, steps, resamples, sampler, seed, precision)
         return self.upsampled(scan, how, sensor_in, on_step, times)
 
@@ -181,7 +182,7 @@ class ScanModel(ABC):
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
         """
-        scan = self._noted(scan, sensor)
+        scan = noted(self, scan, sensor)
         return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
@@ -207,7 +208,7 @@ class ScanModel(ABC):
         """
         if not 0 <= least <= 1:
             raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
-        scan = self._noted(scan, sensor)
+        scan = noted(self, scan, sensor)
         return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
@@ -267,7 +268,7 @@ class ScanModel(ABC):
         pixels = pixel_of_points(loose, self.sensor, "spherical")
         known |= occupied(loose, self.sensor, pixels)
         filled = self.fill_beams(scan, sensor_in, sparse, known, how, on_step)
-        return replace(filled, completed=with_measured(loose, sparse.mask, filled, pixels))
+        return replace(filled, completed=with_measured(scan, sparse.mask, filled, pixels))
 
     def check(self, how: Filling) -> None:
         """Raises ValueError, before any work, for a request that this model cannot do or would ignore."""
@@ -305,20 +306,7 @@ class ScanModel(ABC):
 
     def stranger(self, scan: Scan, sensor: Sensor | str | None = None) -> str | None:
         """What a model that knows one sensor alone, or was tuned to one, has to say of another's scan, or None."""
-        own = self.experiment.card.sensor if self.any_sensor else self.sensor.name
-        if not own:
-            return None
-        name = recognise(scan)[0] if sensor is None else sensor if isinstance(sensor, str) else sensor.name
-        if name is None or same_kind(name, own) or (self.sensor.name == own and lies_on(scan, self.sensor)):
-            return None
-        knows = f"was tuned to {own}" if self.any_sensor else f"knows {own} alone"
-        return f"{knows}, and this is a scan of {name}"
-
-    def _noted(self, scan: Any, sensor: Sensor | str | None = None) -> Any:
-        scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
-        if isinstance(scan, Scan) and (text := self.stranger(scan, sensor)) is not None:
-            warnings.warn(f'{self.experiment.name} {text}; use load("default")', stacklevel=3)
-        return scan
+        return stranger(self, scan, sensor)
 
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""

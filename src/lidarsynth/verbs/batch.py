@@ -20,6 +20,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
@@ -145,6 +146,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     try:
         loaded = work.item.read()
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
+        warning = warning or _caution(loaded.scan, job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
         cloud, beside = None, ()
         if work.target is None:
@@ -193,6 +195,14 @@ def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -
         return None
     text = model.stranger(scan, None if job.sensor is None else get_sensor(job.sensor))
     return text and f"{work.item.path}: {job.model} {text}; use --model default"
+
+
+def _caution(scan: Scan, job: Job, work: Work) -> str | None:
+    """What must be said of the points that are to be completed, in one line."""
+    if not work.check or job.verb not in ("complete", "upsample"):
+        return None
+    text = caution(scan)
+    return text and f"{work.item.path}: {text}"
 
 
 def _made(

@@ -92,7 +92,7 @@ def scan_lines(scan: Scan, dropped: int = 0) -> Lines:
         "points": f"{len(scan)}" + (f" ({dropped} without a return dropped)" if dropped else ""),
         "range": f"{depth.min():.2f} to {depth.max():.2f} m, median {np.median(depth):.2f} m",
         "reflectance": f"{light.min():.2f} to {light.max():.2f}, mean {light.mean():.3f}",
-        "fields": " ".join(["x y z reflectance", *own, *scan.extra]),
+        "fields": " ".join(["x y z reflectance", *own, *(name for name in scan.extra if name not in own)]),
         "sensor": f"{name} ({reason})" if name else reason,
     }
     warning = check_frame(scan).warning()

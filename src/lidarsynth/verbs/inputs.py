@@ -15,7 +15,7 @@ from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.turns import capture_turns
-from lidarsynth.files.fields import Fields, FileError, find, scan_from_fields
+from lidarsynth.files.fields import PLACE, Fields, FileError, find, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
@@ -49,8 +49,8 @@ class Reading:
 class Loaded:
     """A scan that was read.
 
-    scan     in the sensor's frame; of a message, or where a transform was asked for, `extra["point"]` is each point's
-             place in `given`
+    scan     in the sensor's frame; of a message, or where a transform was asked for, `extra[PLACE]` is each point's
+             place in `given`, from 1
     given    the columns of the message, or x y z of the file
     dropped  points without a return, or not finite
     stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
@@ -105,8 +105,8 @@ class MessageInput:
         try:
             cloud = cloud_of(self.message)
             how = self.reading.intensity, self.reading.rings
-            places = np.arange(len(next(iter(cloud.fields.values()), ())))
-            scan, dropped = scan_from_fields({**cloud.fields, "point": places}, *how)
+            places = np.arange(1, len(next(iter(cloud.fields.values()), ())) + 1)
+            scan, dropped = scan_from_fields({**cloud.fields, PLACE: places}, *how)
             loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
@@ -311,7 +311,7 @@ def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
     given = dict(zip("xyz", scan.xyz.T, strict=True))
     if reading.transform is None:
         return Loaded(scan, given, dropped)
-    extra = {"point": np.arange(len(scan)), **scan.extra}
+    extra = {PLACE: np.arange(1, len(scan) + 1), **scan.extra}  # that of a message stays
     return Loaded(replace(scan, xyz=transformed(scan.xyz, reading.transform), extra=extra), given, dropped)
 
 
@@ -319,7 +319,7 @@ def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) ->
     """A filled scan in the frame of its file: measured points bit by bit as given, new ones transformed back."""
     if transform is None:
         return filled
-    place, old = filled.extra["point"], filled.extra.get("new", np.zeros(len(filled))) == 0
+    place, old = filled.extra[PLACE] - 1, filled.extra[PLACE] > 0
     xyz = transformed(filled.xyz, np.linalg.inv(transform))
     given = np.stack([loaded.given[str(find(loaded.given, axis))] for axis in "xyz"], axis=1)
     xyz[old] = given[place[old]]
@@ -327,18 +327,18 @@ def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) ->
 
 
 def without_places(scan: Scan) -> Scan:
-    """The scan without `extra["point"]`."""
-    return replace(scan, extra={name: values for name, values in scan.extra.items() if name != "point"})
+    """The scan without `extra[PLACE]`."""
+    return replace(scan, extra={name: values for name, values in scan.extra.items() if name != PLACE})
 
 
 def message_fields(filled: Scan, given: Fields) -> Fields:
     """A filled scan as the columns that its message had, bit by bit for measured points, and `new`, `confidence`.
 
-    New points have their x y z, a reflectance in the message's own scale, the ring number that its row has there, and
-    the time of the points in their direction; other fields are 0.
+    New points have their x y z, a reflectance in the message's own scale, the ring number that their row, or the next
+    one that has any, has there, and the time of the points in their direction; other fields are 0.
     """
-    new = filled.extra["new"] > 0
-    place = np.where(new, 0, filled.extra["point"])
+    new = filled.extra[PLACE] == 0
+    place = np.where(new, 0, filled.extra[PLACE] - 1)
     fields = {name: column[place] for name, column in given.items()}
     for column in fields.values():
         column[new] = 0
@@ -350,13 +350,13 @@ def message_fields(filled: Scan, given: Fields) -> Fields:
         scale = float(np.median(fields[name][lit] / filled.reflectance[lit])) if lit.any() else 1.0
         fields[name][new] = (filled.reflectance[new] * scale).astype(fields[name].dtype)
     if (name := find(given, "ring")) is not None and filled.ring is not None:
-        known = np.zeros(int(filled.ring.max()) + 1, fields[name].dtype)
-        known[filled.ring[old]] = fields[name][old]
-        fields[name][new] = known[filled.ring[new]]
+        rows, first = np.unique(filled.ring[old], return_index=True)
+        place = np.searchsorted((rows[1:] + rows[:-1]) / 2, filled.ring[new])
+        fields[name][new] = fields[name][old][first][place]
     if (name := find(given, "time")) is not None:
         azimuth = np.arctan2(filled.xyz[:, 1], filled.xyz[:, 0])
         order = np.flatnonzero(old)[np.argsort(azimuth[old])]
         nearest = np.searchsorted(azimuth[order], azimuth[new]).clip(0, len(order) - 1)
         fields[name][new] = fields[name][order[nearest]]
     sure = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
-    return fields | {"new": new.astype(np.uint8)} | sure
+    return fields | {"new": filled.extra["new"]} | sure

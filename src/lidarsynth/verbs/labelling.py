@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.files.fields import Fields
+from lidarsynth.files.fields import PLACE, Fields
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.lidar.sensor import Sensor
@@ -35,5 +35,5 @@ def found(points: Scan, sensor: Sensor) -> str:
 def labelled_fields(named: Scan, given: Fields) -> Fields:
     """A labelled scan as the columns that its message had, bit by bit, and `label`."""
     assert named.label is not None
-    fields = {name: column[named.extra["point"]] for name, column in given.items()}
+    fields = {name: column[named.extra[PLACE] - 1] for name, column in given.items()}
     return fields | {"label": named.label.astype(np.uint8)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsynth.files.fields import Fields, find
+from lidarsynth.files.fields import PLACE, Fields, find
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -25,7 +25,7 @@ def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) ->
 
 def realised_fields(real: Scan, given: Fields) -> Fields:
     """A realised scan as the columns that its message had, bit by bit but for the intensity, in the message's scale."""
-    fields = {name: column[real.extra["point"]] for name, column in given.items()}
+    fields = {name: column[real.extra[PLACE] - 1] for name, column in given.items()}
     name = find(given, "reflectance")
     if name is None:
         return fields | {"intensity": real.reflectance}

@@ -216,7 +216,7 @@ class CascadeModel(ScanModel):
         filled = model.fill(image, known, how, on_step)
         loose = replace(scan, ring=None)
         pixels = pixel_of_points(loose, filled.sensor, "spherical")
-        return replace(filled, completed=with_measured(loose, image.mask, filled, pixels))
+        return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
@@ -306,7 +306,7 @@ class CascadeModel(ScanModel):
         return [with_known(a, RangeImage(r, f, r > 0, self.sensor), t, keep_reflectance=True) for a, r, f, t in samples]
 
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
-        """(6, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
+        """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         own, told = replace(self, response=response_of(image, known)), known | (self._blocked & ~image.mask)
         shades = own.response.even(image.reflectance)
         pixels = known_of(image.range[None], shades[None], told[None], True, padded(self.sensor))

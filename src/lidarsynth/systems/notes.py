@@ -1,0 +1,50 @@
+"""What a model has to say of a scan before it works on it: warnings of one line."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, ClassVar, Protocol
+
+from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.unseen import caution
+
+
+class Knows(Protocol):
+    """What a model says of itself; see `ScanModel`."""
+
+    sensor: Sensor
+    experiment: Experiment
+    any_sensor: ClassVar[bool]
+
+
+def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: bool = False) -> Any:
+    """The scan or image, or an array as a scan, with a warning of what should be known of the result.
+
+    sensor   that made the scan, None = recognised
+    filling  whether points are to be added
+    """
+    scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
+    if isinstance(scan, Scan):
+        text = stranger(model, scan, sensor)
+        for note in (
+            text and f'{model.experiment.name} {text}; use load("default")',
+            caution(scan) if filling else None,
+        ):
+            if note is not None:
+                warnings.warn(note, stacklevel=3)
+    return scan
+
+
+def stranger(model: Knows, scan: Scan, sensor: Sensor | str | None = None) -> str | None:
+    """What a model that knows one sensor alone, or was tuned to one, has to say of another's scan, or None."""
+    own = model.experiment.card.sensor if model.any_sensor else model.sensor.name
+    if not own:
+        return None
+    name = recognise(scan)[0] if sensor is None else sensor if isinstance(sensor, str) else sensor.name
+    if name is None or same_kind(name, own) or (model.sensor.name == own and lies_on(scan, model.sensor)):
+        return None
+    knows = f"was tuned to {own}" if model.any_sensor else f"knows {own} alone"
+    return f"{knows}, and this is a scan of {name}"

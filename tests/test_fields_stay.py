@@ -1,0 +1,108 @@
+"""What a file had is there after every verb: rings and times as they were, marks of points that were filled in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarsynth as ls
+from lidarsynth.files.fields import FileError, written_names
+from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.streets.reader import SyntheticStreets
+
+
+@pytest.fixture(scope="module")
+def street() -> Scan:
+    """A VLP-16's scan, its rings from below and its times as a driver writes them."""
+    scan = SyntheticStreets(5, 1, ls.get_sensor("vlp-16")).image(0).to_scan()
+    stamps = np.uint64(1_600_000_000_000_000_000) + np.arange(len(scan), dtype=np.uint64) * 3000
+    return replace(scan, label=None, extra={"Ring": np.uint16(15) - scan.ring.astype(np.uint16), "stamp": stamps})
+
+
+def by_driver(street: Scan, path: Path) -> None:
+    table = np.zeros(len(street), [(n, "<f4") for n in ("x", "y", "z", "intensity")] + [("ring", "<u2"), ("t", "<u8")])
+    for i, axis in enumerate("xyz"):
+        table[axis] = street.xyz[:, i]
+    table["intensity"], table["ring"], table["t"] = street.reflectance, street.extra["Ring"], street.extra["stamp"]
+    np.save(path, table)
+
+
+def test_rings_and_times_come_back_as_the_file_has_them(street: Scan, tmp_path: Path):
+    by_driver(street, tmp_path / "a.npy")
+    scan = read(tmp_path / "a.npy")
+    np.testing.assert_array_equal(scan.ring, street.ring)
+    for suffix in (".pcd", ".ply", ".npz"):
+        write(tmp_path / f"b{suffix}", scan)
+        again = read(tmp_path / f"b{suffix}")
+        np.testing.assert_array_equal(again.ring, street.ring)
+        np.testing.assert_array_equal(again.extra["file_ring"], street.extra["Ring"])
+        np.testing.assert_array_equal(again.extra["t"], street.extra["stamp"])
+        write(tmp_path / f"c{suffix}", again)
+        assert set(read(tmp_path / f"c{suffix}").extra) == set(again.extra), "nothing is added twice"
+
+
+def test_a_denser_scan_keeps_the_rings_of_its_points(street: Scan):
+    scan = replace(street, extra={})
+    above = replace(scan, xyz=scan.xyz.copy())
+    above.xyz[:5] = [0.1, 0, 20]  # above the view
+    for one in (scan, above):
+        up = ls.load("nearest").into("os1-64").upsample(one, "vlp-16").to_scan()
+        old = up.extra["new"] == 0
+        assert up.ring is not None and up.ring.min() >= 0 and up.ring.max() <= 63
+        place = np.lexsort(up.xyz[old].T), np.lexsort(one.xyz.T)
+        np.testing.assert_array_equal(up.extra["ring"][old][place[0]], one.ring[place[1]])
+
+
+def test_points_that_were_filled_in_stay_so(street: Scan):
+    model = ls.load("default")
+    half = replace(street[street.xyz[:, 0] > 0], extra={})
+    with pytest.warns(UserWarning, match="found none in 1[78]. degrees of the turn"):
+        once = model.complete(half).to_scan()
+    with pytest.warns(UserWarning, match="that were filled in before"):
+        whole = model.complete(once)
+    twice, kept = whole.to_scan(), whole.surer_than(0.8).to_scan()
+    assert (once.extra["new"] == 1).sum() > 100
+    assert (twice.extra["new"] == 1).sum() >= (once.extra["new"] == 1).sum()
+    doubted = (once.extra["new"] == 1) & (once.extra["confidence"] < 0.8)
+    gone = once.xyz[doubted]
+    assert len(gone) and not (np.isin(kept.xyz[:, 0], gone[:, 0]) & np.isin(kept.xyz[:, 1], gone[:, 1])).any()
+
+
+def test_names_that_files_can_hold():
+    assert written_names(["länge", "", "a b", "a_b", "ring", "file_ring"], ["x", "ring"]) == \
+        ["l_nge", "field", "a_b", "a_b_2", "file_ring", "file_ring_2"]  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npz"])
+def test_fields_of_any_name_are_written(suffix: str, tmp_path: Path):
+    names = ["länge", "", "a b", "a_b", "x", "ring"]
+    extra = {name: np.arange(3) + 10 * k for k, name in enumerate(names)}
+    scan = Scan(np.float32([[9, 0, 0], [0, 9, 0], [9, 9, 0]]), np.float32([0, 0.5, 1]), np.arange(3), extra=extra)
+    write(tmp_path / f"a{suffix}", scan)
+    found = read(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(found.xyz, scan.xyz)
+    np.testing.assert_array_equal(sorted(v[0] for v in found.extra.values()), sorted(v[0] for v in extra.values()))
+
+
+def test_what_is_beside_a_bin_is_there_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scan = Scan(np.ones((3, 3), np.float32), extra={"new": np.uint8([0, 1, 1])})
+    import lidarsynth.files.formats as formats
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(formats.WRITERS, ".bin", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "a.bin", scan)
+    assert (tmp_path / "a.new").is_file() and not (tmp_path / "a.bin").exists()
+
+
+def test_centimetres_are_no_metres(tmp_path: Path):
+    xyz = np.random.default_rng(0).normal(0, 2000, (500, 3)).astype(np.float32)
+    np.save(tmp_path / "cm.npy", np.concatenate([xyz, np.zeros((500, 1), np.float32)], 1))
+    with pytest.raises(FileError, match="are they centimetres"):
+        read(tmp_path / "cm.npy")
