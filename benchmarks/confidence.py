@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--model", default="default")
     parser.add_argument("--corrupt", default="beams:4")
     parser.add_argument("--fit", type=Path, metavar="FOLDER")
-    parser.add_argument("--streets", type=int, default=22)
+    parser.add_argument("--streets", type=int, default=26)
     parser.add_argument("--bins", type=int, default=10)
     args = parser.parse_args()
     model = load(str(args.fit) if args.fit else args.model)

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 import lidarsynth as ls
 from lidarsynth.experiment.record import Confidence, from_dict
+from lidarsynth.files.fields import PLACE
 from lidarsynth.files.formats import read_image
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage
@@ -47,30 +48,32 @@ def test_signals_are_those_of_the_definition():
     rays = rays_of(SENSOR, SENSOR.blocked_rays())
     seen = signals(wall(10.0, 0.25, 0.5), rays)[0, :, 5, 7]
     across = min(2 * np.pi / 256, np.radians(30 / 31))  # one pixel away, in the row
-    expected = [np.log(0.27 / 0.5), np.log(across + 1e-3), 2.0, *[np.log(0.02 / 0.5)] * 2, np.log(11)]
+    expected = [np.log(0.27 / 0.5), np.log(across + 1e-3), 2.0, *[np.log(0.02 / 0.5)] * 2, np.log(11), 0]
     assert_close(seen, torch.tensor(expected, dtype=torch.float32), rtol=1e-4, atol=1e-4)
+    alone = signals(wall(10.0, 0.25, 0.0), rays)[0, 6, 5, 7]  # nothing is known in the row and the column
+    assert_close(alone, torch.tensor(np.log(1.501 / 0.2), dtype=torch.float32), rtol=1e-4, atol=1e-4)
 
 
 def test_confidence_is_the_logistic_of_the_signals_and_falls_with_doubt():
-    rays, weights = rays_of(SENSOR, SENSOR.blocked_rays()), Confidence(-1.0, -0.5, 0.3, -0.2, -0.1, -0.4, 0.7)
+    rays, weights = rays_of(SENSOR, SENSOR.blocked_rays()), Confidence(-1.0, -0.5, 0.3, -0.2, -0.1, -0.4, 0.7, -0.6)
     seen = signals(wall(10.0, 0.25, 0.5), rays)[0, :, 5, 7].double()
-    logit = (seen * torch.tensor([-1.0, -0.5, 0.3, -0.2, -0.1, -0.4]).double()).sum() + 0.7
+    logit = (seen * torch.tensor([-1.0, -0.5, 0.3, -0.2, -0.1, -0.4, -0.6]).double()).sum() + 0.7
     stated = confidence(wall(10.0, 0.25, 0.5), rays, weights)[0, 0, 5, 7].double()
     assert_close(stated, 1 / (1 + torch.exp(-logit)), rtol=1e-5, atol=1e-6)
     unanswered = wall(10.0, 0.25, 0.5)._replace(logit=torch.zeros(1, 1, 32, 256))
-    for worse in (wall(10.0, 0.5, 0.5), wall(10.0, 0.25, 0.2), unanswered):
+    for worse in (wall(10.0, 0.5, 0.5), wall(10.0, 0.25, 0.2), wall(10.0, 0.25, 0.0), unanswered):
         assert confidence(worse, rays, weights)[0, 0, 5, 7] < stated
 
 
 def test_the_fit_finds_the_weights_that_made_the_data_and_refuses_wrong_signs():
     rng = np.random.default_rng(0)
-    seen = rng.normal(size=(100_000, 6))
-    truth = np.array([-1.0, -0.3, 0.5, 0.0, -0.2, -0.4])
+    seen = rng.normal(size=(100_000, 7))
+    truth = np.array([-1.0, -0.3, 0.5, 0.0, -0.2, -0.4, -0.6])
     hits = rng.random(len(seen)) < 1 / (1 + np.exp(-(seen @ truth + 0.8)))
     found = fitted(seen, hits)
     np.testing.assert_allclose(
-        [found.spread, found.angle, found.answer, found.columns, found.range, found.constant],
-        [-1.0, -0.3, 0.5, -0.2, -0.4, 0.8],
+        [found.spread, found.angle, found.answer, found.columns, found.range, found.far, found.constant],
+        [-1.0, -0.3, 0.5, -0.2, -0.4, -0.6, 0.8],
         atol=0.03,
     )
     assert fitted(-seen, hits).spread == 0.0  # more spread, more often right: not believed
@@ -151,7 +154,7 @@ def test_what_has_no_confidence_says_so(model: CascadeModel, street: RangeImage)
 def test_bags_get_a_column_of_confidences(model: CascadeModel, street: RangeImage):
     sparse = street.keep(corrupt(street, "beams:4")).to_scan()
     given = {"x": sparse.xyz[:, 0], "y": sparse.xyz[:, 1], "z": sparse.xyz[:, 2]}
-    numbered = replace(sparse, extra={"point": np.arange(len(sparse))})
+    numbered = replace(sparse, extra={PLACE: np.arange(1, len(sparse) + 1)})
     filled = model.into(SENSOR).complete(numbered).to_scan()
     columns = message_fields(filled, given)
     np.testing.assert_array_equal(columns["confidence"], filled.extra["confidence"])

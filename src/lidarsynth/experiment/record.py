@@ -164,6 +164,7 @@ class Confidence:
     columns: float = within(0.0, -1000, 0)  # and to the left and right
     range: float = within(0.0, -1000, 0)
     constant: float = within(0.0, -1000, 1000)
+    far: float = within(0.0, -1000, 0)  # by how much the angle is beyond that of a narrow hole
 
     def __post_init__(self):
         check_ranges(self)

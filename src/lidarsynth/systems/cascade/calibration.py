@@ -18,6 +18,7 @@ from lidarsynth.systems.filling import Filling
 RECIPES = (
     *("beams:2", "beams:4", "points:0.1", "beams:4:1", "beams:8", "points:0.03"),
     *("points:0.3", "beams:4+points:0.5", "sector:60", "points:0.01", "region:5:20:-5:5"),
+    *("sector:180", "beams:4+sector:120"),
 )
 POINTS = 4000  # of a scan
 ONE_STEP = Filling("conditional", 1)
@@ -36,7 +37,7 @@ def right(filled: RangeImage, truth: RangeImage) -> np.ndarray:
     return filled.mask & truth.mask & (np.abs(filled.range - truth.range) <= allowed)
 
 
-def calibrated(model: CascadeModel, seed: int = 515151, count: int = 44) -> Confidence:
+def calibrated(model: CascadeModel, seed: int = 515151, count: int = 52) -> Confidence:
     """The weights of confidence that suit a trained cascade, by `count` streets."""
     rng, seen, hits = np.random.default_rng(seed), [], []
     for number, (truth, recipe) in enumerate(held_out(seed, count)):
@@ -44,7 +45,7 @@ def calibrated(model: CascadeModel, seed: int = 515151, count: int = 44) -> Conf
         filled = own.fill(truth.keep(known), known, ONE_STEP)
         chosen = np.flatnonzero(filled.mask & ~known)
         chosen = rng.permutation(chosen)[:POINTS]
-        seen.append(own.doubts(truth.keep(known), known).numpy().reshape(6, -1)[:, chosen].T)
+        seen.append(own.doubts(truth.keep(known), known).numpy().reshape(7, -1)[:, chosen].T)
         hits.append(right(filled, truth).reshape(-1)[chosen])
     return fitted(np.concatenate(seen), np.concatenate(hits))
 

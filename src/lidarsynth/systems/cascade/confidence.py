@@ -20,6 +20,7 @@ from lidarsynth.networks.rays import Rays, decode_range
 METRES, SHARE = 0.3, 0.02  # what a point may be off: metres, and share of its range
 LEAST = 0.02  # metres below which distances are all alike
 FARTHEST = 1.5  # radians, where no return is known in the row and the column
+NARROW = 0.2  # radians to the nearest known return, beyond which a point is in a wide hole
 ANSWER = 6.0  # beyond it the network's logit says no more
 
 
@@ -29,7 +30,8 @@ def tolerance(metres: np.ndarray | Tensor) -> np.ndarray | Tensor:
 
 
 def signals(filled: Filled, rays: Rays) -> Tensor:
-    """(B, 6, H, W) in the order of `Confidence`: logarithms of metres by the tolerance, of radians, a logit, log range.
+    """(B, 7, H, W) in the order of `Confidence`, without its constant: logarithms of metres by the tolerance, of
+    radians, a logit, log range, and of radians by those of a narrow hole.
 
     filled  of a network that was asked for its doubt
     """
@@ -41,13 +43,15 @@ def signals(filled: Filled, rays: Rays) -> Tensor:
     rows = torch.maximum(torch.cat([up[:, :, :1], up], 2), torch.cat([up, up[:, :, -1:]], 2))
     left = (height - height.roll(1, 3)).abs()
     columns = torch.maximum(left, left.roll(-1, 3))
+    angle = torch.log(_angle(filled.near, rays) + 1e-3)
     parts = (
         _by_tolerance(filled.spread, allowed),
-        torch.log(_angle(filled.near, rays) + 1e-3),
+        angle,
         filled.logit.clamp(-ANSWER, ANSWER),
         _by_tolerance(rows * (1 + metres), allowed),
         _by_tolerance(columns * (1 + metres), allowed),
         height,
+        (angle - math.log(NARROW)).clamp_min(0),
     )
     return torch.cat(parts, 1)
 
@@ -66,17 +70,17 @@ def _angle(near: Tensor, rays: Rays) -> Tensor:
 
 def confidence(filled: Filled, rays: Rays, weights: Confidence) -> Tensor:
     """(B, 1, H, W) chances that a point is right, of a network that was asked for its doubt."""
-    *factors, constant = astuple(weights)
-    by = torch.tensor(factors, device=filled.code.device)[:, None, None]
+    *factors, constant, far = astuple(weights)
+    by = torch.tensor([*factors, far], device=filled.code.device)[:, None, None]
     return torch.sigmoid((signals(filled, rays) * by).sum(1, keepdim=True) + constant)
 
 
 def fitted(seen: np.ndarray, right: np.ndarray, steps: int = 50) -> Confidence:
-    """Logistic regression: the weights by which `right` (N,) bool is most likely, given signals `seen` (N, 6).
+    """Logistic regression: the weights by which `right` (N,) bool is most likely, given signals `seen` (N, 7).
 
     A signal whose weight would have the wrong sign, so that more doubt would mean more confidence, gets none.
     """
-    signs = np.array([-1, -1, 1, -1, -1, -1])
+    signs = np.array([-1, -1, 1, -1, -1, -1, -1])
     used = np.ones(len(signs), bool)
     while True:
         weights = _newton(seen[:, used], right, steps)
@@ -86,7 +90,8 @@ def fitted(seen: np.ndarray, right: np.ndarray, steps: int = 50) -> Confidence:
         used[np.flatnonzero(used)[wrong]] = False
     full = np.zeros(len(signs))
     full[used] = weights[:-1]
-    return Confidence(*(round(float(w), 4) for w in (*full, weights[-1])))
+    factors = [round(float(w), 4) for w in full]
+    return Confidence(*factors[:6], constant=round(float(weights[-1]), 4), far=factors[6])
 
 
 def _newton(seen: np.ndarray, right: np.ndarray, steps: int) -> np.ndarray:
