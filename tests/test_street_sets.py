@@ -55,6 +55,10 @@ def written(folder: Path, layout: str, streets: LabelledStreets = STREETS) -> Pa
     return folder
 
 
+def files_of(layout: str, index: int, streets: LabelledStreets = STREETS) -> list[str]:
+    return [path for path, _ in LAYOUTS[layout].sizes(streets, index, 0)]
+
+
 def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
@@ -220,9 +224,56 @@ def test_a_stopped_set_goes_on_to_the_same_files(tmp_path: Path, layout: str):
         record = folder / LAYOUTS[layout].record(STREETS, index)
         record.unlink()
         (record.parent / f".{record.stem}.123.part").write_bytes(b"{")
-    (folder / LAYOUTS[layout].scan(STREETS, 3)).unlink()  # somebody else's doing
+    (folder / files_of(layout, 3)[0]).unlink()  # somebody else's doing
     written(folder, layout)
     assert content(frames) == whole
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_frames_that_somebody_cut_off_are_made_anew(tmp_path: Path, layout: str):
+    folder = written(tmp_path / "set", layout)
+    whole = content(folder)
+    cut = [name for name in files_of(layout, 0) if "label_2" not in name]  # text of any length
+    for index, name in enumerate([*cut, LAYOUTS[layout].record(STREETS, 0)]):
+        mine = folder / name.replace("000000", f"{index:06d}")
+        mine = mine if mine.exists() else folder / name  # of nuScenes a class file has a name of its own
+        mine.write_bytes(mine.read_bytes()[:-3] if index % 2 else b"")
+    assert next(write_streets(folder, STREETS, layout)) < 7
+    written(folder, layout)
+    assert content(folder) == whole
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_smaller_number_leaves_a_larger_set_whole(tmp_path: Path, layout: str):
+    line = Sensor("line", (-10.0,), 32, 1.0, 30.0)
+    for name, options, count in (("places", Options(), 18), ("drives", Options(frames=2), 2)):
+        folder = written(tmp_path / name, layout, LabelledStreets(0, count, line, options))
+        whole, larger = content(folder), LabelledStreets(0, count, line, options)
+        (folder / files_of(layout, 1, larger)[0]).unlink()
+        beside = (folder / LAYOUTS[layout].record(larger, 0)).parent
+        (beside / "99999999.json").write_text("{}")
+        assert list(write_streets(folder, LabelledStreets(0, 1, line, options), layout))[-1] == len(larger)
+        (beside / "99999999.json").unlink()
+        assert content(folder) == whole
+
+
+def test_tracks_are_of_the_stamps_and_boxes_of_when_they_were_seen(tmp_path: Path, frames: list[Frame]):
+    sequence = written(tmp_path / "set", "semantickitti") / "sequences" / "00"
+    tracks = json.loads((sequence / "tracks.json").read_text())
+    record, moved = json.loads((sequence / "boxes" / "000003.json").read_text()), 0.0
+    there = {box.instance: box for box in LabelledStreets(0, 1, SENSOR, Options(frames=7))[3].boxes}
+    for box in record["boxes"]:
+        truth = there[box["instance"]].place
+        np.testing.assert_allclose(tracks[str(box["instance"])]["frames"]["3"][:3], truth, atol=1e-3)
+        moved = max(moved, float(np.linalg.norm(np.array(box["place"]) - truth)))
+    assert moved > 0.05  # m
+
+
+def test_a_scan_without_a_point_is_no_scan(tmp_path: Path):
+    blind = Sensor("blind", (89.0,), 16)
+    with pytest.raises(ValueError, match=r"blind: expected a sensor that sees something .* found no return .* scan 0"):
+        list(write_streets(tmp_path / "set", LabelledStreets(0, 1, blind), "pcd"))
+    assert not list((tmp_path / "set").glob("0*"))
 
 
 def test_other_settings_and_other_folders_are_refused(tmp_path: Path):
@@ -241,7 +292,9 @@ def test_the_verb_writes_says_and_grows(tmp_path: Path, capsys: pytest.CaptureFi
     words = ["streets", "--out", str(tmp_path / "set"), "--sensor", str(sensor), "--format", "pcd", "--workers", "1"]
     main([*words, "-n", "1"])
     main([*words, "-n", "2"])
-    assert "has 2 labelled scans of own in the layout of pcd" in capsys.readouterr().out
+    assert "has 2 labelled scans of own in the layout of pcd\n" in capsys.readouterr().out
+    main([*words, "-n", "1"])
+    assert "has 2 labelled scans of own in the layout of pcd, more than -n 1 asks for" in capsys.readouterr().out
     assert (tmp_path / "set" / "000001.pcd").exists() and (tmp_path / "set" / "overview.png").stat().st_size > 1000
     with pytest.raises(SystemExit) as refused:
         main([*words, "-n", "2", "--rain", "-3"])

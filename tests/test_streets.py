@@ -94,6 +94,22 @@ def test_points_of_an_instance_are_in_its_box(still: list[Frame], driven: list[F
     assert checked > 500
 
 
+def test_deskewed_boxes_stand_where_their_points_were_seen(driven: list[Frame]):
+    """Where things are at the stamp, some of those that move would have no point at all."""
+    held = []
+    for frame in driven:
+        for box in (box for box in frame.boxes if box.moves and box.points and box.late is not None):
+            mine = frame.scan.xyz[frame.raw >> 16 == box.instance]
+            at_stamp = replace(box, centre=tuple(np.array(box.centre) - box.late * np.array(box.velocity)))
+            held.append((inside(box, mine, 0).sum(), inside(at_stamp, mine, 0).sum(), box.points))
+    seen, stamped, told = np.array(held).T
+    assert len(told) > 20 and seen.sum() > 0.99 * told.sum() and (seen > 0.5 * told).all()
+    assert stamped.sum() < 0.95 * told.sum() and (stamped < 0.5 * told).any()
+    beside = [box for frame in driven for box in frame.boxes if np.hypot(*box.centre[:2]) > 5 and box.late is not None]
+    off = [10 * (box.late or 0.0) + np.arctan2(box.centre[1], box.centre[0]) / (2 * np.pi) for box in beside]
+    np.testing.assert_allclose(off, np.round(off), atol=0.12)  # clockwise, the stamp ahead, both ends behind
+
+
 def test_boxes_hold_little_else(still: list[Frame]):
     """What returns from within a car's box is that car, its ground, or what leans against it."""
     for frame in still:
@@ -111,13 +127,14 @@ def test_occlusion_is_a_share(still: list[Frame]):
 
 
 def test_boxes_move_with_their_velocity(driven: list[Frame]):
-    """Place after a turn = place + velocity * time, for everyone in both frames."""
+    """Place after a turn = place + velocity * the time between both meetings, for everyone in both frames."""
     before, after = ({box.instance: box for box in frame.boxes} for frame in driven[1:3])
     moved = 0
     for number in before.keys() & after.keys():
         a, b = before[number], after[number]
         mean = (np.array(a.world_velocity) + b.world_velocity) / 2
-        np.testing.assert_allclose(np.array(b.place) - a.place, mean * 0.1, atol=0.05)
+        assert a.late is not None and b.late is not None and abs(a.late) <= 0.05 >= abs(b.late)
+        np.testing.assert_allclose(np.array(b.place) - a.place, mean * (0.1 + b.late - a.late), atol=0.05)
         assert a.size == b.size and a.kind == b.kind
         moved += a.moves
     assert moved >= 3
@@ -193,6 +210,16 @@ def test_density_does_what_it_says():
         Density(traffic=-1).of(None)  # type: ignore[arg-type]
 
 
+def test_without_traffic_and_parking_no_vehicle_is_left():
+    """Not in car parks either, nor bicycles; with ever so little parking they are there, and all else is the same."""
+    little, none = (world(0, Density(traffic=0, parking=parking)) for parking in (1e-9, 0))
+    kinds = {"car", "van", "truck", "bus", "bicyclist", "motorcyclist", "bicycle", "motorcycle"}
+    assert not kinds & set(none.things["kind"]) and {"car", "van", "truck", "bicycle"} <= set(little.things["kind"])
+    left = little.things[~np.isin(little.things["kind"], list(kinds))]
+    np.testing.assert_array_equal(none.things, left)
+    np.testing.assert_array_equal(none.poses, little.poses)
+
+
 def test_rain_extinction_is_the_integral():
     """pi/4 1e-6 integral of D^2 2 N(D) dD with Marshall-Palmer drops, by quadrature."""
     size = np.linspace(0, 30, 300_001)
@@ -241,6 +268,9 @@ def test_wrong_options_are_named():
         Weather(rain=-1)
     with pytest.raises(ValueError, match="expected a drive of at most"):
         draw_drive(0, 0, 3600, speed=30.0)
+    for mount in (-2.0, 0.0, 500.0, np.nan):
+        with pytest.raises(ValueError, match=r"expected a mount above the road .* 0 to 100 m, found (-2|0|500|nan)$"):
+            LabelledStreets(0, 4, Sensor("line", (-10.0,), 64, mount=mount))
     with pytest.raises(IndexError, match=r"0\.\.3, got 4"):
         LabelledStreets(0, 4, Sensor("line", (-10.0,), 64))[4]
 
@@ -306,6 +336,22 @@ def test_cyclists_ride_forward_beside_the_road():
     assert rides.sum() > 5 and np.all((speed > 3.8) & (speed < 6.2))
     ahead = np.column_stack([np.cos(moment.yaw[rides]), np.sin(moment.yaw[rides])])
     np.testing.assert_allclose(np.sum(ahead * moment.velocity[rides, :2], axis=1), speed, rtol=0.02)
+
+
+def test_cyclists_roll_off_kerbs_and_do_not_fall():
+    """Their height changes with their velocity, where a side road meets theirs too."""
+    lowest = 1.0
+    for number in range(3):
+        drive = draw_drive(0, number, 4.0, Density(cyclists=2, traffic=0))
+        rides = (drive.actors.kind == "bicyclist") & (drive.number >= 0)
+        for time in np.arange(0.05, 3.9, 0.1):
+            before, after = drive.moment(time), drive.moment(time + 0.1)
+            both = rides & before.present & after.present
+            fall = (after.place - before.place)[both, 2] - 0.05 * (after.velocity + before.velocity)[both, 2]
+            assert np.abs(fall).max(initial=0) < 0.03
+            x, y, z = before.place[both].T
+            lowest = min(lowest, (z - drive.world.ground.height(x, y)).min(initial=1))
+    assert lowest < 0.02  # some do cross
 
 
 def test_kerbs_are_as_high_as_asked_and_all_else_stays():

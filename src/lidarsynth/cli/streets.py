@@ -12,7 +12,7 @@ from lidarsynth.cli.terminal import counted, say
 
 def streets(
     out: Annotated[Path, arg(help="folder of the data set.")],
-    count: Annotated[int, arg(aliases=["-n"], help="how many scans, or drives with --frames.")] = 100,
+    count: Annotated[int, arg(aliases=["-n"], help="how many scans, or drives with --frames, at least.")] = 100,
     sensor: Annotated[
         str, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file.")
     ] = "hdl-64e-kitti",
@@ -25,12 +25,12 @@ def streets(
     speed: Annotated[
         float | None, arg(metavar="KM/H", help="the car would like to drive; default: as the street has it.")
     ] = None,
-    deskewed: Annotated[bool, arg(help="take the car's own motion within a turn out of the points.")] = False,
+    deskewed: Annotated[bool, arg(help="take the car's own motion out of a turn; boxes stand where seen.")] = False,
     perfect: Annotated[
         bool, arg(help="as a simulator casts: every beam returns, no noise, no reflectance; `realise` makes it real.")
     ] = False,
     traffic: Annotated[float, arg(help="moving vehicles, riders among them: 1 = as usual, 2 = twice, 0 = none.")] = 1.0,
-    parking: Annotated[float, arg(help="parked vehicles, likewise.")] = 1.0,
+    parking: Annotated[float, arg(help="parked vehicles, likewise; 0 = no car parks or bicycles either.")] = 1.0,
     pedestrians: Annotated[float, arg(help="likewise; 0.08 = the share of real scans, of which 1 has 14 times.")] = 1.0,
     vegetation: Annotated[float, arg(help="trees and bushes, likewise.")] = 1.0,
     groups: Annotated[float, arg(help="of people who stand together, per 100 m and side of the street.")] = 0.0,
@@ -51,7 +51,7 @@ def streets(
     picture: Annotated[bool, arg(help="write overview.png, four frames with their boxes.")] = True,
 ) -> None:
     """Labelled scans of synthetic streets: classes, instances, 3-D boxes, poses; stopped, the same command goes on."""
-    from lidarsynth.data.street_sets import overview, write_streets
+    from lidarsynth.data.street_sets import overview, with_those_there, write_streets
     from lidarsynth.lidar.sensor import get_sensor
     from lidarsynth.pictures.render import save_png
     from lidarsynth.streets.areas import Density
@@ -62,10 +62,11 @@ def streets(
             "walls": walls, "barriers": barriers, "panels": panels, "garages": garages}  # fmt: skip
     density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
-    made = LabelledStreets(seed, count, get_sensor(sensor), options)
+    made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     workers = os.cpu_count() or 1 if workers is None else workers
     for _ in counted((done, len(made)) for done in write_streets(out, made, format, workers)):
         pass
-    say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}")
+    kept = f", more than -n {count} asks for" if made.count > count else ""
+    say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}{kept}")
     if picture:
         say(f"wrote {save_png(out / 'overview.png', overview(made))}")

@@ -1,13 +1,15 @@
 """Writing labelled streets as a data set that others' tools read; stopped at any moment, the same call goes on.
 
-A frame is there when its JSON is, which is written last; every file appears whole or not at all. `streets.json` says
-what the set was made with, and the tables of the layout are written when all frames are there.
+A frame is there when its JSON is, which is written last, and its files are as long as the JSON says; every file appears
+whole or not at all. `streets.json` says what the set was made with, and the tables of the layout are written when all
+frames are there. A set never shrinks.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from io import BytesIO
@@ -18,7 +20,7 @@ import numpy as np
 
 from lidarsynth.data.index import resumable_file
 from lidarsynth.data.layouts.kitti import KITTI
-from lidarsynth.data.layouts.layout import Layout
+from lidarsynth.data.layouts.layout import Layout, points_told
 from lidarsynth.data.layouts.nuscenes import NUSCENES
 from lidarsynth.data.layouts.pcd import PCD
 from lidarsynth.data.layouts.semantickitti import SEMANTICKITTI
@@ -29,7 +31,7 @@ from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
 from lidarsynth.streets.areas import MORE
 from lidarsynth.streets.drawing import bev_with_boxes, strips
-from lidarsynth.streets.frame import LabelledStreets
+from lidarsynth.streets.frame import LabelledStreets, Options
 
 LAYOUTS: dict[str, Layout] = {
     "semantickitti": SEMANTICKITTI,
@@ -37,13 +39,14 @@ LAYOUTS: dict[str, Layout] = {
     "nuscenes": NUSCENES,
     "pcd": PCD,
 }
-EDITION = 2  # of the streets: raised when equal settings give other scans or boxes, so that no set mixes them
+EDITION = 2  # of the streets: raised when equal settings give other scans or boxes, so that no set mixes them;
+# `_edition` raises it for some settings only
 RECORD = "streets.json"
 CHUNK = 16  # frames that one process makes in a row, at most; they share their world
 
 
 def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: int = 0) -> Iterator[int]:
-    """Store all frames and yield how many are there, then the tables.
+    """Store all frames and yield how many are there, then the tables; of as many as the folder has, if it has more.
 
     layout   a word of LAYOUTS
     workers  processes; with fewer than two this one works itself
@@ -57,6 +60,7 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
 def _write(folder: Path, streets: LabelledStreets, layout: str, workers: int) -> Iterator[int]:
     _claim(folder, _settings(streets, layout))
     sweep(folder, deep=True)
+    streets = with_those_there(folder, streets, layout)
     task = _Task(folder, streets, layout)
     chunks = task.chunks()
     done = len(streets) - sum(map(len, chunks))
@@ -73,6 +77,17 @@ def _write(folder: Path, streets: LabelledStreets, layout: str, workers: int) ->
         _put(folder / path, content)
 
 
+def with_those_there(folder: Path, streets: LabelledStreets, layout: str) -> LabelledStreets:
+    """The streets with as many scans, or drives, as the folder has whole, where these are more than asked for."""
+    of, frames = LAYOUTS[layout], max(streets.options.frames, 1)
+    there = Counter(index // frames for index in {of.index(streets, path) for path in folder.glob(of.records)})
+    for number in sorted((n for n, found in there.items() if n >= streets.count and found == frames), reverse=True):
+        names = [of.record(streets, index) for index in range(number * frames, (number + 1) * frames)]
+        if all(points_told(folder / name) is not None for name in names):  # and not somebody's own numbered JSON
+            return LabelledStreets(streets.seed, number + 1, streets.sensor, streets.options)
+    return streets
+
+
 class _Task:
     """What a worker has to know to make any chunk."""
 
@@ -81,10 +96,10 @@ class _Task:
         self._runs: list[list[int]] = []
 
     def chunks(self) -> list[list[int]]:
-        """Frames that are not there, or have lost their scan, in runs of one world."""
+        """Frames that are not there, or have a file that is missing or cut off, in runs of one world."""
         layout, runs = LAYOUTS[self.layout], []
         for index in range(len(self.streets)):
-            if all((self.folder / part(self.streets, index)).exists() for part in (layout.record, layout.scan)):
+            if layout.has(self.folder, self.streets, index):
                 continue
             group = (self.streets.place(index)[0], index // CHUNK)
             if not runs or runs[-1][0] != group:
@@ -98,6 +113,9 @@ class _Task:
         layout = LAYOUTS[self.layout]
         for index in self._runs[chunk]:
             frame = self.streets[index]
+            if not len(frame.scan):
+                raise ValueError(f"{self.streets.sensor.name}: expected a sensor that sees something from every place, "
+                                 f"found no return of any beam in scan {index}")  # fmt: skip
             for path, content in layout.files(self.streets, index, frame):
                 _put(self.folder / path, content)
             _put(self.folder / layout.record(self.streets, index), json.dumps(frame.record()).encode())
@@ -112,7 +130,14 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
             if of[name] == later[name]:
                 del of[name]  # a set of before there was this choice goes on
     asked = {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
-    return asked | {"edition": EDITION}
+    return asked | {"edition": _edition(streets.options)}
+
+
+def _edition(options: Options) -> int:
+    """EDITION, or one more where 2026-11-25 brought boxes that stand where seen, cyclists who roll off kerbs, or no
+    vehicles in car parks: other sets go on."""
+    drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
+    return EDITION + (drives or options.density.parking == 0)
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> None:

@@ -53,6 +53,7 @@ class Area:
     panels: float = 0.0
     garages: float = 0.0
     kerb: float = KERB  # m, from carriageway to sidewalk
+    car_parks: bool = True  # and parked bicycles; False leaves them out, and all else where it is
 
 
 # fmt: off
@@ -98,7 +99,8 @@ AREAS: dict[str, Area] = {
 class Density:
     """How much of what there is, as factors of what the kind of street has; 1 leaves a world as it is.
 
-    kerbs  factor of their height of 12 cm
+    parking  of vehicles along the street; 0 leaves out car parks and bicycles too, which are as many for any other
+    kerbs    factor of their height of 12 cm
 
     More, per 100 m and side: groups of people, parked motorcycles, road works, cyclists beside the road; heavy vehicles
     that stand (lorries, coaches, trailers); walls and fences of more kinds; crash barriers; panels larger than signs;
@@ -138,7 +140,7 @@ class Density:
         green = {"kerb_bushes": area.kerb_bushes * self.vegetation, "woods": area.woods * self.vegetation}
         new |= {name: getattr(self, name) for name in MORE}
         green["on_road"], green["kerb"] = area.on_road * self.pedestrians, area.kerb * self.kerbs
-        return replace(area, **new, **green)
+        return replace(area, **new, **green, car_parks=self.parking > 0)
 
 
 MORE = ("groups", "motorcycles", "works", "cyclists", "heavy", "walls", "barriers", "panels", "garages")

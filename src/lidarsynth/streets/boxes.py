@@ -27,6 +27,8 @@ class Box:
     velocity    (3,) m/s over ground
     place, heading, world_velocity: centre, yaw and velocity in the world's frame
     points      how many returns are labelled with it; occlusion: share of its first hits that others hide, 0 to 1
+    late        s after the stamp at which it was where the box stands, None = the stamp: centre, place, yaw and heading
+                are of that time, so that centre - late * velocity is where it is at the stamp
     """
 
     kind: str
@@ -40,6 +42,7 @@ class Box:
     world_velocity: tuple[float, float, float]
     points: int
     occlusion: float
+    late: float | None = None
 
     @property
     def moves(self) -> bool:
@@ -59,8 +62,10 @@ class Box:
         rounded = {
             key: [round(v, 4) for v in value] if isinstance(value, tuple) else value
             for key, value in vars(self).items()
+            if value is not None
         }
-        return rounded | {key: round(getattr(self, key), 5) for key in ("yaw", "heading", "occlusion")}
+        late = {} if self.late is None else {"late": round(self.late, 5)}
+        return rounded | {key: round(getattr(self, key), 5) for key in ("yaw", "heading", "occlusion")} | late
 
 
 def boxes_of(
@@ -73,12 +78,14 @@ def boxes_of(
     poses: np.ndarray,
     late: np.ndarray | None,
     to_world: np.ndarray,
+    as_seen: bool = False,
 ) -> list[Box]:
     """Boxes of all actors whose middle is within the sensor's range, or that a return is labelled with.
 
     numbers   (H, W) instance of each return, 0 for none
     poses     (1 or W, 6) of the carrier by column; late (W,) s after the stamp, None where nothing moves
     to_world  (4, 4) sensor to world at the stamp
+    as_seen   each stands where its points were met, not where it is at the stamp
     """
     actors = bodies.actors
     middles = moment.place + _about(actors.middle, moment.yaw)
@@ -89,18 +96,38 @@ def boxes_of(
     first = np.where(turn.first >= 0, world.thing[turn.first], -1)
     hits = np.bincount(first.ravel() + 1, minlength=len(world.things) + 1)
     found, frames = [], attitudes(sensor, poses)
+    after = _lateness(numbers, late, here) if as_seen and late is not None else None
+    now = moment if after is None else moment.later(after)
+    shown_at = now.place + _about(actors.middle, now.yaw)
+    centres = (shown_at - to_world[:3, 3]) @ to_world[:3, :3]
     for actor in near.tolist():
         met = hits[actors.thing[actor] + 1]
         alone = met + _hidden(bodies, actor, moment, sensor, turn, first, frames, late, here[actor]) if met else 0
-        front = np.array([np.cos(moment.yaw[actor]), np.sin(moment.yaw[actor]), 0]) @ to_world[:3, :3]
+        front = np.array([np.cos(now.yaw[actor]), np.sin(now.yaw[actor]), 0]) @ to_world[:3, :3]
         shown = met / alone if alone else 0.0
         found.append(Box(
-            str(actors.kind[actor]), int(actor) + 1, _three(here[actor]), _three(actors.size[actor] + 2 * MARGIN),
+            str(actors.kind[actor]), int(actor) + 1, _three(centres[actor]), _three(actors.size[actor] + 2 * MARGIN),
             float(np.arctan2(front[1], front[0])), _three(moment.velocity[actor] @ to_world[:3, :3]),
-            _three(middles[actor]), float(np.arctan2(np.sin(moment.yaw[actor]), np.cos(moment.yaw[actor]))),
+            _three(shown_at[actor]), float(np.arctan2(np.sin(now.yaw[actor]), np.cos(now.yaw[actor]))),
             _three(moment.velocity[actor]), int(points[actor + 1]), float(np.clip(1 - shown, 0, 1)),
+            None if after is None else float(after[actor]),
         ))  # fmt: skip
     return found
+
+
+def _lateness(numbers: np.ndarray, late: np.ndarray, here: np.ndarray) -> np.ndarray:
+    """(A,) s after the stamp at which each actor was met: the median of its returns, or when the beams passed by.
+
+    numbers (H, W) as in `boxes_of`; late (W,) s; here (A, 3) m, its middle in the sensor frame at the stamp. The median
+    is of one end of the turn for those that both ends meet, where a mean would be of neither.
+    """
+    column = (np.pi - np.arctan2(here[:, 1], here[:, 0])) * len(late) / (2 * np.pi)
+    after = late[column.astype(int) % len(late)]
+    row, column = np.nonzero(numbers)
+    met = numbers[row, column] - 1
+    for actor in np.unique(met).tolist():
+        after[actor] = np.quantile(late[column[met == actor]], 0.5, method="lower")
+    return after
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:

@@ -22,6 +22,7 @@ MARGIN = 120.0  # m of street behind the start and beyond the end
 LONGEST = 4000.0  # m of street in one world
 OWN_LENGTH = 4.3  # m, of the carrier
 APART = 2.3  # m between the middles of vehicles that pass each other
+RAMP = 1.5  # m in which a kerb falls to the carriageway for those who ride
 STANDING = 0.3  # share of pedestrians who do not walk
 
 
@@ -37,6 +38,10 @@ class Moment:
     velocity: np.ndarray
     spin: np.ndarray
     present: np.ndarray
+
+    def later(self, after: np.ndarray) -> Moment:
+        """Everyone moved on by a time of their own, (A,) s, short enough that velocity and spin stay what they are."""
+        return replace(self, place=self.place + after[:, None] * self.velocity, yaw=self.yaw + after * self.spin)
 
 
 @dataclass(frozen=True)
@@ -88,10 +93,18 @@ class Drive:
         for number, road in enumerate(self.world.ground.roads):
             mine = self.number == number
             x, y, heading = road.at(s[mine], self.aside[mine])
-            walks = (self.actors.pace[mine] == WALK) & (self.world.ground.carriageway(x, y) > 0) & (road.walk > 0)
-            place[mine] = np.column_stack([x, y, self.world.ground.height(x, y) + self.world.ground.kerb * walks])
+            up = self._up(mine, number, x, y) if road.walk > 0 else 0.0
+            place[mine] = np.column_stack([x, y, self.world.ground.height(x, y) + up])
             yaw[mine] = heading + np.where(self.ahead[mine] > 0, 0, np.pi)
         return place, yaw
+
+    def _up(self, mine: np.ndarray, number: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Metres above the carriageway of the actors `mine` of a road: where another road meets theirs, people step off
+        the kerb, cyclists roll down and up again."""
+        ground, walks = self.world.ground, self.actors.pace[mine] == WALK
+        rolls = walks & (self.actors.kind[mine] == "bicyclist")
+        raised = np.where(rolls, np.clip(ground.carriageway(x, y, skip=number) / RAMP, 0, 1), 1.0)
+        return ground.kerb * raised * (walks & (ground.carriageway(x, y) > 0))
 
 
 def draw_drive(seed: int, number: int, seconds: float, density: Density = TODAY, speed: float | None = None) -> Drive:

@@ -33,7 +33,8 @@ class Options:
     frames    0 = scans of places where everything stands still; else frames of each drive
     rate      turns per second
     speed     m/s the carrier would like to drive, None = as the street has it
-    deskewed  the carrier's own motion within a turn is taken out of the points, as odometry data sets have it
+    deskewed  the carrier's own motion within a turn is taken out of the points, as odometry data sets have it, and
+              boxes stand where the beams met them, as annotators put them around the points
     perfect   as a simulator casts: every beam reports exactly what it meets first, with a reflectance of 0
     """
 
@@ -66,7 +67,7 @@ class Frame:
 
     scan      points in the sensor frame, ring by ring; label = training class, time = s after the turn began
     raw       (N,) uint32, SemanticKITTI's raw class of each point, its instance number in the upper half
-    boxes     of all road users within range, at `stamp`
+    boxes     of all road users within range, at `stamp`, or of deskewed frames when the beams met them (`Box.late`)
     to_world  (4, 4) float64, sensor frame at `stamp` -> world
     stamp     s on the clock of its world, the middle of the turn; 0 for scans of places
     world, number   which world or drive, and which scan of it; unique together
@@ -193,10 +194,9 @@ class LabelledStreets:
         pose = poses[0] if times is None else poses[len(poses) // 2]
         to_world = sensor_pose(sensor, pose)
         late = None if times is None else times - stamp
-        boxes = boxes_of(world, bodies, moment, sensor, turn, numbers, poses, late, to_world)
-        points = turn.points
-        if self.options.deskewed and times is not None:
-            points = _deskewed(sensor, turn, poses, to_world)
+        deskewed = self.options.deskewed and times is not None
+        boxes = boxes_of(world, bodies, moment, sensor, turn, numbers, poses, late, to_world, as_seen=deskewed)
+        points = _deskewed(sensor, turn, poses, to_world) if deskewed else turn.points
         order = np.roll(np.arange(sensor.width)[::-1], sensor.width // 2)
         hit = (turn.distance > 0)[:, order]
         ring, column = np.nonzero(hit)

@@ -11,6 +11,7 @@ from lidarsynth.streets.more import more
 from lidarsynth.streets.world import REACH, STILL, TRAFFIC, WALK, World, draw_ground, draw_poses
 
 Array = np.ndarray
+NOWHERE = np.inf  # m clear of carriageways: what is drawn with it is left out, and all that is drawn later stays
 
 
 def draw_area(rng: np.random.Generator) -> Area:
@@ -217,7 +218,7 @@ def car_park(builder: WorldBuilder, road: Road, side: int) -> None:
             d = side * (_edge(road) + rng.choice([3.2, 9.5])) + rng.normal(0, 0.2, len(s))
             turn = np.where(rng.random(len(s)) < 0.7, np.pi / 2, -np.pi / 2)
             clear = builder.ground.carriageway(*road.at(s, d)[:2]) > 2.6
-            _vehicles(builder, road, s[clear], d[clear], turn[clear], 0.0)
+            _vehicles(builder, road, s[clear], d[clear], turn[clear], 0.0, there=area.car_parks)
     if area.bank > 0.02 and road.half > 3 and rng.random() < 0.3:
         start = rng.uniform(road.start, 0)
         s = np.arange(start, rng.uniform(start + 20, max(road.stop, start + 20)), 2.0)
@@ -248,7 +249,8 @@ def kerbside(builder: WorldBuilder, road: Road, side: int, main: bool) -> None:
             yaw = yaw + np.where(side < 0, np.pi, 0) + rng.normal(0, 0.25, count)
         elif kind != "bin":
             yaw = yaw + rng.uniform(0, 6.28, count)
-        builder.put(kind, x, y, yaw, up=up, clear=0.15, pace=WALK if kind == "person" else STILL)
+        clear = 0.15 if area.car_parks or kind != "bicycle" else NOWHERE
+        builder.put(kind, x, y, yaw, up=up, clear=clear, pace=WALK if kind == "person" else STILL)
     if main:
         count = rng.poisson(area.on_road)
         x, y, yaw = road.at(_along(builder, road, count), rng.uniform(-road.half, road.half, count))
@@ -301,8 +303,9 @@ def _vehicles(
     up: float,
     two_wheels: float = 0.0,
     pace: int = STILL,
+    there: bool = True,
 ) -> None:
-    rng = builder.rng
+    rng, clear = builder.rng, None if there else NOWHERE
     draw = rng.random(len(s))
     x, y, yaw = road.at(s, d)
     yaw = yaw + heading + rng.normal(0, 0.02, len(s))
@@ -312,5 +315,5 @@ def _vehicles(
     for kind, high in limits.items():
         chosen = (draw > low) & (draw <= high)
         if chosen.any():
-            builder.put(kind, x[chosen], y[chosen], yaw[chosen], up=up, clear=None, size=(0.96, 1.04), pace=pace)
+            builder.put(kind, x[chosen], y[chosen], yaw[chosen], up=up, clear=clear, size=(0.96, 1.04), pace=pace)
         low = high

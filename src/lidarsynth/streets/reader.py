@@ -20,9 +20,15 @@ FULL_TURN = 2083  # azimuth steps per turn of KITTI's sensor at 10 Hz
 
 
 class Worlds:
-    """Worlds of a seed by number, without what `sensor` cannot see; the last two are kept."""
+    """Worlds of a seed by number, without what `sensor` cannot see; the last two are kept.
+
+    Raises ValueError for a sensor that cannot stand on a road.
+    """
 
     def __init__(self, seed: int, sensor: Sensor, without: tuple[str, ...] = (), density: Density = TODAY):
+        if not 0 < sensor.mount < sensor.max_range:
+            raise ValueError(f"sensor {sensor.name}: expected a mount above the road and within its range of it, 0 to "
+                             f"{sensor.max_range:g} m, found {sensor.mount:g}")  # fmt: skip
         self.seed, self.sensor, self.without, self.density = seed, sensor, without, density
         self._kept: dict[int, tuple[World, Caster]] = {}
 

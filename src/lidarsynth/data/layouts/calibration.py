@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 FOCAL, MIDDLE = 721.5377, (609.5593, 172.854)  # pixels; KITTI's P2 of 2011_09_26
@@ -21,6 +23,7 @@ def odometry_calibration() -> str:
     return "\n".join([*lines, f"Tr: {numbers(AXES[:3])}"]) + "\n"
 
 
+@lru_cache(maxsize=1)
 def object_calibration() -> str:
     """`calib/NNNNNN.txt` of the object benchmark; OpenPCDet reads it by line number."""
     lines = [f"P{k}: {numbers(PROJECTION)}" for k in range(4)]

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from lidarsynth.data.layouts.calibration import AXES, IMAGE, PROJECTION, object_calibration
-from lidarsynth.data.layouts.layout import Content, Layout, is_held_out
+from lidarsynth.data.layouts.layout import Content, Layout, Sizes, is_held_out, numbered
 from lidarsynth.streets.actors import KINDS
 from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.frame import Frame, LabelledStreets
@@ -38,6 +38,13 @@ def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     yield f"training/label_2/{index:06d}.txt", "".join(f"{line}\n" for line in lines).encode()
     yield f"training/calib/{index:06d}.txt", object_calibration().encode()
     yield f"training/image_2/{index:06d}.png", _dark_image()
+
+
+def _sizes(streets: LabelledStreets, index: int, points: int) -> Sizes:
+    yield _scan(streets, index), 16 * points
+    yield f"training/label_2/{index:06d}.txt", None
+    yield f"training/calib/{index:06d}.txt", len(object_calibration())
+    yield f"training/image_2/{index:06d}.png", len(_dark_image())
 
 
 def label_line(box: Box) -> str | None:
@@ -81,4 +88,4 @@ def _tables(streets: LabelledStreets, _: Path) -> Content:
         yield f"ImageSets/{name}.txt", "".join(f"{i:06d}\n" for i, there in enumerate(chosen) if there).encode()
 
 
-KITTI = Layout(_record, _scan, _files, _tables)
+KITTI = Layout(_record, _files, _sizes, _tables, "training/boxes/*.json", numbered)

@@ -15,7 +15,7 @@ from tempfile import TemporaryFile
 import numpy as np
 from PIL import Image
 
-from lidarsynth.data.layouts.layout import Content, Layout, is_held_out, read_record
+from lidarsynth.data.layouts.layout import Content, Layout, Sizes, is_held_out, numbered, read_record
 from lidarsynth.data.layouts.nuscenes_tables import Shot, fixed_rows, lidarseg_path, scene_rows
 from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.streets.actors import KINDS
@@ -52,6 +52,12 @@ def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     yield _scan(streets, index), points.tobytes()
     if _is_key(streets, index):
         yield lidarseg_path(index), classes(frame).tobytes()
+
+
+def _sizes(streets: LabelledStreets, index: int, points: int) -> Sizes:
+    yield _scan(streets, index), 20 * points
+    if _is_key(streets, index):
+        yield lidarseg_path(index), points
 
 
 def classes(frame: Frame) -> np.ndarray:
@@ -98,4 +104,4 @@ def _empty_map() -> bytes:
     return file.getvalue()
 
 
-NUSCENES = Layout(_record, _scan, _files, _tables)
+NUSCENES = Layout(_record, _files, _sizes, _tables, "boxes/*.json", numbered)

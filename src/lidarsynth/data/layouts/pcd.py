@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.layouts.layout import Content, Layout
+from lidarsynth.data.layouts.layout import Content, Layout, Sizes, numbered
 from lidarsynth.files.pcd import write_table
 from lidarsynth.streets.frame import Frame, LabelledStreets
 
@@ -35,8 +35,19 @@ def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     yield _scan(streets, index), file.getvalue()
 
 
+def _sizes(streets: LabelledStreets, index: int, points: int) -> Sizes:
+    yield _scan(streets, index), _header(points) + points * POINT.itemsize
+
+
+def _header(points: int) -> int:
+    """Bytes before the points: those of an empty file, whose number of points is written twice as one digit."""
+    file = BytesIO()
+    write_table(file, np.zeros(0, POINT))
+    return file.tell() + 2 * (len(str(points)) - 1)
+
+
 def _tables(_: LabelledStreets, __: Path) -> Content:
     yield from ()
 
 
-PCD = Layout(_record, _scan, _files, _tables)
+PCD = Layout(_record, _files, _sizes, _tables, "*.json", numbered)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.layouts.calibration import camera_poses, numbers, odometry_calibration
-from lidarsynth.data.layouts.layout import Content, Layout, read_record
+from lidarsynth.data.layouts.layout import Content, Layout, Sizes, read_record
 from lidarsynth.streets.frame import Frame, LabelledStreets
 from lidarsynth.streets.world import POSES
 
@@ -47,6 +47,24 @@ def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     yield f"{sequence}/point_times/{name}.bin", scan.time.astype("<f4").tobytes()
 
 
+def _sizes(streets: LabelledStreets, index: int, points: int) -> Sizes:
+    sequence, name = _place(streets, index)
+    yield _scan(streets, index), 16 * points
+    yield f"{sequence}/labels/{name}.label", 4 * points
+    yield f"{sequence}/rings/{name}.bin", 2 * points
+    yield f"{sequence}/point_times/{name}.bin", 4 * points
+
+
+def _index(streets: LabelledStreets, path: Path) -> int:
+    words = path.parent.parent.name, path.stem
+    if not all(word.isdecimal() for word in words):
+        return -1
+    sequence, number = map(int, words)
+    if streets.options.frames:
+        return sequence * streets.options.frames + number
+    return (number // POSES * SEQUENCES + sequence) * POSES + number % POSES
+
+
 def _tables(streets: LabelledStreets, folder: Path) -> Content:
     places = [_place(streets, index) for index in range(len(streets))]
     for sequence in sorted({sequence for sequence, _ in places}):
@@ -66,13 +84,14 @@ def _tables(streets: LabelledStreets, folder: Path) -> Content:
 
 
 def _tracks(boxes: dict[str, list[dict]]) -> dict[str, dict]:
-    """Instance -> its kind, size, and its place, heading and velocity in the world by frame."""
+    """Instance -> its kind, size, and its place, heading and velocity in the world by frame, at its stamp."""
     tracks: dict[str, dict] = {}
     for name, found in boxes.items():
         for box in found:
             track = tracks.setdefault(str(box["instance"]), {"kind": box["kind"], "size": box["size"], "frames": {}})
-            track["frames"][name] = [*box["place"], box["heading"], *box["world_velocity"]]
+            place = np.array(box["place"]) - box.get("late", 0.0) * np.array(box["world_velocity"])
+            track["frames"][name] = [*np.round(place, 4).tolist(), box["heading"], *box["world_velocity"]]
     return tracks
 
 
-SEMANTICKITTI = Layout(_record, _scan, _files, _tables)
+SEMANTICKITTI = Layout(_record, _files, _sizes, _tables, "sequences/*/boxes/*.json", _index)
