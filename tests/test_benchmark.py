@@ -262,6 +262,35 @@ def test_a_stopped_benchmark_goes_on_and_changed_settings_begin_anew(data: Path,
     assert again.calls[7:] == [1], "only the scan that is another one is filled anew"
 
 
+def test_another_experiment_takes_another_folder(data: Path, tmp_path: Path):
+    other = stored(tmp_path / "other", [street(i) for i in range(4, 6)])
+    head, near = f'data = "{data}"\n', '[[method]]\nname = "near"\ninterpolation = "nearest"\n'
+    config, out = tmp_path / "b.toml", tmp_path / "out"
+    first = benchmark("upsampling", written(config, head + METHODS), out, no_model)
+    kept = (out / "results.json").read_bytes()
+    for text, told in (
+        (head + 'corruption = "beams:2"\n' + METHODS, "with corruption = 'beams:4', found 'beams:2'"),
+        (head + 'protocol = "lidm-reconstruction-2024"\n' + METHODS, "with protocol = .*, found .*'lidm-rec"),
+        (head + "seed = 3\n" + METHODS + near, "with seed = 0, found 3"),
+        (f'data = "{other}"\n' + METHODS, "with data = '.*data', found '.*other'"),
+        (head + METHODS.replace('"bilinear"\n', '"nearest"\n').replace('name = "nearest"', 'name = "bilinear"'),
+         "with method 'bilinear' = .*'bilinear'.*, found .*'nearest'"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=rf"{out}: expected the experiment .*{told}.*; use another --out"):
+            benchmark("upsampling", written(config, text), out, no_model)
+        assert (out / "results.json").read_bytes() == kept and (out / "table.md").read_text() == first
+    written(config, f'reference = "{data}"\n[[method]]\nname = "noise"\nnoise = true\n')
+    with pytest.raises(ValueError, match="with kind = 'upsampling', found 'generation'"):
+        benchmark("generation", config, out, no_model)
+    more = 'title = "More"\nimages = 2\nprotocol = ["lidm-reconstruction-2024", "r2dm-upsampling-2024"]\n' + head
+    benchmark("upsampling", written(config, more + near + METHODS), out, no_model)
+    assert [row["count"] for row in results(out).values()] == [2, 2], "rows are added, scans may be fewer"
+    benchmark("upsampling", config, out, no_model)
+    (out / "results.json").write_text("[]")
+    with pytest.raises(ValueError, match="expected the results of a benchmark, found another table; use another --out"):
+        benchmark("upsampling", config, out, no_model)
+
+
 def test_rows_that_cannot_be_are_told(data: Path, tiny: Path, tmp_path: Path):
     small = stored(tmp_path / "small", [street(0, SENSOR.resized(width=32))])
     config = written(tmp_path / "b.toml", f'data = "{small}"\n[[method]]\nname="tiny"\nmodel="tiny"\n{METHODS}')
@@ -549,7 +578,8 @@ def test_the_verb_writes_and_refuses(data: Path, tmp_path: Path, capsys: pytest.
     command = json.loads((tmp_path / "out" / "results.json").read_text())["command"]
     assert sorted(shlex.split(command)) == sorted(["lidarsynth", *words]) and command in told
     assert f"wrote {tmp_path / 'out'}/ with results.json, table.md, figure.png" in told
-    for wrong in (["--seed", "-1"], ["--data", "nowhere"], ["--classes", "nowhere"], ["--batch-size", "0"]):
+    for wrong in (["--seed", "-1"], ["--data", "nowhere"], ["--classes", "nowhere"], ["--batch-size", "0"],
+                  ["--device", "cuda:99"]):  # fmt: skip
         with pytest.raises(SystemExit) as end:
             main(["benchmark", "upsampling", str(config), "--out", str(tmp_path / "no"), *wrong])
         assert end.value.code == 2 and len(capsys.readouterr().err.strip().splitlines()) == 1

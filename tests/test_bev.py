@@ -80,6 +80,13 @@ def test_counts_depend_neither_on_batches_nor_on_who_gathered_them():
     assert second.count == 5
 
 
+def test_an_empty_batch_changes_nothing():
+    counts = gathered([clouds(3)])
+    counts.update(np.zeros((0, 10, 3)))
+    assert counts.count == 3 and torch.equal(counts.pooled, bev_histograms(clouds(3)).sum(0))
+    assert bev_histograms(np.zeros((0, 10, 3)), bins=7).shape == (0, 7, 7)
+
+
 def test_errors_say_both_sides():
     with pytest.raises(ValueError, match=r"must be \(B, N, 3\), got \(4, 3\)"):
         bev_histograms(np.ones((4, 3)))

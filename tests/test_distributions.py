@@ -73,6 +73,12 @@ def test_frechet_distance_equals_scipy_and_is_zero_for_equal_sets(count):
     assert frechet_distance(moments(x), moments(x[::-1])) == pytest.approx(0, abs=1e-5 * np.trace(cov[0]))
 
 
+def test_frechet_distance_of_equal_sets_is_no_less_than_zero():
+    for seed in range(20):
+        features = np.random.default_rng(seed).normal(0, 50, (24, 12))
+        assert 0 <= frechet_distance(moments(features), moments(features)) < 1e-6
+
+
 def test_frechet_distance_of_few_against_many_equals_scipy_from_either_side():
     few, many = draw(12, 30, 1).astype(np.float64), draw(200, 30, 2, shift=0.2).astype(np.float64)
     few[6:] = few[:6]  # rank 5
@@ -206,7 +212,10 @@ def test_jensen_shannon_distance_equals_scipy():
         (lambda: kernel_distance(np.ones((1, 2)), np.ones((3, 2)), np.random.default_rng(0)), "found 1 and 3"),
         (lambda: gaussian_mmd(np.ones((2, 3)), np.ones((2, 4))), r"\(2, 3\) and \(2, 4\)"),
         (lambda: gaussian_mmd(np.ones((2, 3)), np.zeros((2, 3))), "found one without"),
+        (lambda: gaussian_mmd(np.ones((2, 4)), np.ones((2, 2, 2))), r"\(2, 4\) and \(2, 2, 2\)"),
+        (lambda: gaussian_mmd(np.array([[3.0, -1.0]]), np.ones((2, 2))), "counts of at least 0, found -1"),
         (lambda: jensen_shannon_distance(np.ones(3), np.zeros(3)), "counts of one shape"),
+        (lambda: jensen_shannon_distance(np.ones(3), np.array([1, 1, np.inf])), "counts of one shape.*inf"),
         (lambda: jensen_shannon_distance(np.ones(3), np.ones(4)), "counts of one shape"),
     ],
 )

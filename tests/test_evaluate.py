@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +21,7 @@ from lidarsynth.evaluation import evaluate as evaluation
 from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.evaluation.pairs import Pairs
 from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING, STREET_1
+from lidarsynth.evaluation.report import Result
 from lidarsynth.evaluation.statistics import load_statistics
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import thin
@@ -393,6 +395,150 @@ def test_errors_name_the_sample_and_say_both_sides(tmp_path: Path, real: Path):
     torch.save({"f": print}, tmp_path / "code/0.pth")
     with pytest.raises(ValueError, match="damaged or unsafe file"):
         ls.evaluate(tmp_path / "code", real)
+
+
+def recoded(form: str, images: list[RangeImage]) -> list[torch.Tensor]:
+    """Official samples in another code or scale than theirs."""
+    tensors = []
+    for image in images:
+        code, xyz, light = np.log2(image.range + 1) / 6, np.moveaxis(image.points(), -1, 0), image.reflectance
+        channels = {
+            "both coded to -1 to 1": (2 * code - 1, 2 * light - 1),
+            "range coded to -1 to 1": (2 * code - 1, light),
+            "metres": (image.range, light),
+            "reflectance to 255": (code, 255 * light),
+            "points, reflectance to 255": (image.range, *xyz, 255 * light),
+            "points, reflectance to -1": (image.range, *xyz, light - 1),
+            "points, depth as a code": (code, *xyz, light),
+            "points, in 80 m": (image.range, *xyz / 80, light),
+            "points, of another frame": (image.range, *xyz[:2], xyz[2] + 1.73, light),
+        }[form]
+        tensors.append(torch.from_numpy(np.stack(channels).astype(np.float32)))
+    return tensors
+
+
+@pytest.mark.parametrize(
+    ("form", "reason"),
+    [
+        ("both coded to -1 to 1", "expected a reflectance of 0 to 1, found -1 to "),
+        ("range coded to -1 to 1", r"expected a range code log2\(r \+ 1\) / 6 of 0 to 1.057, found -1 to "),
+        ("metres", r"expected a range code log2\(r \+ 1\) / 6 of 0 to 1.057, found 0 to "),
+        ("reflectance to 255", "expected a reflectance of 0 to 1, found 0 to 25"),
+        ("points, reflectance to 255", "expected a reflectance of 0 to 1, found 0 to 25"),
+        ("points, reflectance to -1", "expected a reflectance of 0 to 1, found -1 to "),
+        ("points, depth as a code", r"expected a depth of \|x, y, z\| in metres, found another in 100% of the pixels"),
+        ("points, in 80 m", r"expected a depth of \|x, y, z\| in metres, found another in 100% of the pixels"),
+        ("points, of another frame", r"expected a depth of \|x, y, z\| in metres, found another"),
+    ],
+)
+def test_samples_in_another_code_are_refused(form: str, reason: str, tmp_path: Path, real: Path, run: Run):
+    (tmp_path / "samples").mkdir()
+    for i, tensor in enumerate(recoded(form, STREETS[:2])):
+        torch.save(tensor, tmp_path / f"samples/{i}.pth")
+    for protocol in ("bev-1", "r3dpa-2026"):
+        with pytest.raises(ValueError, match=f"0.pth: {reason}") as refusal:
+            ls.evaluate(tmp_path / "samples", real, protocol)
+        assert "\n" not in str(refusal.value)
+    assert run("evaluate", tmp_path / "samples", "--reference", real, "--out", tmp_path / "r.json")[0] == 2
+
+
+def test_samples_that_pass_their_limits_a_little_are_clipped(tmp_path: Path):
+    code, light = np.log2(STREETS[0].range + 1) / 6, STREETS[0].reflectance
+    kept = torch.from_numpy(np.stack([code, light]))
+    kept[0, 0], kept[1, 0, :32] = 1.0, 0.0
+    passed = kept.clone()
+    passed[0, 0] = np.log2(81) / 6  # an hdl-64e sees 80 m, the code ends at 63
+    passed[0][kept[0] == 0], passed[1, 0, :32] = -0.02, -0.02
+    for name, tensor in (("kept", kept), ("passed", passed)):
+        broken_sample(tmp_path / name, tensor)
+    images = [image_set(tmp_path / name).image(0, SENSOR, "spherical") for name in ("kept", "passed")]
+    for name in ("range", "reflectance", "mask"):
+        np.testing.assert_array_equal(*(getattr(image, name) for image in images))
+    assert images[1].range.max() == pytest.approx(63)
+
+
+def test_tensors_of_other_beams_than_they_are_taken_for_are_noted(tmp_path: Path):
+    protocol = replace(STREET_1, networks=(), rows=BEV_1.rows)
+    real = saved(tmp_path / "real", [street(i, SENSORS["hdl-64e-kitti"].resized(width=64)) for i in range(2)], "ply")
+
+    def notes(form: str, sensor: str | None = None, side: int = 0) -> list[str]:
+        folder = tmp_path / form
+        sides = (folder, real) if side == 0 else (real, folder)
+        warnings = ls.evaluate(*sides, protocol, sensor=sensor).warnings
+        return [text for text in warnings if "tensors" in text]
+
+    for form in ("r2dm", "lidargen"):
+        saved(tmp_path / form, STREETS[:2], form)
+        assert notes(form, "hdl-64e") == []
+    (points,) = notes("r2dm")
+    assert re.fullmatch(
+        r"the points of samples, which are tensors, lie \d\.\d degrees off the beams of hdl-64e-kitti, for whose rows "
+        r"they are taken: --sensor names theirs \(R2DM's grid is hdl-64e\)",
+        points,
+    )
+    assert notes("lidargen") == ["samples are tensors without points, taken for the rays of hdl-64e-kitti: --sensor "
+                                 "names others (R2DM's grid is hdl-64e)"]  # fmt: skip
+    assert notes("lidargen", side=1)[0].startswith("the reference are tensors without points")
+    assert not [text for text in ls.evaluate(tmp_path / "r2dm", STREETS[:2]).warnings if "tensors" in text]
+
+
+def test_what_stands_in_empty_pixels_does_not_count(tmp_path: Path, real: Path):
+    def filled(image: RangeImage) -> RangeImage:
+        hole = ~image.mask
+        xyz = np.where(hole[..., None], np.float32(9), image.points())
+        return replace(image, range=image.range + 50 * hole, reflectance=image.reflectance + hole, xyz=xyz)
+
+    dirty = saved(tmp_path / "dirty", [filled(image) for image in STREETS])
+    clean = saved(tmp_path / "clean", [replace(image, xyz=image.points()) for image in STREETS])
+    for samples in (dirty, [filled(image) for image in STREETS]):
+        report = ls.evaluate(samples, clean, "street-upsampling-1")
+        assert report.values["range MAE"] == report.values["reflectance MAE"] == 0
+    reports = [ls.evaluate(samples, real) for samples in (dirty, clean)]
+    assert reports[0].values == reports[1].values and reports[0].hashes["samples"] == reports[1].hashes["samples"]
+
+
+def test_a_whole_and_its_parts_do_not_merge(tmp_path: Path, real: Path, run: Run):
+    samples, files = saved(tmp_path / "samples", STREETS), {}
+    for part in ("1/1", "1/2", "2/2"):
+        files[part] = tmp_path / f"{part[0]}of{part[2]}.safetensors"
+        evaluation.gather_part(samples, part, files[part])
+    for parts in (("1/1", "1/2"), ("2/2", "1/1"), ("1/1", "1/2", "2/2")):
+        code, _, error = run("evaluate", *(files[part] for part in parts), "--reference", real)
+        assert code == 2 and f"expected parts of one division, found {', '.join(parts)}" in error
+    other = tmp_path / "other.safetensors"
+    evaluation.gather_part(saved(tmp_path / "more", REAL[:3]), "1/1", other)
+    assert ls.evaluate([files["1/1"], other], real).counts["samples"] == 9, "two whole sets are one"
+
+
+def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, real: Path, run: Run):
+    out, part = tmp_path / "r.json", tmp_path / "part.safetensors"
+    for device in ("cuda:99", "tpu-9"):
+        with pytest.raises(ValueError, match=f"expected a device of torch, such as cpu or cuda, found '{device}': "):
+            ls.evaluate(STREETS, REAL, "street-1", device=device)
+        code, _, error = run("evaluate", real, "--reference", real, "--out", out, "--device", device)
+        assert code == 2 and error.count("\n") == 1 and "expected a device" in error
+    with pytest.raises(ValueError, match="expected a batch_size of at least 1, found 0"):
+        ls.evaluate(STREETS, REAL, batch_size=0)
+    with pytest.raises(ValueError, match="expected a seed of at least 0, found -1"):
+        ls.evaluate(STREETS, REAL, seed=-1)
+    with pytest.raises(ValueError, match="expected a batch_size of at least 1, found 0"):
+        evaluation.gather_part(real, "1/1", part, batch_size=0)
+    told = "the samples know their own sensor, hdl-64e: vlp-16, named for points and tensors, is not used"
+    assert told in ls.evaluate(STREETS, REAL, sensor="vlp-16").warnings
+    assert told not in ls.evaluate(STREETS, REAL, sensor="hdl-64e").warnings
+    with pytest.raises(ValueError, match=told):
+        evaluation.gather_part(real, "1/1", part, sensor="vlp-16")
+    evaluation.gather_part(real, "1/1", part, sensor="hdl-64e")
+    assert told in ls.evaluate([part], REAL, sensor="vlp-16").warnings
+    assert told in ls.evaluate(STREETS[:2], REAL[:2], "r2dm-upsampling-2024", sensor="vlp-16").warnings
+
+
+def test_a_zero_has_no_sign():
+    assert [str(Result("FRD", value, "m")) for value in (-0.0004, 0.0004, -0.0006)] == [
+        "0.000 m",
+        "0.000 m",
+        "-0.001 m",
+    ]
 
 
 def test_batches_in_one_file_are_images_like_others(tmp_path: Path, real: Path):

@@ -186,7 +186,7 @@ def test_a_cache_folder_is_found_without_a_home(monkeypatch):
     assert download.cache_folder().name == "lidarsynth-cache"
 
 
-@pytest.mark.parametrize("device", ["meta", "tpu-9", ""])
+@pytest.mark.parametrize("device", ["meta", "tpu-9", "", "cuda:99", "hpu"])
 def test_devices_that_compute_nothing_are_refused(device: str):
     with pytest.raises(ValueError, match="expected a device"):
         check_device(device)

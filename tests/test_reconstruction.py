@@ -86,6 +86,10 @@ def test_iou_axioms():
         confusion_matrix(labels, labels, 3)
     with pytest.raises(ValueError, match=r"found \(8, 8\) and \(4, 8\)"):
         confusion_matrix(labels, labels[:4])
+    np.testing.assert_array_equal(confusion_matrix(labels, labels.astype(np.float32), 4), perfect)
+    for wrong_label in (1.7, np.nan, np.inf, -0.5):
+        with pytest.raises(ValueError, match=r"expected .*labels"):
+            confusion_matrix(labels, np.where(labels == 1, wrong_label, labels), 4)
 
 
 def test_point_distances_equal_scipy():

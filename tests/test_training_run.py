@@ -2,6 +2,7 @@
 
 import csv
 import random
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -117,6 +118,47 @@ def test_a_run_can_be_extended(cache: Path, tmp_path: Path):
         list(run(tiny(2), cache, out, options=QUIET))
     with pytest.raises(ValueError, match=r"expected its own run, with training.learning_rate"):
         list(run(tiny(8, **{"training.learning_rate": 0.5}), cache, out, options=QUIET))
+
+
+def test_a_run_goes_on_with_its_own_images(cache: Path, tmp_path: Path):
+    """Wherever their folder lies now; as many of the same name, but other ones, are other data."""
+    out, moved, twin, few = (tmp_path / name for name in ("run", "moved", "twin", "few"))
+    shutil.copytree(cache, moved)
+    list(write_cache(twin, lambda i: noise_image(100 + i), 24, SENSOR, {"name": "noise"}))
+    list(write_cache(few, noise_image, 12, SENSOR, {"name": "few"}))
+    list(run(tiny(2), cache, out, options=QUIET))
+    assert [progress.step for progress in run(tiny(3), moved, out, options=QUIET)] == [2, 3]
+    own = r"run: expected its own run, which learns from 24 images of noise"
+    for data, found in (
+        (twin, "24 images of noise"),
+        (few, "12 images of few"),
+        ("synthetic", "endless images of syn"),
+    ):
+        with pytest.raises(ValueError, match=rf"{own}.*, found {found}.*; another folder begins a new run"):
+            list(run(tiny(4), data, out, options=QUIET))
+    with pytest.raises(ValueError, match="48 images of several caches"):
+        list(run(tiny(4), f"{cache},{few}", out, options=QUIET))
+    (out / "start.json").unlink()  # as of a run from before there was one
+    with pytest.raises(ValueError, match=rf"{own}, found 12 images of few; another folder"):
+        list(run(tiny(4), few, out, options=QUIET))
+    assert [progress.step for progress in run(tiny(4), cache, out, options=QUIET)] == [3, 4]
+    (out / "start.json").write_text("[]")
+    with pytest.raises(ValueError, match=r"start.json: expected what a run began with, found another table"):
+        list(run(tiny(5), cache, out, options=QUIET))
+
+
+def test_a_run_goes_on_from_no_other_weights(cache: Path, tmp_path: Path):
+    first, plain, tuned = (tmp_path / name for name in ("first", "plain", "tuned"))
+    for out, weights in ((first, None), (plain, None), (tuned, str(first))):
+        list(run(tiny(1), cache, out, weights, options=QUIET))
+    for weights in (None, str(first)):
+        assert [p.step for p in run(tiny(1), cache, tuned, weights, options=QUIET)] == [1], "the same command goes on"
+    for out, begun in ((tuned, first), (plain, "no weights")):
+        with pytest.raises(ValueError, match=rf"its own run, begun from {begun}, found --from nowhere; leave it away"):
+            list(run(tiny(2), cache, out, "nowhere", options=QUIET))
+    (tuned / "start.json").unlink()
+    (progress,) = run(tiny(1), cache, tuned, "nowhere", options=QUIET)
+    assert progress.note == f"--from nowhere is not used: the run in {tuned} goes on"
 
 
 def test_a_run_on_several_caches_says_so(cache: Path, tmp_path: Path):

@@ -8,24 +8,25 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.benchmark.config import Generation, Upsampling, protocols_of, read_config, rows
+from lidarsynth.benchmark.config import KINDS, Generation, Upsampling, protocols_of, read_config, rows
 from lidarsynth.benchmark.drawings import plotter, save_scores, side_by_side, with_classes, with_labels_of
 from lidarsynth.benchmark.generation import generation_row
 from lidarsynth.benchmark.published import PUBLISHED, why_not
-from lidarsynth.benchmark.record import record_of
+from lidarsynth.benchmark.record import check_same, record_of
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.setup import Load, Setup, open_setup
 from lidarsynth.benchmark.sources import corrupted, located
 from lidarsynth.benchmark.tables import page
 from lidarsynth.benchmark.upsampling import Problem, upsampling_row
 from lidarsynth.evaluation.accumulation import OnImages
-from lidarsynth.evaluation.image_sets import image_set, sensor_of
+from lidarsynth.evaluation.image_sets import emptied, image_set, sensor_of
 from lidarsynth.evaluation.pairs import classes_of
 from lidarsynth.evaluation.protocols import R2DM_UPSAMPLING, get_protocol
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import reconstruction_errors
+from lidarsynth.networks.device import check_device
 from lidarsynth.pictures.render import save_png
 
 RESULTS, TABLE, FIGURE, SCORES = "results.json", "table.md", "figure.png", "scores.png"
@@ -70,9 +71,13 @@ def benchmark(
     command  to be told in the results
 
     Scans stay in `out`, so that the same call goes on where it was stopped, and a new row is added to old ones. Raises
-    ValueError in one line; a method that cannot do what is asked for is a row without numbers instead.
+    ValueError in one line, also where `out` has a row of the same name that another file made; a method that cannot do
+    what is asked for is a row without numbers instead.
     """
+    check_device(device)
     settings, out = read_config(kind, config, data, seed), Path(out)
+    replaced = [name for name, given in ((KINDS[kind][2], data), ("seed", seed)) if given is not None]
+    check_same(out / RESULTS, kind, settings, replaced)
     several = any(isinstance(method.steps, tuple) and len(method.steps) > 1 for method in settings.method)
     draws_scores = kind == "generation" and several
     if draws_scores:
@@ -82,7 +87,7 @@ def benchmark(
     outcome = upsampling(setup, settings) if isinstance(settings, Upsampling) else generation(setup, settings)
     names = protocols_of(settings)
     text = page(settings.title, command, outcome.rows, names, outcome.about)
-    write_whole(out / RESULTS, record_of(kind, settings, setup, outcome.rows, outcome.data, command))
+    write_whole(out / RESULTS, record_of(kind, settings, setup, outcome.rows, outcome.data, command, replaced))
     save_png(out / FIGURE, side_by_side(outcome.pictures, settings.title, outcome.note))
     if draws_scores:
         save_scores(out / SCORES, outcome.rows, names, settings.title)
@@ -115,7 +120,7 @@ def _filled_pictures(setup: Setup, problem: Problem, found: Sequence[Row]) -> tu
     pictures = {f"input, {problem.config.corruption}": truth.keep(known)}
     for row in found:
         if row.image:
-            image = row.image(number)
+            image = emptied(row.image(number))
             error = reconstruction_errors(image, truth, ~known).range_mae
             pictures[f"{row.name}: hidden range MAE {error:.2f} m"] = image
     return _coloured(setup, pictures | {"truth": truth}, truth)

@@ -45,7 +45,7 @@ class Column:
         ranks = [self.rank(v) for v, competes in zip(values, competing, strict=True) if competes and v is not None]
         cells = []
         for value, competes, row in zip(values, competing, rows, strict=True):
-            cell = "N/A" if value is None else f"{value:.{self.digits}f}"
+            cell = "N/A" if value is None else f"{round(value, self.digits) + 0.0:.{self.digits}f}"  # no -0.000
             if value is not None and competes and len(ranks) > 1 and self.rank(value) == min(ranks):
                 cell = f"**{cell}**"
             paper = self.published(row)

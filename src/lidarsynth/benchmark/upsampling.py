@@ -15,6 +15,7 @@ from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.setup import Setup
 from lidarsynth.benchmark.sources import Corrupted
 from lidarsynth.benchmark.store import Seconds, Store
+from lidarsynth.evaluation.image_sets import emptied
 from lidarsynth.evaluation.pairs import Pairs, classes_of
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.statistics import definition
@@ -102,9 +103,9 @@ def _judged(setup: Setup, name: str, data: Corrupted, store: Store, stamps: Sequ
     def judge() -> dict[str, Any]:
         pairs, errors = Pairs(protocol, classes_of(judges.networks), setup.seen(name, data.sensor.width)), []
         for i in range(len(stamps)):
-            truth, known = data[i]
-            pairs.update([store.image(i)], [truth])
-            hidden = reconstruction_errors(store.image(i), truth, ~known)
+            (truth, known), filled = data[i], emptied(store.image(i))
+            pairs.update([filled], [truth])
+            hidden = reconstruction_errors(filled, truth, ~known)
             errors.append([pairs.errors[-1].range_mae, pairs.errors[-1].reflectance_mae,
                            hidden.range_mae, hidden.reflectance_mae])  # fmt: skip
             if setup.on_images:

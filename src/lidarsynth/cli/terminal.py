@@ -128,15 +128,10 @@ def load_with_bar(source: str, device: str) -> ScanModel:
 
 
 def check_device(device: str) -> None:
-    """Raises ValueError for what is no device of torch, or one that holds no numbers."""
-    import torch
+    """Raises ValueError for what is no device of torch, is not here, or holds no numbers."""
+    from lidarsynth.networks.device import check_device as check
 
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise ValueError(f"expected a device of torch, such as cpu or cuda, found {device!r}: {error}") from None
-    if kind == "meta":
-        raise ValueError(f"expected a device that computes, such as cpu or cuda, found {device!r}")
+    check(device)
 
 
 def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> None:

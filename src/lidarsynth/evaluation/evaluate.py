@@ -15,22 +15,28 @@ from typing import Literal, TypeAlias
 from lidarsynth.data.cache import sha256 as sha256_of_file
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
-from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, sensor_of, stem_of
+from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, sensor_of
+from lidarsynth.evaluation.notes import (
+    one_set,
+    tensors_taken,
+    unlike_metres,
+    unlike_pairs,
+    unlike_sensors,
+    unused_sensor,
+)
 from lidarsynth.evaluation.pairs import Pairs, classes_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
-from lidarsynth.lidar.recognition import recognise, same_kind
-from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
+from lidarsynth.networks.device import check_device
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
-METRES = 1.5  # no outdoor scan ends so near
-LOOKED_AT = 8  # scans of a set, from everywhere, whether all are of one sensor
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
 
@@ -54,13 +60,22 @@ def evaluate(
     seed       of the subsets of the squared MMDs
 
     Rows whose network is not there are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values
-    that are not finite, statistics of another protocol.
+    that are not finite, statistics of another protocol, a device that is not here.
     """
     start = time.monotonic()
+    _check_numbers({"batch_size": (batch_size, 1), "seed": (seed, 0)})
+    check_device(device)
     record = get_protocol(protocol) if isinstance(protocol, str) else protocol
     judge = _judge_pairs if record.pairs else _judge_sets
     report = judge(_Run(record, sensor, batch_size, device, on_images), _single(samples), _single(reference), seed)
     return replace(report, seconds=time.monotonic() - start)
+
+
+def _check_numbers(numbers: Mapping[str, tuple[int, int]]) -> None:
+    """Raises ValueError by name unless each (number, least) is that at least."""
+    for name, (number, least) in numbers.items():
+        if number < least:
+            raise ValueError(f"expected a {name} of at least {least}, found {number}")
 
 
 @dataclass(frozen=True)
@@ -89,6 +104,12 @@ class _Run:
     def sensor_of(self, images: ImageSet, fallback: Sensor) -> Sensor:
         """Of a set by its first image; lists of points are judged as the protocol's own sensor draws them."""
         return self.fallback() if self.protocol.clouds else sensor_of(images.item(0), fallback)
+
+    def notes(self, judged: ImageSet | None, truth: ImageSet | None, drawn: Sensor) -> tuple[str, ...]:
+        """What is unlike in the images that were read, or statistics stand for, and judged as those of `drawn`."""
+        sides = {"samples": judged, "the reference": truth}
+        told = unused_sensor(self.sensor, judged, drawn) + unlike_sensors(sides, drawn)
+        return told + tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides)
 
     def networks(self, sensor: Sensor) -> Loaded:
         return load_networks(self.protocol, sensor.width, self.device, self.on_images)
@@ -189,8 +210,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         real_files = [kept] if kept else []
     assert real
     report = report_of(fake, real, loaded.missing, seed, run.on_images)
-    warnings += _unlike_sensors({"samples": judged, "the reference": truth}, fake.sensor) + _one_set(judged, truth)
-    warnings += _unlike_metres({"samples": judged, "the reference": truth})
+    warnings += run.notes(judged, truth, fake.sensor) + one_set(judged, truth)
     if real_files:
         told["reference statistics"] = ", ".join(map(str, real_files))
         hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
@@ -212,55 +232,8 @@ def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> 
     pairs = run.pairs(judged, truth, sensor, loaded)
     report = pairs.report(loaded.missing, loaded.weights)
     sources = {"samples": judged.source, "reference": truth.source}
-    warnings = report.warnings + _unlike_sensors({"samples": judged, "the reference": truth}, sensor)
-    warnings += _unlike_pairs(judged.names, truth.names)
+    warnings = report.warnings + run.notes(judged, truth, sensor) + unlike_pairs(judged.names, truth.names)
     return replace(report, sources=sources, warnings=warnings, images=_size_of(sensor))
-
-
-def _unlike_pairs(names: Sequence[str], true_names: Sequence[str]) -> tuple[str, ...]:
-    """A warning where sample i does not have the name of reference i, endings left out."""
-    other = [(own, its) for own, its in zip(names, true_names, strict=True) if stem_of(own) != stem_of(its)]
-    if not other:
-        return ()
-    first = " with ".join(other[0])
-    return (f"{len(other)} of {len(names)} samples are compared with a reference of another name, first {first}",)
-
-
-def _unlike_sensors(sides: Mapping[str, ImageSet | None], drawn: Sensor) -> tuple[str, ...]:
-    """A warning where points, by some scans of each side, are of other sensors than the one whose images they are
-    drawn into, or than the other side's; of images their own beams tell."""
-    taken = {side: names for side, images in sides.items() if images and (names := _sensors_of(images))}
-    known = {name for names in taken.values() for name in names}
-    known |= {drawn.name} & SENSORS.keys()  # a user's own may be a unit of any of them
-    if not taken or all(same_kind(name, min(known)) for name in known):
-        return ()
-    told = " and ".join(f"{side} of {', '.join(names)}" for side, names in taken.items())
-    return (f"the points of {told} are drawn into images of {drawn.name}: other beams",)
-
-
-def _sensors_of(images: ImageSet) -> list[str]:
-    """The sensors of those that are points, of some from everywhere, as recognised."""
-    some = (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
-    return list(dict.fromkeys(name for scan in some if isinstance(scan, Scan) and (name := recognise(scan)[0])))
-
-
-def _unlike_metres(sides: Mapping[str, ImageSet | None]) -> tuple[str, ...]:
-    """A warning where the images of a side, by the first and the last, have ranges as they come out of a network."""
-    warnings = []
-    for side, images in sides.items():
-        some = [images.item(i) for i in {0, len(images) - 1}] if images else []
-        farthest = max((float(item.range.max(initial=0)) for item in some if isinstance(item, RangeImage)), default=0)
-        if 0 < farthest <= METRES:
-            warnings.append(f"ranges of {side} are {farthest:.2f} m at most: expected metres, not shares of a limit")
-    return tuple(warnings)
-
-
-def _one_set(judged: ImageSet | None, truth: ImageSet | None) -> tuple[str, ...]:
-    """A warning where both sides are the same images."""
-    one, other = ((images.stamp, images.names) if images else ("", ()) for images in (judged, truth))
-    if one != other or not one[0]:
-        return ()
-    return ("samples and reference are the same images: distances are 0, or as far as chance goes",)
 
 
 def _size_of(sensor: Sensor) -> str:
@@ -286,6 +259,8 @@ def gather_part(
     reference  what they will be judged against, if it is here: tells the sensor of points, as in `evaluate`
     Raises ValueError as `evaluate` does.
     """
+    _check_numbers({"batch_size": (batch_size, 1)})
+    check_device(device)
     record, out = get_protocol(protocol) if isinstance(protocol, str) else protocol, Path(out)
     samples = _single(samples)
     if out.suffix != ENDING or record.pairs:
@@ -300,6 +275,8 @@ def gather_part(
         raise ValueError(f"{record.title} takes as many of the reference as there are samples: expected it to be "
                          "gathered with them, found it alone")  # fmt: skip
     run, images = _Run(record, sensor, batch_size, device, on_images), image_set(samples)
+    if unused := unused_sensor(sensor, images, run.fallback()):
+        raise ValueError(f"expected the sensor of the images, or none, found another: {unused[0]}")
     spec = run.sensor_of(images, run.sensor_like(reference))
     role: Role = "real" if side == "reference" else "samples"
     statistics, _ = run.statistics(images, spec, role, run.networks(spec), part=part)
@@ -309,7 +286,7 @@ def gather_part(
 def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statistics, tuple[str, ...]]:
     """One set of statistics of several files, and a warning where parts are lacking.
 
-    Raises ValueError where two hold the same images.
+    Raises ValueError where two hold the same images, or may: parts of different divisions.
     """
     loaded = [load_statistics(file, protocol) for file in files]
     parts = [tuple(map(int, metadata.get("part", "1/1").split("/"))) for _, metadata in loaded]
@@ -318,8 +295,8 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
     for i, file in enumerate(files):
         if digests[i] in digests[:i] or (parts[i] in shared and parts[i] in parts[:i]):
             raise ValueError(f"{file}: expected a part of its own, found the images of another part")
-    if len({n for _, n in shared}) > 1:
-        raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in shared)}")
+    if len({n for _, n in parts}) > 1:  # a whole beside parts, too: the images of these may be in it
+        raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in parts)}")
     total, _ = loaded[0]
     for other, _ in loaded[1:]:
         total.merge(other)

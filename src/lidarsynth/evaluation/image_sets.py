@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.evaluation.protocol import Clouds
+from lidarsynth.evaluation.sample_tensors import check_points, from_tensor
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import MAX_BYTES
 from lidarsynth.files.formats import READERS, holds_image, read, read_image
@@ -49,12 +50,12 @@ class ImageSet:
         return len(self.names)
 
     def image(self, i: int, sensor: Sensor, projection: str, resize: bool = False) -> RangeImage:
-        """Image i in the sensor's size; points are projected, larger images thinned where `resize`.
+        """Image i in the sensor's size, its empty pixels 0; points are projected, larger images thinned where `resize`.
 
         Raises ValueError that begins with the image's name.
         """
         try:
-            return as_image(self.item(i), sensor, projection, resize)
+            return as_image(judged(self.item(i)), sensor, projection, resize)
         except ValueError as error:
             raise self._named(i, error) from None
 
@@ -65,7 +66,7 @@ class ImageSet:
         Raises ValueError that begins with the image's name, also for a scan without any point in range.
         """
         try:
-            xyz = points_of(self.item(i), sensor, clouds, real)
+            xyz = points_of(judged(self.item(i)), sensor, clouds, real)
         except ValueError as error:
             raise self._named(i, error) from None
         return Scan(xyz, np.zeros(len(xyz), np.float32))
@@ -169,6 +170,20 @@ def _read_tensor(path: Path) -> Tensor:
     return tensor
 
 
+def judged(item: Item) -> Item:
+    """What counts of a stored form: an empty pixel holds nothing. Raises ValueError for a tensor whose depth is not
+    that of its points."""
+    if isinstance(item, Tensor):
+        check_points(item)
+    return emptied(item) if isinstance(item, RangeImage) else item
+
+
+def emptied(image: RangeImage) -> RangeImage:
+    """The image with 0 in its empty pixels, whatever stood there."""
+    layers = [image.range, image.reflectance, *([] if image.xyz is None else [image.xyz])]
+    return image.keep(image.mask) if any(layer[~image.mask].any() for layer in layers) else image
+
+
 def as_image(item: Item, sensor: Sensor, projection: str, resize: bool = False) -> RangeImage:
     """Any stored form as a range image of the sensor's size. Raises ValueError for another size, NaN, other shapes."""
     size = (sensor.height, sensor.width)
@@ -202,24 +217,6 @@ def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> np.ndar
 
 def _divides(size: tuple[int, int], larger: tuple[int, int]) -> bool:
     return all(b % a == 0 for a, b in zip(size, larger, strict=True))
-
-
-def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
-    """A published sample as a range image of the sensor.
-
-    (5, H, W): depth, x, y, z in metres, reflectance, as the official R2DM program saves; (2, H, W): LiDARGen's range
-    code log2(r + 1) / 6 and reflectance, both in [0, 1]. Raises ValueError for another shape, NaN or infinity.
-    """
-    size = (sensor.height, sensor.width)
-    if tensor.ndim != 3 or tensor.shape[0] not in (2, 5) or tuple(tensor.shape[1:]) != size:
-        raise ValueError(f"expected a tensor (5, {size[0]}, {size[1]}) or (2, ...), found {tuple(tensor.shape)}")
-    values = tensor.detach().float().numpy()
-    if not np.isfinite(values).all():
-        raise ValueError(f"expected finite values, found {np.sum(~np.isfinite(values))} of NaN or infinity")
-    distance = values[0].clip(min=0) if len(values) == 5 else np.exp2(6 * values[0].clip(0, 1)) - 1
-    mask = distance > 0
-    xyz = np.moveaxis(values[1:4], 0, -1).copy() if len(values) == 5 else None
-    return RangeImage(distance, values[-1] * mask, mask, sensor, xyz=xyz)
 
 
 def sensor_of(first: Item, fallback: Sensor) -> Sensor:

@@ -29,7 +29,10 @@ class Result:
     reason: str = ""
 
     def __str__(self) -> str:
-        return "N/A" if self.value is None else f"{self.value:.{self.digits}f}{f' {self.unit}' if self.unit else ''}"
+        if self.value is None:
+            return "N/A"
+        shown = round(self.value, self.digits) + 0.0  # which has no sign where it is 0
+        return f"{shown:.{self.digits}f}{f' {self.unit}' if self.unit else ''}"
 
 
 def results_of(

@@ -35,7 +35,7 @@ def bev_histograms(
     edges = _edges(bins, extent).to(points)
     cell = torch.where(keep, _cell(x, edges) * bins + _cell(y, edges), bins**2)
     counts = [torch.bincount(scan, minlength=bins**2 + 1)[:-1] for scan in cell]
-    return torch.stack(counts).view(len(points), bins, bins).int()
+    return (torch.stack(counts) if counts else cell.new_zeros(0)).view(len(points), bins, bins).int()
 
 
 def _edges(bins: int, extent: float) -> Tensor:

@@ -120,7 +120,7 @@ def frechet_distance(a: Moments, b: Moments) -> float:
     root = _factor(*((first, a.count) if fewer else (second, b.count)))
     eigenvalues = torch.linalg.eigvalsh(root.T @ (second if fewer else first) @ root).clamp(min=0)
     distance = (a.mean - b.mean.to(a.mean)).square().sum() + first.trace() + second.trace()
-    return float(distance - 2 * eigenvalues.sqrt().sum())
+    return max(float(distance - 2 * eigenvalues.sqrt().sum()), 0.0)  # of equal ones rounding leaves either sign
 
 
 def _factor(covariance: Tensor, count: int) -> Tensor:
@@ -171,10 +171,10 @@ def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> f
 
     x (N, ...) and y (M, ...) are histograms of one shape, each divided by its sum here. `block` of them at a time
     become float32, so 10,000 histograms of 100x100 counts need little more memory than themselves. Zero, to 1e-8, for
-    equal sets. Raises ValueError for other shapes, or a histogram without counts.
+    equal sets. Raises ValueError for other shapes, negative counts, or a histogram without any.
     """
     first, second = _rows(x), _rows(y)
-    if not len(first) or not len(second) or first.shape[1] != second.shape[1]:
+    if not len(first) or not len(second) or tuple(x.shape[1:]) != tuple(y.shape[1:]):
         raise ValueError(f"expected two sets of histograms of one shape, found {tuple(x.shape)} and {tuple(y.shape)}")
     used = ((first != 0).any(0) | (second != 0).any(0).to(first.device)).nonzero()[:, 0]
     p, q = (_Blocks(rows, used, block) for rows in (first, second))
@@ -196,6 +196,8 @@ class _Blocks:
         self.total = rows.sum(1, keepdim=True, dtype=torch.float64)
         if not (self.total > 0).all() or not torch.isfinite(self.total).all():
             raise ValueError("expected counts in every histogram, found one without")
+        if (least := float(rows.amin())) < 0:
+            raise ValueError(f"expected counts of at least 0, found {least:g}")
 
     def __len__(self) -> int:
         return -(-len(self.rows) // self.block)
@@ -224,10 +226,10 @@ def jensen_shannon_distance(p: Array, q: Array) -> float:
     """Square root of the Jensen-Shannon divergence, natural logarithm: 0 for equal, sqrt(ln 2) for disjoint ones.
 
     p, q are counts of one shape, pooled over all scans; each is divided by its sum. Square the value for the divergence
-    (nats). Raises ValueError for other shapes, negative counts or none.
+    (nats). Raises ValueError for other shapes, negative or infinite counts, or none.
     """
     counts = [_rows(values[None]).double()[0].cpu() for values in (p, q)]
-    if p.shape != q.shape or any(not (c.sum() > 0) or c.min() < 0 for c in counts):
+    if p.shape != q.shape or any(not 0 < c.sum() < math.inf or c.min() < 0 for c in counts):
         found = [(tuple(v.shape), float(c.sum())) for v, c in zip((p, q), counts, strict=True)]
         raise ValueError(f"expected counts of one shape, found shapes and sums {found}")
     some = (counts[0] > 0) | (counts[1] > 0)  # most cells of a map are empty on both sides

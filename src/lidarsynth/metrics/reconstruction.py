@@ -110,13 +110,16 @@ def _harmonic(precision: float, recall: float) -> float:
 def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.ndarray:
     """(classes, classes) int64 pixels, truth by row, predicted by column; those of several scans simply add up.
 
-    Labels of one shape, 0 to classes - 1. Raises ValueError for other shapes or labels.
+    Labels of one shape, whole numbers 0 to classes - 1. Raises ValueError for other shapes or labels.
     """
     rows, columns = (v.cpu().numpy() if isinstance(v, Tensor) else np.asarray(v) for v in (truth, predicted))
-    both = np.concatenate([rows.ravel(), columns.ravel()]).astype(np.int64)
-    if rows.shape != columns.shape or not rows.size or both.min() < 0 or both.max() >= classes:
+    both = np.concatenate([rows.ravel(), columns.ravel()])
+    if rows.shape != columns.shape or not rows.size or not both.min() >= 0 or not both.max() < classes:
         raise ValueError(f"expected two images of one shape with labels 0-{classes - 1}, "
                          f"found {rows.shape} and {columns.shape}")  # fmt: skip
+    if both.dtype.kind == "f" and (both % 1).any():
+        raise ValueError(f"expected labels of whole numbers, found {both[both % 1 != 0][0]:g}")
+    both = both.astype(np.int64)
     pairs = both[: rows.size] * classes + both[rows.size :]
     return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
 

@@ -4,6 +4,7 @@
     out/checkpoints/step-00001000/             the same two files as of that step, and state.pt: everything of the run;
                                                checksums.json, the SHA-256 of each: a flipped byte is found
     out/checkpoints/latest                     link to the newest
+    out/start.json                             what the run began with: which images, from which weights
 
 Nothing of the random generators or of the data order has to be kept: both follow from the step (`training.randomness`).
 """

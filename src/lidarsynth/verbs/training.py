@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from lidarsynth.data.index import PLACE
 from lidarsynth.experiment.folder import read_experiment
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Card, Experiment, with_fields
@@ -20,12 +19,13 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import VARIED, VIRTUAL, Streets, TrainingImages, open_images
+from lidarsynth.training.examples import VARIED, VIRTUAL, TrainingImages, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
 from lidarsynth.training.monitor import Monitor
 from lidarsynth.training.options import Options
+from lidarsynth.verbs.training_start import Start, check_start, start_of, write_start
 from lidarsynth.weights.load import load_parts
 
 if TYPE_CHECKING:
@@ -81,19 +81,21 @@ def run(
 
     The first yield says where the run stands: at 0, or at the step of the newest checkpoint; that is continued exactly,
     or, with more `training.steps`, extended: behind the checkpoint the learning rate is that of the longer run.
-    weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet; where the
-                experiment has a base, from that
+    weights     start from these (a word, a folder or a file as in `load`), when there is no checkpoint yet; where there
+                is one it may be left out; where the experiment has a base, from that
     validation  cache of images that are not trained on
     resume      insist that there is a checkpoint
 
     SIGTERM or Ctrl-C saves after the present step and ends the iteration. Raises ValueError when experiment, images,
-    weights or folder do not fit; FloatingPointError, naming step, scans and last checkpoint, when it is not finite.
+    weights or folder do not fit, or the folder's run began with other images or weights; FloatingPointError, naming
+    step, scans and last checkpoint, when it is not finite.
     """
     options = options or Options()
     out, accelerator = Path(out), accelerator_of(options)
     images = open_images(data, experiment)
+    begun = start_of(images, data, weights)
     with only_writer(out, "training") if accelerator.is_main_process else nullcontext():
-        yield from _run(experiment, images, data, out, weights, validation, options, resume, accelerator)
+        yield from _run(experiment, images, data, out, begun, validation, options, resume, accelerator)
 
 
 def _run(
@@ -101,13 +103,13 @@ def _run(
     images: TrainingImages,
     data: str | Path,
     out: Path,
-    weights: str | None,
+    begun: Start,
     validation: str | Path | None,
     options: Options,
     resume: bool,
     accelerator: Accelerator,
 ) -> Iterator[Progress]:
-    experiment, state, note = _begin(experiment, images, out, weights, resume, accelerator)
+    experiment, state, note = _begin(experiment, images, out, begun, resume, accelerator)
     monitor = Monitor(experiment, state.task, data, validation)
     if accelerator.is_main_process:
         yield Progress(state.step, {}, 0.0, 0.0, note=note)
@@ -130,13 +132,13 @@ def _begin(
     experiment: Experiment,
     images: TrainingImages,
     out: Path,
-    weights: str | None,
+    begun: Start,
     resume: bool,
     accelerator: Accelerator,
 ) -> tuple[Experiment, Run, str]:
     """The experiment with its card, and the run: fresh, from weights, or as the newest whole checkpoint has it.
 
-    And a line that names newer checkpoints that are damaged.
+    And a line that names newer checkpoints that are damaged, or weights that are not used.
     """
     found, expected = images.sensor, build_sensor(experiment)
     if (found.height, found.width) != (expected.height, expected.width):
@@ -145,11 +147,11 @@ def _begin(
     with fixed_randomness(experiment.training.seed):
         network = build_network(experiment)
     sensor = "" if images.source["name"] in (VARIED, VIRTUAL) else images.sensor.name
-    card = replace(experiment.card, data=_learned_from(images), sensor=sensor)
+    card = replace(experiment.card, data=begun.images, sensor=sensor)
     saved, note = newest_whole(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
-    weights = weights or experiment.base
+    weights = begun.weights or experiment.base
     if weights and not saved:
         source, trained = load_parts(weights)
         transfer(network, experiment, trained, source, weights)
@@ -159,6 +161,7 @@ def _begin(
     state = start(experiment, network, task_of(experiment), accelerator.scaler)
     if saved:
         card = _same_experiment(saved, experiment).card
+        note = "; ".join(filter(None, (note, check_start(out, begun, card))))
         # The history's last line is this run's, written anew at each checkpoint.
         card = replace(card, history=card.history[:-1], licence=experiment.card.licence or card.licence)
         load_run(saved / STATE, state)
@@ -167,15 +170,10 @@ def _begin(
                              f"found {experiment.training.steps}")  # fmt: skip
     if accelerator.is_main_process:
         sweep(out)
+        if not saved:
+            write_start(out, begun)
     accelerator.wait_for_everyone()
     return replace(experiment, card=card), state, note
-
-
-def _learned_from(images: TrainingImages) -> str:
-    """What a card says of the images: how many of what, and not where they lie on this disk."""
-    count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
-    details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
-    return ", ".join([f"{count} images of {images.source['name']}", *details])
 
 
 def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:

@@ -1,0 +1,96 @@
+"""Notes on sets of images that are read to be judged: what makes their numbers mean something else; one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from torch import Tensor
+
+from lidarsynth.evaluation.image_sets import ImageSet, stem_of
+from lidarsynth.evaluation.sample_tensors import beams_off
+from lidarsynth.lidar.recognition import recognise, same_kind
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+
+METRES = 1.5  # no outdoor scan ends so near
+LOOKED_AT = 8  # scans of a set, from everywhere, whether all are of one sensor
+GRID = "R2DM's grid is hdl-64e"
+Sides = Mapping[str, ImageSet | None]  # what is judged, in words -> its images; None where statistics stand for them
+
+
+def unlike_pairs(names: Sequence[str], true_names: Sequence[str]) -> tuple[str, ...]:
+    """A note where sample i does not have the name of reference i, endings left out."""
+    other = [(own, its) for own, its in zip(names, true_names, strict=True) if stem_of(own) != stem_of(its)]
+    if not other:
+        return ()
+    first = " with ".join(other[0])
+    return (f"{len(other)} of {len(names)} samples are compared with a reference of another name, first {first}",)
+
+
+def unlike_sensors(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
+    """A note where points, by some scans of each side, are of other sensors than the one whose images they are drawn
+    into, or than the other side's; of images their own beams tell."""
+    taken = {side: names for side, images in sides.items() if images and (names := _sensors_of(images))}
+    known = {name for names in taken.values() for name in names}
+    known |= {drawn.name} & SENSORS.keys()  # a user's own may be a unit of any of them
+    if not taken or all(same_kind(name, min(known)) for name in known):
+        return ()
+    told = " and ".join(f"{side} of {', '.join(names)}" for side, names in taken.items())
+    return (f"the points of {told} are drawn into images of {drawn.name}: other beams",)
+
+
+def _sensors_of(images: ImageSet) -> list[str]:
+    """The sensors of those that are points, of some from everywhere, as recognised."""
+    some = (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
+    return list(dict.fromkeys(name for scan in some if isinstance(scan, Scan) and (name := recognise(scan)[0])))
+
+
+def tensors_taken(sides: Sides, rays: Sensor, named: str | None) -> tuple[str, ...]:
+    """Notes where a side, by its first, is of tensors whose rows are other beams than the sensor's they are taken for;
+    or, unless a sensor was named for them, which rays those have that hold no points."""
+    told = []
+    for side, images in sides.items():
+        first = images.item(0) if images else None
+        if not isinstance(first, Tensor):
+            continue
+        if len(first) == 5 and (off := beams_off(first, rays)):
+            told.append(f"the points of {side}, which are tensors, lie {off:.1f} degrees off the beams of {rays.name}, "
+                        f"for whose rows they are taken: --sensor names theirs ({GRID})")  # fmt: skip
+        if len(first) == 2 and named is None:
+            told.append(f"{side} are tensors without points, taken for the rays of {rays.name}: --sensor names others "
+                        f"({GRID})")  # fmt: skip
+    return tuple(told)
+
+
+def unused_sensor(named: str | None, images: ImageSet | None, own: Sensor) -> tuple[str, ...]:
+    """A note where a sensor was named, and the samples are images, or statistics, that know another of their own.
+
+    own  of the samples, where they are statistics
+    """
+    first = images.item(0) if images else None
+    if named is None or (images and not isinstance(first, RangeImage)):
+        return ()
+    own, given = first.sensor if isinstance(first, RangeImage) else own, get_sensor(named)
+    fits = given.height % own.height == 0
+    if fits and given.resized(own.height, own.width).elevations == own.elevations:
+        return ()
+    return (f"the samples know their own sensor, {own.name}: {named}, named for points and tensors, is not used",)
+
+
+def unlike_metres(sides: Sides) -> tuple[str, ...]:
+    """A note where the images of a side, by the first and the last, have ranges as they come out of a network."""
+    notes = []
+    for side, images in sides.items():
+        some = [images.item(i) for i in {0, len(images) - 1}] if images else []
+        farthest = max((float(item.range.max(initial=0)) for item in some if isinstance(item, RangeImage)), default=0)
+        if 0 < farthest <= METRES:
+            notes.append(f"ranges of {side} are {farthest:.2f} m at most: expected metres, not shares of a limit")
+    return tuple(notes)
+
+
+def one_set(judged: ImageSet | None, truth: ImageSet | None) -> tuple[str, ...]:
+    """A note where both sides are the same images."""
+    one, other = ((images.stamp, images.names) if images else ("", ()) for images in (judged, truth))
+    if one != other or not one[0]:
+        return ()
+    return ("samples and reference are the same images: distances are 0, or as far as chance goes",)

@@ -1,0 +1,81 @@
+"""Published samples as tensors, R2DM's (5, H, W) and LiDARGen's (2, H, W): into range images, or why they are none."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import Sensor
+
+OVERSHOOT = 0.05  # what comes out of a network may pass its limits by so much, and is clipped; other codes by far more
+NEAR, SHARE = 0.05, 0.02  # metres, and share of the depth: how far it may be from |x, y, z|
+FEW = 0.01  # share of the pixels in which it may be farther
+ENOUGH = 5  # points of a row whose elevation is told
+
+
+def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
+    """A published sample as a range image of the sensor.
+
+    (5, H, W): depth, x, y, z in metres, reflectance, as the official R2DM program saves; (2, H, W): LiDARGen's range
+    code log2(r + 1) / 6, clipped to 63 m, and reflectance, both in [0, 1]. Raises ValueError for another shape, NaN,
+    infinity, or values that are not so coded: outside their limits, or a code beyond the sensor's farthest range.
+    """
+    size = (sensor.height, sensor.width)
+    if tensor.ndim != 3 or tensor.shape[0] not in (2, 5) or tuple(tensor.shape[1:]) != size:
+        raise ValueError(f"expected a tensor (5, {size[0]}, {size[1]}) or (2, ...), found {tuple(tensor.shape)}")
+    values = tensor.detach().float().numpy()
+    if not np.isfinite(values).all():
+        raise ValueError(f"expected finite values, found {np.sum(~np.isfinite(values))} of NaN or infinity")
+    reflectance = _within("a reflectance", values[-1], 1)
+    if len(values) == 5:
+        distance = _within("a depth in metres", values[0], np.inf)
+    else:
+        farthest = max(1.0, float(np.log2(sensor.max_range + 1) / 6))
+        distance = np.exp2(6 * _within("a range code log2(r + 1) / 6", values[0], farthest).clip(0, 1)) - 1
+    mask = distance > 0
+    xyz = np.moveaxis(values[1:4], 0, -1).copy() if len(values) == 5 else None
+    return RangeImage(distance, reflectance * mask, mask, sensor, xyz=xyz)
+
+
+def _within(what: str, values: np.ndarray, high: float) -> np.ndarray:
+    """The values, clipped to 0 to `high`. Raises ValueError where some are farther off than OVERSHOOT."""
+    least, greatest = float(values.min()), float(values.max())
+    if least < -OVERSHOOT or greatest > high + OVERSHOOT:
+        limits = "at least 0" if high == np.inf else f"0 to {high:.4g}"
+        raise ValueError(f"expected {what} of {limits}, found {least:.4g} to {greatest:.4g}: another code or scale")
+    return values.clip(0, high)
+
+
+def check_points(tensor: Tensor) -> None:
+    """Raises ValueError for a (5, H, W) tensor whose depth is not the distance of its points; other shapes pass."""
+    if tensor.ndim != 3 or tensor.shape[0] != 5:
+        return
+    depth, *xyz = tensor.detach().double().numpy()[:4]
+    distance = np.sqrt(sum(axis**2 for axis in xyz))
+    there = distance > 0
+    off = there & (np.abs(distance - depth) > NEAR + SHARE * np.maximum(distance, depth))
+    if off.sum() > FEW * there.sum():
+        row, column = np.argwhere(off)[off.sum() // 2]
+        raise ValueError(
+            f"expected a depth of |x, y, z| in metres, found another in {off.sum() / there.sum():.0%} of the pixels: "
+            f"{depth[row, column]:.4g} at row {row}, column {column} for a point {distance[row, column]:.4g} m away"
+        )
+
+
+def beams_off(tensor: Tensor, sensor: Sensor) -> float:
+    """Degrees from the rows of a (5, H, W) tensor to the sensor's beams, the median of the rows; 0 within half of the
+    beams' spacing, or where no row has points. A row of a grid of edges is as high as the spacing."""
+    x, y, z = tensor.detach().double().numpy()[1:4]
+    if tensor.shape[1] != sensor.height or sensor.height < 2:
+        return 0.0
+    flat, heights = np.hypot(x, y), sensor.offsets or (0.0,) * sensor.height
+    spacing, off = float(np.median(-np.diff(sensor.elevations))), []
+    for row, (beam, height) in enumerate(zip(sensor.elevations, heights, strict=True)):
+        there = flat[row] > 0
+        if there.sum() >= ENOUGH:
+            seen = float(np.median(np.degrees(np.arctan2(z[row, there] - height, flat[row, there]))))
+            lower = beam - spacing if sensor.edges else beam
+            off.append(max(seen - beam, lower - seen, 0.0))
+    found = float(np.median(off)) if off else 0.0
+    return found if found > spacing / 2 else 0.0

@@ -1,0 +1,81 @@
+"""What a training run began with, kept beside its checkpoints: it goes on with the same images and weights only."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from lidarsynth.data.index import PLACE, read_index
+from lidarsynth.experiment.record import Card
+from lidarsynth.lidar.small_file import read_json
+from lidarsynth.lidar.whole_file import write_whole
+from lidarsynth.training.examples import Streets, TrainingImages, folders_of
+
+START = "start.json"
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a run is begun with.
+
+    images       how many of what, in words: what a card says of them, and not where they lie on this disk
+    fingerprint  of the images of caches, 16 hex digits, wherever the folders lie; "" of streets
+    weights      as they were asked for, or None
+    """
+
+    images: str
+    fingerprint: str = ""
+    weights: str | None = None
+
+
+def start_of(images: TrainingImages, data: str | Path, weights: str | None) -> Start:
+    """Of open images, and the words of them and of the weights. Raises ValueError where `data` is no cache."""
+    count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
+    details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
+    words = ", ".join([f"{count} images of {images.source['name']}", *details])
+    return Start(words, "" if isinstance(images, Streets) else _fingerprint(data), weights)
+
+
+def _fingerprint(data: str | Path) -> str:
+    """From the checksums that the indexes of the caches hold, in their order."""
+    shards = [sorted(read_index(folder)["shards"].items()) for folder in folders_of(data)]
+    content = [[(entry["count"], entry.get("sha256")) for _, entry in of if entry["count"]] for of in shards]
+    return sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def write_start(out: Path, start: Start) -> None:
+    """Keep what a run begins with. Raises OSError."""
+    write_whole(out / START, json.dumps(asdict(start), indent=1) + "\n")
+
+
+def check_start(out: Path, start: Start, card: Card) -> str:
+    """A note on what is not used where a run goes on, or "". Raises ValueError for other images or weights.
+
+    card  of the run's checkpoint: of a run from before there was this file it tells how many images of what there were
+    """
+    if not (out / START).exists():
+        return _check_card(out, start, card)
+    try:
+        found = Start(**read_json(out / START))
+    except TypeError:  # made by other hands
+        raise ValueError(f"{out / START}: expected what a run began with, found another table") from None
+    if (found.images, found.fingerprint) != (start.images, start.fingerprint):
+        was, given = ((f"{s.images} ({s.fingerprint})" if s.fingerprint else s.images) for s in (found, start))
+        raise ValueError(_other(out, was, given))
+    if start.weights not in (None, found.weights):
+        raise ValueError(f"{out}: expected its own run, begun from {found.weights or 'no weights'}, found --from "
+                         f"{start.weights}; leave it away, or another folder begins a new run")  # fmt: skip
+    return ""
+
+
+def _check_card(out: Path, start: Start, card: Card) -> str:
+    was, given = (words.partition(", ")[0] for words in (card.data.rpartition("; ")[2], start.images))
+    if was and was != given:
+        raise ValueError(_other(out, was, given))
+    return f"--from {start.weights} is not used: the run in {out} goes on" if start.weights else ""
+
+
+def _other(out: Path, was: str, given: str) -> str:
+    return f"{out}: expected its own run, which learns from {was}, found {given}; another folder begins a new run"
