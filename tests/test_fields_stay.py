@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 import lidarsynth as ls
-from lidarsynth.files.fields import FileError, written_names
+from lidarsynth.files.fields import PLACE, FileError, written_names
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.unseen import caution, widest_gap
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.verbs.inputs import message_fields
 
 
 @pytest.fixture(scope="module")
@@ -106,3 +108,38 @@ def test_centimetres_are_no_metres(tmp_path: Path):
     np.save(tmp_path / "cm.npy", np.concatenate([xyz, np.zeros((500, 1), np.float32)], 1))
     with pytest.raises(FileError, match="are they centimetres"):
         read(tmp_path / "cm.npy")
+
+
+def test_new_points_of_a_message_have_the_ring_of_the_nearest_beam():
+    """Rows 0, 4 and 8 of a denser image are the message's rings 2, 1 and 0."""
+    given = {"x": np.float32([9, 9, 9]), "y": np.zeros(3, np.float32), "z": np.float32([1, 0, -1]),
+             "ring": np.uint8([2, 1, 0])}  # fmt: skip
+    xyz = np.stack([given[axis] for axis in "xyz"], 1)
+    extra = {PLACE: np.array([1, 2, 3, 0, 0, 0]), "new": np.array([0, 1, 0, 1, 1, 1], np.uint8)}
+    filled = Scan(np.concatenate([xyz, xyz + 1]), ring=np.array([0, 4, 8, 1, 5, 7]), extra=extra)
+    fields = message_fields(filled, given)
+    np.testing.assert_array_equal(fields["ring"], [2, 1, 0, 2, 1, 0])
+    np.testing.assert_array_equal(fields["new"], filled.extra["new"])  # one had been filled in before
+    np.testing.assert_array_equal(fields["x"][:3], given["x"])
+
+
+@pytest.mark.parametrize(("turn", "wide"), [(np.arange(0, 360, 2), 1), (np.arange(-50, 51), 259), (np.array([7]), 359)])
+def test_the_widest_gap_of_a_turn(turn: np.ndarray, wide: int):
+    angle = np.radians(turn + 0.5)
+    xyz = np.stack([9 * np.cos(angle), 9 * np.sin(angle), 0 * angle], 1).astype(np.float32)
+    assert widest_gap(xyz) == wide
+    assert (caution(Scan(xyz)) is None) == (wide < 45)
+
+
+def test_bad_arrays_are_told_by_the_library():
+    model = ls.load("nearest").into("vlp-16")
+    xyz = np.random.default_rng(0).normal(0, 10, (200, 3)).astype(np.float32)
+    with pytest.raises(ValueError, match="reflectance of 0 to 1, found 0 to 255"):
+        model.complete(Scan(xyz, np.linspace(0, 255, 200, dtype=np.float32)))
+    xyz[3] = np.nan
+    with pytest.raises(ValueError, match="finite points"):
+        model.complete(Scan(xyz))
+    with pytest.raises(ValueError, match="ring must be an array, got a list"):
+        Scan(xyz, ring=[0] * 200)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"whole number of at least 2 times as many beams, found 2\.5"):
+        ls.get_sensor("vlp-16").denser(2.5)  # type: ignore[arg-type]

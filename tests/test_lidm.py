@@ -335,7 +335,7 @@ def test_the_chamfer_distance_of_pairs_is_half_of_both_squared_means():
 def test_scans_without_points_in_range_are_named(tmp_path: Path, published: Path):
     real = folder_of_scans(tmp_path / "real", 2, 0)
     far = folder_of_scans(tmp_path / "far", 1, 0)
-    np.full((10, 4), 300, np.float32).tofile(far / "000009.bin")
+    np.full((10, 4), 200, np.float32).tofile(far / "000009.bin")
     with pytest.raises(ValueError, match=r"000009.bin: expected points between 1 and 56 m, found none of 10"):
         evaluate.evaluate(far, real, "lidm-2024")
 

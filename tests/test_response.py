@@ -14,6 +14,7 @@ from lidarsynth.networks.rays import padded, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.response import (
     AS_STREETS,
+    MEASURED,
     SHARES,
     USUAL,
     Response,
@@ -89,22 +90,25 @@ def test_the_share_of_the_mean_is_what_suits_the_scan(street: RangeImage, offset
     """Told by a network that answers the truth, or something else, beside a mean that is 0.1 too bright."""
     size, told = padded(street.sensor), np.ones(street.shape, bool)
     response = Response(1.0, 1.000001)
-    ahead = slice((size[1] - 128) // 2, (size[1] + 128) // 2)
-    truth = torch.zeros(1, 1, size[0], 128)
-    truth[0, 0, : street.shape[0]] = torch.from_numpy(street.reflectance[:, ahead])
-    answer = SimpleNamespace(reflectance=truth + offset, plain=truth + 0.1)
+    full = torch.zeros(size)
+    full[: street.shape[0]] = torch.from_numpy(street.reflectance[:, np.arange(size[1]) % street.shape[1]])
 
     class Fill(torch.nn.Linear):
         def forward(self, known, rays, noise):
-            assert not known.told[0, 0, 1::2][: street.shape[0] // 2 - 2].all()
-            return answer
+            assert not known.told[:, 0, 1::2][:, : street.shape[0] // 2 - 2].all()
+            assert known.told.shape == (8, 1, size[0], 64)
+            first = (np.arange(8) * size[1] // 8 + (size[1] - 64) // 2) % size[1]
+            truth = torch.stack([full[:, (at + np.arange(64)) % size[1]] for at in first])[:, None]
+            return SimpleNamespace(reflectance=truth + offset, plain=truth + 0.1)
 
     rays = rays_of(street.sensor, street.sensor.blocked_rays())
     fill, shades = Fill(1, 1), response.even(street.reflectance)
     found = tried(response, fill, street, told, shades, rays)  # type: ignore[arg-type]
-    assert found.plain == (USUAL + share) / 2
+    assert found.plain == share
     assert share in SHARES
-    assert tried(AS_STREETS, fill, street, told, shades, rays) == Response(plain=USUAL)  # type: ignore[arg-type]
+    kitti = replace(street.sensor, dimness=(0.01,) * street.shape[0])
+    measured = tried(AS_STREETS, fill, replace(street, sensor=kitti), told, shades, rays)  # type: ignore[arg-type]
+    assert measured == Response(plain=MEASURED)
     assert tried(AS_STREETS, fill, street, told, shades, rays, tuned=True) == AS_STREETS  # type: ignore[arg-type]
     few = told & (np.arange(len(told)) < 3)[:, None]
     assert tried(response, fill, street, few, shades, rays).plain == USUAL  # type: ignore[arg-type]

@@ -61,7 +61,7 @@ class Many:
     shard: Annotated[str | None, arg(metavar="I/N", help="only every N-th scan, from the I-th: one of N machines.")] = (
         None
     )
-    all_pictures: Annotated[bool, arg(help=f"pictures also of more than {PICTURES} scans.")] = False
+    all_pictures: Annotated[bool, arg(help=f"pictures of captures, too, and of more than {PICTURES} scans.")] = False
 
 
 def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:

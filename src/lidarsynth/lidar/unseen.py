@@ -23,7 +23,7 @@ def caution(scan: Scan) -> str | None:
 def widest_gap(xyz: np.ndarray) -> int:
     """Whole degrees of the widest arc of the turn, seen from above, in which no point (N, 3) stands; 360 of none."""
     seen = np.zeros(360, bool)
-    seen[np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])).astype(int) % 360] = True
+    seen[np.floor(np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))).astype(int) % 360] = True
     if not seen.any():
         return 360
     at = np.flatnonzero(seen)

@@ -182,7 +182,9 @@ class CascadeModel(ScanModel):
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
             rays, fill = own.response.told(rays_told(self.sensor)), self.network.surest
-            own = replace(own, response=tried(own.response, fill, image, known, reflectance, rays, self.tuned))
+            with torch.autocast(self._device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+                response = tried(own.response, fill, image, known, reflectance, rays, self.tuned)
+            own = replace(own, response=response)
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), image, known, keep_reflectance=lit)

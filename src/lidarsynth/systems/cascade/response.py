@@ -25,10 +25,10 @@ GAMMAS = (0.4, 2.5)
 LEAST, NARROWEST = 0.002, 0.05  # reflectance; natural logarithm between the quartiles
 ENOUGH = 50  # returns
 SECTORS, FEW = 12, 12  # of a turn, in which beams are compared; returns of both beams in one
-SHARES, PART = (0.0, 0.25, 0.5, 0.75, 1.0), 128  # of the mean of what is known around; columns in which it is tried
-# What is tried tells little: half of it, and half of what is best on average; all of that where nothing can be tried,
-# or beams are measured: less errs by 1 % less there, but classes are read worse (docs/training-default.md).
-USUAL = 0.4
+SHARES = tuple(k / 10 for k in range(11))  # of the mean of what is known around
+PARTS, WIDTH, SEAM = 8, 64, 16  # parts of the turn in which they are tried, columns of each, and of its ends not judged
+# Shares where nothing can be tried, and of a sensor whose beams are measured (docs/training-default.md).
+USUAL, MEASURED = 0.4, 0.1
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 
 
@@ -104,36 +104,56 @@ def tried(
     rays: Rays,
     tuned: bool = False,
 ) -> Response:
-    """The response with a share of the mean: half of the way from the usual one to that which suits the scan. Every
-    second known beam of a part of the turn, ahead, is hidden and filled, and the share taken that errs least.
+    """The response with the share of the mean that suits the scan: every second known beam of some parts of the turn is
+    hidden and filled, and the share taken that errs least.
 
-    told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. Of a sensor whose
-    beams are measured, and where fewer than four beams return enough, the usual one; where no reflectance is known, and
-    for a fill that was `tuned` to scans of the sensor, none.
+    told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. `MEASURED` of a sensor
+    whose beams are measured, `USUAL` where fewer than four beams return enough; where no reflectance is known, and for
+    a fill that was `tuned` to scans of the sensor, none.
     """
     returned = told & image.mask
     if tuned or not image.reflectance[returned].any():
         return response
-    rows = np.flatnonzero(returned.sum(1) >= ENOUGH)
+    rows, size = np.flatnonzero(returned.sum(1) >= ENOUGH), padded(image.sensor)
     hidden = np.zeros_like(told)
     hidden[rows[1::2]] = True
-    size, width = padded(image.sensor), min(PART, padded(image.sensor)[1])
-    ahead = slice((size[1] - width) // 2, (size[1] + width) // 2)
-    judged, truth = (returned & hidden)[:, ahead], image.reflectance[:, ahead]
-    if response == AS_STREETS or len(rows) < 4 or judged.sum() < ENOUGH:
-        return response._replace(plain=USUAL)
+    columns = _columns(size[1])
+    inside = slice(SEAM, -SEAM if columns.shape[1] > 2 * SEAM else None)
+    of_image = columns[:, inside] % told.shape[1]
+    judged, truth = (part[:, of_image].transpose(1, 0, 2) for part in (returned & hidden, image.reflectance))
+    if hdl64e.dimness(image.sensor) or len(rows) < 4 or judged.sum() < ENOUGH:
+        return response._replace(plain=usual(image.sensor))
     known = known_of(image.range[None], reflectance[None], (told & ~hidden)[None], True, size)
     device = next(fill.parameters()).device
-    known = Known(*(part[..., ahead].contiguous().to(device) for part in known))
-    rays = Rays(*((part if part.shape[3] == 1 else part[..., ahead].contiguous()).to(device) for part in rays))
+    known = Known(*(_cut(part, columns).to(device) for part in known))
+    rays = Rays(*(_cut(part, columns).to(device) for part in rays))
     with torch.inference_mode():
-        filled = fill(known, rays, known.metres.new_zeros(1, NOISES, size[0], width))
+        filled = fill(known, rays, known.metres.new_zeros(len(columns), NOISES, size[0], columns.shape[1]))
 
     def error(share: float) -> float:
-        mixed = response._replace(plain=share).mixed(filled)[0, 0, : truth.shape[0], : truth.shape[1]]
-        return float(np.abs(response.reported(mixed.clamp(0, 1).cpu().numpy()) - truth)[judged].mean())
+        mixed = response._replace(plain=share).mixed(filled)[:, 0, : truth.shape[1], inside].clamp(0, 1)
+        return float(np.abs(response.reported(mixed.float().cpu().numpy()[judged]) - truth[judged]).mean())
 
-    return response._replace(plain=(USUAL + min(SHARES, key=error)) / 2)
+    return response._replace(plain=min(SHARES, key=error))
+
+
+def usual(sensor: Sensor) -> float:
+    """The share of the mean that is taken untried."""
+    return MEASURED if hdl64e.dimness(sensor) else USUAL
+
+
+def _columns(turn: int) -> np.ndarray:
+    """(PARTS, WIDTH) columns of parts of a turn, one of them ahead; fewer where the turn is too short."""
+    count, width = max(1, min(PARTS, turn // WIDTH)), min(WIDTH, turn)
+    first = np.arange(count) * turn // count + (turn - width) // 2
+    return (first[:, None] + np.arange(width)) % turn
+
+
+def _cut(part: torch.Tensor, columns: np.ndarray) -> torch.Tensor:
+    """(P, 1, H, C) columns (P, C) of a turn (1, 1, H, W), or of what is alike in all columns, (1, 1, H, 1)."""
+    if part.shape[3] == 1:
+        return part.expand(len(columns), *part.shape[1:])
+    return part[0, 0][:, torch.from_numpy(columns)].transpose(0, 1)[:, None].contiguous()
 
 
 def dimness_of(reflectance: np.ndarray, metres: np.ndarray, returned: np.ndarray) -> np.ndarray:
