@@ -59,7 +59,7 @@ def rngs() -> list[torch.Generator]:
 
 @pytest.fixture(scope="module")
 def drawn(network: BetweenBeams, known: Grid) -> Grid:
-    return draw_beams(network, known, rays(0), rays(1), rngs(), sharp=0.5, heats=(1.0, 1.0, 1.0))
+    return draw_beams(network, known, rays(0), rays(1), rngs(), sharp=0.5, heats=(1.0, 1.0))
 
 
 def test_every_column_is_drawn_once_after_those_it_is_told_of():

@@ -131,7 +131,7 @@ def test_a_drawn_scan_is_rough_where_greenery_is_seen_in_it(monkeypatch: pytest.
     seen = []
     for word in ("road", "vegetation"):
 
-        def all_of(network, images, *_, of=CLASS_NUMBER[word]):
+        def all_of(network, images, *_, of=CLASS_NUMBER[word], **__):
             return [replace(image, label=np.where(image.mask, of, 0)) for image in images]
 
         monkeypatch.setattr("lidarsynth.systems.cascade.model.named", all_of)

@@ -180,3 +180,14 @@ def test_of_classes_that_look_alike_the_common_one_is_named():
     (image,) = named(network, [kerb(WIDE)], AS_STREETS, WIDE)
     assert image.label is not None and (image.label[image.mask] == int(np.argmax(THOUSAND))).all()
     assert (weights() * np.array(THOUSAND)).sum() == pytest.approx(1000)
+
+
+def test_what_gets_more_is_named_more_often():
+    torch.manual_seed(3)
+    network, images = ClassUNet(8).eval(), [kerb(WIDE)]
+    green = 15
+    plain, more = (named(network, images, AS_STREETS, WIDE, more=told)[0].label for told in (None, {"vegetation": 9.0}))
+    assert plain is not None and more is not None
+    assert (more == green).sum() > (plain == green).sum()
+    kept = more != green
+    np.testing.assert_array_equal(more[kept], plain[kept])

@@ -18,9 +18,9 @@ from lidarsynth.networks.rays import encode_range
 
 AROUND, STRIDES = 2, (0, 4, 2, 1)  # known columns to either side; those drawn before, of each phase
 HYPOTHESES, SHADES = 11, 5  # of range, of reflectance
-# Of draws, as in `column_transformer.draw`; the heat of whether rays return, and of reflectance on flat ground, whose
-# range code is so near: chosen by street-2 (docs/training-default.md).
-SHARP, HEAT, LOST, CALM, FLAT = 0.3, 0.85, 0.4, 0.3, 0.02
+# Of draws, as in `column_transformer.draw`; the heat of whether rays return: chosen by street-2
+# (docs/training-default.md).
+SHARP, HEAT, LOST = 0.3, 0.85, 0.4
 FEATURES = 3 * (4 * (2 * AROUND + 1) + 6) + RAY_CHANNELS + 3 * HYPOTHESES + len(STRIDES)
 
 
@@ -91,11 +91,11 @@ def draw_beams(
     between: Tensor,
     rng: Sequence[torch.Generator],
     sharp: float = SHARP,
-    heats: tuple[float, float, float] = (HEAT, LOST, CALM),
+    heats: tuple[float, float] = (HEAT, LOST),
 ) -> Grid:
     """The beams between those of grids (B, R, C) and their rays (B, 8, R - 1, C), each by a generator of its own.
 
-    heats  of range, of whether rays return, and of reflectance on flat ground
+    heats  of range, and of whether rays return
     """
     shape = (len(rays), between.shape[2], rays.shape[-1])
     chance = torch.stack([torch.rand(5, *shape[1:], generator=one) for one in rng])
@@ -106,9 +106,7 @@ def draw_beams(
         told, u, ray = told_of(known, rays, hidden, between, columns), chance[:, :, columns], between[..., columns]
         drawn = network.pixel(told.features, around[:, :, columns], told.ranges, told.valid)
         code = one_of((drawn.choice, drawn.centre, drawn.scale), u[..., 1:3], sharp, heats[0], CODES)
-        of_shade = network.shades(drawn, code, told.ranges, told.shades, told.lit)
-        calm, free = (one_of(of_shade, u[..., 3:5], share, share, TONES) for share in (heats[2], 1.0))
-        shade = torch.where((code - told.ranges[..., 0]).abs() < FLAT, calm, free)
+        shade = one_of(network.shades(drawn, code, told.ranges, told.shades, told.lit), u[..., 3:5], 1.0, 1.0, TONES)
         back = (u[..., 0] < (drawn.returns / heats[1]).sigmoid()) & (ray[:, 6] < 0.5)
         for part, new in zip(hidden, (code * back, shade * back, back), strict=True):
             part[..., columns] = new

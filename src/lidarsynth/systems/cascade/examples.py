@@ -17,10 +17,12 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_beams import with_between
 from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS, grid_columns, grid_rays, grid_rows
+from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
 from lidarsynth.systems.cascade.lessons import AS_FAR, FARTHEST, HEIGHT, WIDTH, Lessons, lessons, to_height
+from lidarsynth.systems.cascade.surfaces import evened
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
 from lidarsynth.training.task import Images
@@ -317,8 +319,9 @@ def grid(image: RangeImage, rng: np.random.Generator, count: int = COLUMNS) -> t
 def taller(image: RangeImage, rng: np.random.Generator, fine: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`grid` of 31 beams, of which every second one is half-way between two others, and 160 of 512 columns in a row.
 
-    The beams of the grid and those between, or `fine`, of those and what is between them again. A sensor that has no 31
-    such beams or 512 columns gives a grid of blocked rays, which teaches nothing.
+    The beams of the grid and those between, or `fine`, of those and what is between them again. Reflectances are
+    evened, since speckle is not drawn. A sensor that has no 31 such beams or 512 columns gives a grid of blocked rays,
+    which teaches nothing.
     """
     (height, width), first = image.shape, rng.random()
     rows = grid_rows(height, first) if height >= ROWS else np.zeros(ROWS, int)
@@ -333,8 +336,10 @@ def taller(image: RangeImage, rng: np.random.Generator, fine: bool) -> tuple[Ten
     columns = grid_columns(width, rng.random(), 4 * COLUMNS)[(turn + np.arange(WIDE)) % (4 * COLUMNS)]
     each = [grid_rays(image.sensor, hidden(image.sensor), rows[k::2], columns) for k in (0, 1)]
     order = np.argsort(np.r_[0:TALL:2, 1:TALL:2])  # their places in one after the other
-    rays, standing = (torch.cat(pair, -2)[..., order, :] for pair in zip(*each, strict=True))
-    return _grid(image, rows, columns, (rays, standing), rng)
+    told = torch.cat([each[0][0], each[1][0]], -2)[..., order, :], torch.cat([each[0][1], each[1][1]], -2)[order]
+    metres, reflectance, rays, standing = _grid(image, rows, columns, told, rng)
+    calm = evened(known_grid(metres[None], reflectance[None]), rays[None])[0]
+    return metres, calm, rays, standing
 
 
 def _grid(

@@ -12,7 +12,7 @@ from lidarsynth.networks.rays import COLUMNS, Rays, decode_range, padded, rays_o
 from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.cascade.confidence import confidence
 from lidarsynth.systems.cascade.model import CascadeModel
-from lidarsynth.systems.cascade.response import AS_STREETS, usual
+from lidarsynth.systems.cascade.response import AS_STREETS, USUAL
 from lidarsynth.systems.cascade.speckle import calmed
 from lidarsynth.systems.graph import Graph
 
@@ -59,7 +59,7 @@ class FillGraph(nn.Module):
         metres = decode_range(filled.code)[:, :, : sensor.height, : range.shape[3]]
         answers = filled.logit[:, :, : sensor.height, : range.shape[3]] > 0
         answers = answers & (metres <= sensor.max_range) & (metres >= sensor.min_range) & ~self._buffer("closed")
-        shade = AS_STREETS._replace(plain=0.0 if self.model.tuned else usual(sensor)).mixed(filled)
+        shade = AS_STREETS._replace(plain=0.0 if self.model.tuned else USUAL).mixed(filled)
         shade = shade[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
         answers = returned | (answers & ~told)
         full = torch.where(answers, torch.where(returned, range, metres), 0.0)

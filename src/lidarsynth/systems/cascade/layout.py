@@ -167,7 +167,12 @@ def _taller(
     rays_of: RaysOf,
     rng: list[torch.Generator],
 ) -> tuple[Grid, np.ndarray]:
-    """The grid with the beams between its own, twice over, as far as the sensor has one between each two."""
+    """The grid with the beams between its own, twice over, as far as the sensor has one between each two.
+
+    They are drawn without speckle, which the grid's own have lost before: it would go on for what a surface looks like.
+    """
+    if network.beams is not None:
+        grid = grid._replace(shade=evened(grid, rays_of(rows, columns)[0]) * grid.returned)
     while network.beams is not None and len(columns) == FINEST and len(rows) < TALLEST and np.diff(rows).min() > 1:
         told, rows = rays_of(rows, columns)[0], with_between(rows)
         grid = interleaved(grid, draw_beams(network.beams, grid, told, rays_of(rows[1::2], columns)[0], rng))

@@ -44,7 +44,7 @@ from lidarsynth.systems.cascade.images import (
 )
 from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times
-from lidarsynth.systems.cascade.naming import class_of_points, named
+from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
@@ -282,7 +282,8 @@ class CascadeModel(ScanModel):
         recorded = textured(drawn, shades, rng)
         if self.network.classes is None:
             return self._named(recorded)
-        seen = named(self.network.classes, recorded, self.response, self.sensor, self.precision)
+        told = self.network.classes, recorded, self.response, self.sensor, self.precision
+        seen = named(*told, more=GROWING if len(rows) > ROWS else None)  # without speckle between its beams
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         return self._named(recorded)
 
