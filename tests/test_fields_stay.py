@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import lidarsynth as ls
+from lidarsynth.cli.many import _named
 from lidarsynth.files.fields import PLACE, FileError, written_names
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.unseen import caution, widest_gap
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.verbs.batch import Result
 from lidarsynth.verbs.inputs import message_fields
 
 
@@ -143,3 +145,13 @@ def test_bad_arrays_are_told_by_the_library():
         Scan(xyz, ring=[0] * 200)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"whole number of at least 2 times as many beams, found 2\.5"):
         ls.get_sensor("vlp-16").denser(2.5)  # type: ignore[arg-type]
+
+
+def test_a_failure_names_its_file_and_which_message_of_it():
+    def told(source: str, name: str, error: str) -> str:
+        return _named(Result(name, Path(source), None, 0.0, error))
+
+    assert told("a.bag", "a/000002", "expected points, found none") == "a.bag: 000002: expected points, found none"
+    assert told("a.bag", "a/000002", "a.bag: a/000002: expected points") == "a.bag: a/000002: expected points"
+    assert told("d/b.pcd.bin", "b", "expected points") == "d/b.pcd.bin: expected points"
+    assert told("d/b.bin", "b", "d/b.bin: expected points") == "d/b.bin: expected points"

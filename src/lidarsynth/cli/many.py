@@ -238,9 +238,10 @@ def _summary(results: list[Result], skipped: int, seconds: float, where: Path) -
 
 
 def _named(result: Result) -> str:
-    """A failure with the file that it is of."""
-    text = str(result.error)
-    return text if str(result.source) in text else f"{result.source}: {text}"
+    """A failure with the file that it is of, and which message or turn of one that holds many."""
+    text, name = str(result.error).removeprefix(f"{result.source}: "), Path(result.name).name
+    one_of_many = not result.source.name.startswith(name) and name not in text
+    return text if str(result.source) in text else f"{result.source}: {f'{name}: ' if one_of_many else ''}{text}"
 
 
 def _refuse_all(failed: list[Result]) -> NoReturn:
