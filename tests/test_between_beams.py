@@ -1,6 +1,7 @@
 """What draws the beams between those of a grid: told what is known and drawn before, it draws what it says."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from lidarsynth.networks.between_beams import STRIDES, BetweenBeams, draw_beams,
 from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS, CoarseUNet, grid_columns, grid_rays, grid_rows
-from lidarsynth.networks.column_neighbours import Grid
+from lidarsynth.networks.column_neighbours import Grid, known_grid
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
 from lidarsynth.networks.pixel_mixture import CODES, TONES, picked
@@ -200,3 +201,32 @@ def test_taller_grids_of_training_have_each_beam_with_its_own_rays():
     image = RangeImage(metres[:16], np.full((16, 1024), 0.5), np.ones((16, 1024), bool), few)
     found, _, told, _ = taller(image, np.random.default_rng(2), True)
     assert not found.any() and (told[6] == 1).all()
+
+
+def test_taller_grids_of_training_have_no_speckle():
+    sensor = Sensor("any", tuple(np.linspace(6, -24, 64).tolist()), 1024, 0.5, 120.0, mount=1.8)
+    speckled = 0.4 + np.random.default_rng(0).normal(0, 0.02, (64, 1024))
+    image = RangeImage(np.full((64, 1024), 9.0), speckled, np.ones((64, 1024), bool), sensor)
+    shade = taller(image, np.random.default_rng(2), True)[1].numpy()
+    assert shade.std() < 0.5 * speckled.std()
+    assert abs(shade.mean() - 0.4) < 0.005
+
+
+def test_beams_are_told_a_grid_without_speckle(monkeypatch: pytest.MonkeyPatch):
+    """What the network that draws between the beams gets of a wall of one reflectance and its speckle."""
+    told = []
+
+    def noted(_, grid: Grid, *__) -> Grid:
+        told.append(grid.shade)
+        return Grid(*(part[:, :-1] for part in grid))
+
+    monkeypatch.setattr(layout, "draw_beams", noted)
+    speckle = torch.randn(1, 16, 512, generator=torch.Generator().manual_seed(1))
+    grid = known_grid(torch.full((1, 16, 512), 9.0), 0.4 + 0.02 * speckle)
+    rows, columns = np.arange(0, 64, 4), np.arange(0, 1024, 2)
+
+    def rays_of(rows: np.ndarray, columns: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.zeros(1, 8, len(rows), len(columns)), torch.zeros(1, len(rows), len(columns))
+
+    layout._taller(SimpleNamespace(beams=object()), grid, rows, columns, rays_of, [])  # type: ignore[arg-type]
+    assert told[0].std() < 0.5 * grid.shade.std()

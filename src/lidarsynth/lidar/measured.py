@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarsynth.lidar.projection import Pixels
+from lidarsynth.lidar.recognition import elevations_of
 from lidarsynth.lidar.scan import RangeImage, Scan
 
 
@@ -31,7 +32,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
         label = np.where(row >= 0, filled.label[row, column], 0)
     assert new.ring is not None
     xyz = np.concatenate([scan.xyz, new.xyz])
-    ends = np.where(_elevation(scan.xyz) > np.mean(filled.sensor.elevations), 0, filled.sensor.height - 1)
+    ends = np.where(elevations_of(scan.xyz) > np.mean(filled.sensor.elevations), 0, filled.sensor.height - 1)
     own = np.where(row < 0, ends, row)
     ring, place = (np.concatenate([part, new.ring]) for part in (own, np.where(row < 0, filled.sensor.height, row)))
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
@@ -65,11 +66,6 @@ def _kept(scan: Scan, row: np.ndarray) -> dict[str, np.ndarray]:
     """The further fields of a scan, and its rings where they are not the rows and no field has them as they were."""
     said = scan.ring is not None and not {"ring", "file_ring"} & set(scan.extra) and (scan.ring != row).any()
     return {**scan.extra, **({"ring": scan.ring} if said else {})}  # type: ignore[dict-item]
-
-
-def _elevation(xyz: np.ndarray) -> np.ndarray:
-    """(N,) degrees above the horizon."""
-    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
 
 
 def _time_towards(xyz: np.ndarray, scan: Scan) -> np.ndarray:

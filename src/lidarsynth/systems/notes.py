@@ -28,13 +28,10 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
     """
     scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
     if isinstance(scan, Scan):
-        text = stranger(model, scan, sensor)
-        for note in (
-            text and f'{model.experiment.name} {text}; use load("default")',
-            caution(scan) if filling else None,
-        ):
-            if note is not None:
-                warnings.warn(note, stacklevel=3)
+        if (text := stranger(model, scan, sensor)) is not None:
+            warnings.warn(f'{model.experiment.name} {text}; use load("default")', stacklevel=3)
+        if filling and (text := caution(scan)) is not None:
+            warnings.warn(text, stacklevel=3)
     return scan
 
 

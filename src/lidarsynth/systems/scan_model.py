@@ -165,9 +165,8 @@ class ScanModel(ABC):
         Raises ValueError when the sensor is not recognised or sees nothing that the model does, and for `times` as many
         beams of a model that cannot make them.
         """
-        scan = (
-            noted(self, scan, sensor_in, filling=True) if self.any_sensor else scan
-        )  # others are made to take another's
+        if self.any_sensor:  # others are made to take another's
+            scan = noted(self, scan, sensor_in, filling=True)
         how = Filling(method, steps, resamples, sampler, seed, precision)
         return self.upsampled(scan, how, sensor_in, on_step, times)
 

@@ -351,8 +351,8 @@ def message_fields(filled: Scan, given: Fields) -> Fields:
         fields[name][new] = (filled.reflectance[new] * scale).astype(fields[name].dtype)
     if (name := find(given, "ring")) is not None and filled.ring is not None:
         rows, first = np.unique(filled.ring[old], return_index=True)
-        place = np.searchsorted((rows[1:] + rows[:-1]) / 2, filled.ring[new])
-        fields[name][new] = fields[name][old][first][place]
+        nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, filled.ring[new])
+        fields[name][new] = fields[name][old][first][nearest]
     if (name := find(given, "time")) is not None:
         azimuth = np.arctan2(filled.xyz[:, 1], filled.xyz[:, 0])
         order = np.flatnonzero(old)[np.argsort(azimuth[old])]
