@@ -14,7 +14,14 @@ from lidarsynth.networks.class_unet import MULTIPLE, RAYS, ClassUNet, around_the
 from lidarsynth.streets.varied import VariedStreets
 from lidarsynth.systems.cascade.examples import CascadeBatch
 from lidarsynth.systems.cascade.lessons import HEIGHT, WIDTH, Lessons, Pixels, _filled_in, lesson, lessons
-from lidarsynth.systems.cascade.naming import THOUSAND, NamingObjective, _on_true_beams, named, weights
+from lidarsynth.systems.cascade.naming import (
+    THOUSAND,
+    NamingObjective,
+    _on_true_beams,
+    named,
+    of_surfaces,
+    weights,
+)
 from lidarsynth.systems.cascade.response import AS_STREETS
 from lidarsynth.systems.cascade.scores import SEAM, lovasz
 
@@ -191,3 +198,19 @@ def test_what_gets_more_is_named_more_often():
     assert (more == green).sum() > (plain == green).sum()
     kept = more != green
     np.testing.assert_array_equal(more[kept], plain[kept])
+
+
+def test_pixels_of_a_surface_are_named_together_and_edges_stay():
+    metres = torch.full((8, 32), 10.0)
+    metres[:, 16:] = 12.0  # a step, and behind it another class
+    metres[4, 5] = 0
+    chances = torch.zeros(3, 8, 32)
+    chances[0, :, :16], chances[1, :, 16:] = 1.0, 1.0
+    chances[:, 2, 8] = torch.tensor([0.4, 0.0, 0.6])  # one pixel of a wall that is taken for a pole
+    chances[:, 4, 5] = torch.tensor([0.0, 0.0, 1.0])  # and one that did not return
+    mean = of_surfaces(chances, metres)
+    assert_close(mean.sum(0), torch.ones(8, 32))
+    assert int(mean[:, 2, 8].argmax()) == 0
+    assert (mean[0, :, 14:16] > 0.9).all() and (mean[1, :, 16:18] == 1).all()
+    assert mean[0, 0, 0] == 1 and mean[1, 0, 31] == 1  # around the turn, but no nearer to each other
+    assert_close(mean[:, 4, 5], chances[:, 4, 5])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidarsynth.files.labels import CLASS_OF_RAW
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
 from lidarsynth.streets.areas import TODAY, Density
@@ -13,7 +14,7 @@ from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.layout import build
-from lidarsynth.streets.objects import library
+from lidarsynth.streets.objects import USUAL, library
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.recordings import RecordedStreets
 from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
@@ -25,7 +26,7 @@ from lidarsynth.streets.weather import (
     rain_extinction,
     strongest_drop,
 )
-from lidarsynth.streets.world import World, visible
+from lidarsynth.streets.world import TRAFFIC, World, visible
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
@@ -317,6 +318,50 @@ def test_heavy_vehicles_walls_barriers_panels_and_garages_come_beside_what_is_th
     for one in np.flatnonzero(heavy):  # a trailer is 5 m long; a lorry and a car's halves are 12 m
         gap = np.linalg.norm(actors.place[vehicles, :2] - actors.place[one, :2], axis=1)
         assert np.sort(gap)[1] > 5.9
+
+
+def test_riders_walkers_and_racks_come_beside_what_is_there_and_ride_into_nobody():
+    more = Density(riders=6, walkers=6, racks=2)
+    plain, full = (world(0, density) for density in (TODAY, more))
+    before, after = ({corners.tobytes() for corners in of.corners} for of in (plain, full))
+    assert before <= after and len(after) > len(before) + 1000
+    kinds = [[str(kind) for kind in actors_of(of).kind] for of in (plain, full)]
+    for kind, least in (("person", 8), ("bicyclist", 2), ("motorcyclist", 2), ("bicycle", 4)):
+        assert kinds[1].count(kind) >= kinds[0].count(kind) + least
+        shapes = full.things["variant"][full.things["kind"] == kind]
+        assert (shapes >= USUAL[kind]).any() and set(plain.things["kind"]) <= set(full.things["kind"])
+    road, actors = full.ground.roads[0], actors_of(full)
+    rides = np.isin(actors.kind, ["bicyclist", "motorcyclist"]) & (actors.pace == TRAFFIC)
+    along, aside = road.coordinates(actors.place[:, 0], actors.place[:, 1])
+    assert rides.sum() > 5 and (np.abs(aside[rides]) < road.half).all()
+    facing = np.cos(actors.yaw[rides] - road.at(along[rides], aside[rides])[2])
+    assert (np.sign(facing) == -np.sign(aside[rides])).all()  # with the traffic of their side
+    on_road = np.isin(actors.kind, ["car", "van", "truck", "bus"])
+    for one in np.flatnonzero(rides):
+        near = (np.abs(along[on_road] - along[one]) < 3) & (np.abs(aside[on_road] - aside[one]) < 1)
+        assert not near.any()
+    where, beside = road.coordinates(full.poses[:, 0], full.poses[:, 1])
+    near = np.abs(where[:, None] - along[rides]) + 3 * np.abs(beside[:, None] - aside[rides])
+    assert near.min() > 5
+
+
+def test_riders_of_drives_follow_the_traffic():
+    drive = draw_drive(2, 0, 2.0, Density(riders=5, traffic=0.5))
+    moment = drive.moment(1.0)
+    rides = moment.present & np.isin(drive.actors.kind, ["bicyclist", "motorcyclist"]) & (drive.number == 0)
+    speed = np.linalg.norm(moment.velocity[rides], axis=1)
+    assert rides.sum() > 4 and speed.max() > 3
+
+
+def test_shapes_of_people_and_two_wheelers_stand_on_the_ground_as_large_as_they_are():
+    sizes = {"person": (0.9, 2.1), "bicyclist": (1.0, 2.2), "motorcyclist": (1.3, 2.3), "bicycle": (0.8, 1.6),
+             "motorcycle": (0.9, 1.8)}  # fmt: skip
+    for kind, (low, high) in sizes.items():
+        assert len(library()[kind]) > USUAL[kind]
+        for shape in library()[kind]:
+            bottom, top = shape.corners[..., 2].min(), shape.corners[..., 2].max()
+            assert abs(bottom) < 0.08 and low < top < high, (kind, bottom, top)
+            assert set(shape.label) == {CLASS_NUMBER[kind]}
 
 
 def test_lorries_and_trailers_have_boxes_and_their_own_classes():

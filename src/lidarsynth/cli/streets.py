@@ -44,6 +44,9 @@ def streets(
     barriers: Annotated[float, arg(help="crash barriers, likewise.")] = 0.0,
     panels: Annotated[float, arg(help="larger than signs, likewise.")] = 0.0,
     garages: Annotated[float, arg(help="rows of them, likewise.")] = 0.0,
+    riders: Annotated[float, arg(help="of bicycles and motorcycles, on the main road, likewise.")] = 0.0,
+    walkers: Annotated[float, arg(help="people of more shapes on sidewalks, likewise.")] = 0.0,
+    racks: Annotated[float, arg(help="of parked bicycles, likewise.")] = 0.0,
     kerbs: Annotated[float, arg(help="their height: 1 = 12 cm, 0.5 = half of it.")] = 1.0,
     rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
     fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
@@ -59,7 +62,8 @@ def streets(
     from lidarsynth.streets.weather import Weather
 
     more = {"groups": groups, "motorcycles": motorcycles, "works": works, "cyclists": cyclists, "heavy": heavy,
-            "walls": walls, "barriers": barriers, "panels": panels, "garages": garages}  # fmt: skip
+            "walls": walls, "barriers": barriers, "panels": panels, "garages": garages,
+            "riders": riders, "walkers": walkers, "racks": racks}  # fmt: skip
     density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)

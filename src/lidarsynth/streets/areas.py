@@ -43,7 +43,7 @@ class Area:
     kerb_bushes: float = 0.6  # per 100 m and side
     on_road: float = 1.5  # pedestrians on the main road
     woods: float = 1.0  # size of those that close a view
-    groups: float = 0.0  # of people who stand together, per 100 m and side; these nine only where asked for
+    groups: float = 0.0  # of people who stand together, per 100 m and side; these twelve only where asked for
     motorcycles: float = 0.0
     works: float = 0.0
     cyclists: float = 0.0
@@ -52,6 +52,9 @@ class Area:
     barriers: float = 0.0
     panels: float = 0.0
     garages: float = 0.0
+    riders: float = 0.0
+    walkers: float = 0.0
+    racks: float = 0.0
     kerb: float = KERB  # m, from carriageway to sidewalk
     car_parks: bool = True  # and parked bicycles; False leaves them out, and all else where it is
 
@@ -104,7 +107,8 @@ class Density:
 
     More, per 100 m and side: groups of people, parked motorcycles, road works, cyclists beside the road; heavy vehicles
     that stand (lorries, coaches, trailers); walls and fences of more kinds; crash barriers; panels larger than signs;
-    garages.
+    garages; on the main road riders, of bicycles and motorcycles; people on sidewalks, racks of bicycles, and these
+    riders, of more shapes than every street has.
 
     Raises ValueError for a factor outside 0 to 100.
     """
@@ -123,6 +127,9 @@ class Density:
     barriers: float = 0.0
     panels: float = 0.0
     garages: float = 0.0
+    riders: float = 0.0
+    walkers: float = 0.0
+    racks: float = 0.0
 
     def __post_init__(self):
         for name, factor in vars(self).items():
@@ -143,7 +150,8 @@ class Density:
         return replace(area, **new, **green, car_parks=self.parking > 0)
 
 
-MORE = ("groups", "motorcycles", "works", "cyclists", "heavy", "walls", "barriers", "panels", "garages")
+MORE = ("groups", "motorcycles", "works", "cyclists", "heavy", "walls", "barriers", "panels", "garages",
+        "riders", "walkers", "racks")  # fmt: skip
 
 
 def _scaled(bounds: Range, factor: float) -> Range:

@@ -14,7 +14,7 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.streets.areas import Area
 from lidarsynth.streets.ground import Ground, ground_mesh, slab_mesh
 from lidarsynth.streets.materials import NUMBER
-from lidarsynth.streets.objects import library
+from lidarsynth.streets.objects import USUAL, library
 from lidarsynth.streets.world import FRONT, GROUND, REACH, SLAB, STILL, THING, THINGS, World
 
 ROW = ("x", "y", "z", "yaw", "length", "width", "height", "tint", "pace")  # metres, radians, scales; of one thing
@@ -64,10 +64,12 @@ class WorldBuilder:
         clear: float | None = 0.3,
         size: tuple[float, float] = (0.9, 1.1),
         pace: int = STILL,
+        all_shapes: bool = False,
     ) -> None:
-        """Things of one kind at (N,) places, variants drawn at random; dropped within `clear` m of a carriageway."""
-        rows = np.empty((len(x), len(ROW)))
-        variant = self.rng.integers(0, len(library()[kind]), len(x))
+        """Things of one kind at (N,) places, variants drawn at random, of `all_shapes` or the usual ones; dropped
+        within `clear` m of a carriageway."""
+        rows, shapes = np.empty((len(x), len(ROW))), len(library()[kind])
+        variant = self.rng.integers(0, shapes if all_shapes else USUAL.get(kind, shapes), len(x))
         rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = x, y, up, yaw
         rows[:, 4:7] = self.rng.uniform(*size, (len(x), 3))
         rows[:, 7], rows[:, 8] = np.minimum(np.maximum(self.rng.normal(size=len(x)), -1.5), 2.2), pace

@@ -46,7 +46,7 @@ def fill(builder: WorldBuilder, places: Array, lane: Array | None = None) -> Non
             if number == 0:
                 parked(builder, road, side, places if lane is None else lane)
                 moving(builder, road, side, places)
-    more(builder)
+    more(builder, places)
     for road in builder.ground.roads:
         for side in (-1, 1):
             garages(builder, road, side)

@@ -1,5 +1,5 @@
 """What a street has more of when it is asked for: people in groups, parked motorcycles, road works, cyclists, heavy
-vehicles, fences and walls, crash barriers, panels.
+vehicles, fences and walls, crash barriers, panels, riders, people and bicycles of more shapes.
 
 All of it is drawn after everything else, so that the rest of a world is the same with and without.
 """
@@ -10,15 +10,19 @@ import numpy as np
 
 from lidarsynth.streets.builder import WorldBuilder
 from lidarsynth.streets.ground import Road
-from lidarsynth.streets.world import WALK
+from lidarsynth.streets.world import TRAFFIC, WALK
 
 FENCES = ("board fence", "board fence", "mesh fence", "railed wall", "high wall", "overgrown fence")
 VEHICLES = ("car", "van", "truck", "bus", "lorry", "coach", "trailer")
+ON_ROAD = (*VEHICLES, "bicyclist", "motorcyclist")
 ROOM = {"lorry": 10.5, "coach": 10.0, "trailer": 6.0}  # metres from one's middle to that of any other vehicle
 
 
-def more(builder: WorldBuilder) -> None:
-    """Draws what the area asks for, per 100 m and side; an area that asks for nothing draws nothing."""
+def more(builder: WorldBuilder, places: np.ndarray) -> None:
+    """Draws what the area asks for, per 100 m and side; an area that asks for nothing draws nothing.
+
+    places (P, 2): (s, d) of the poses on the main road, where nobody rides
+    """
     for road in builder.ground.roads:
         for side in (-1, 1):
             for per_100, put in ((builder.area.groups, _group), (builder.area.motorcycles, _motorcycles),
@@ -29,6 +33,59 @@ def more(builder: WorldBuilder) -> None:
                     count = int(builder.rng.poisson(per_100 * (road.stop - road.start) / 100))
                     for s in builder.rng.uniform(road.start, road.stop, count):
                         put(builder, road, side, float(s))
+    for number, road in enumerate(builder.ground.roads):
+        for side in (-1, 1):
+            if number == 0:
+                _riders(builder, road, side, places)
+            _walkers(builder, road, side)
+            _racks(builder, road, side)
+
+
+def _drawn(builder: WorldBuilder, road: Road, per_100: float) -> np.ndarray:
+    """(N,) metres along the road."""
+    if per_100 <= 0:
+        return np.zeros(0)
+    return builder.rng.uniform(road.start, road.stop, builder.rng.poisson(per_100 * (road.stop - road.start) / 100))
+
+
+def _riders(builder: WorldBuilder, road: Road, side: int, places: np.ndarray) -> None:
+    """On the main road, with the traffic of their side, cyclists nearer to its edge; where no vehicle is."""
+    rng, edge = builder.rng, road.half - road.parking[0 if side < 0 else 1]
+    for s in _drawn(builder, road, builder.area.riders):
+        kind = str(rng.choice(["bicyclist", "motorcyclist"]))
+        out = edge - rng.uniform(0.5, 1.2) if kind == "bicyclist" else edge * rng.uniform(0.35, 0.7)
+        at, turn = np.array([s]), (np.pi if side > 0 else 0.0) + rng.normal(0, 0.04)
+        x, y, along = road.at(at, np.array([side * out]))
+        near = [group.rows[:, :2] for group in builder.groups if group.kind in ON_ROAD]
+        near.append(np.stack([x, y], 1) + 1e3)
+        gap = np.abs(road.coordinates(*np.concatenate(near).T) - np.array([[s], [side * out]]))
+        free = not ((gap[0] < 5.0) & (gap[1] < 1.9)).any()
+        free &= not ((np.abs(places[:, 0] - s) < 6.0) & (np.abs(places[:, 1] - side * out) < 2.3)).any()
+        if free and all(np.hypot(x[0] - other.x, y[0] - other.y) > 7 for other in builder.ground.roads[1:]):
+            builder.put(kind, x, y, along + turn, clear=None, size=(0.95, 1.06), pace=TRAFFIC, all_shapes=True)
+
+
+def _walkers(builder: WorldBuilder, road: Road, side: int) -> None:
+    """On the sidewalk, most of them along it."""
+    s, rng = _drawn(builder, road, builder.area.walkers), builder.rng
+    if len(s):
+        out = road.half + rng.uniform(0.3, max(road.walk, 1.5), len(s))
+        x, y, along = road.at(s, side * out)
+        yaw = along + np.where(rng.random(len(s)) < 0.5, 0, np.pi) + rng.normal(0, 0.5, len(s))
+        up = builder.ground.kerb if road.walk > 0 else 0.0
+        builder.put("person", x, y, yaw, up=up, clear=0.0, pace=WALK, all_shapes=True)
+
+
+def _racks(builder: WorldBuilder, road: Road, side: int) -> None:
+    """One to six that lean against what stands behind the sidewalk, or stand across it in a rack."""
+    rng = builder.rng
+    for s in _drawn(builder, road, builder.area.racks):
+        rack, count = rng.random() < 0.5, int(rng.integers(1, 7))
+        place = s + (0.6 if rack else 1.9) * np.arange(count)
+        x, y, along = road.at(place, np.full(count, side * (road.half + max(road.walk, 1.5) - 0.4)))
+        yaw = along + (np.pi / 2 if rack else 0.0) + rng.normal(0, 0.08, count)
+        up = builder.ground.kerb if road.walk > 0 else 0.0
+        builder.put("bicycle", x, y, yaw, up=up, clear=0.0, all_shapes=True)
 
 
 def _group(builder: WorldBuilder, road: Road, side: int, s: float) -> None:

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lidarsynth.streets import shapes, wayside, works
+from lidarsynth.streets import people, shapes, wayside, works
 from lidarsynth.streets.shapes import Mesh, box, extrusion, frustum, join, leaves, moved, wheel
 
 
@@ -266,9 +266,33 @@ def _vehicles() -> dict[str, list[Mesh]]:
     }
 
 
+# How many variants of these every street draws from; those behind them come where more of all shapes is asked for.
+USUAL = {"person": 8, "bicyclist": 3, "motorcyclist": 2, "bicycle": 1, "motorcycle": 1}
+
+
 @lru_cache(maxsize=1)
 def library() -> dict[str, list[Mesh]]:
     """Every kind of thing -> its variants. The same on every call and machine."""
+    kinds = _kinds()
+    for kind, others in _of_more_shapes(kinds).items():
+        assert len(kinds[kind]) == USUAL[kind]
+        kinds[kind] += others
+    return kinds
+
+
+def _of_more_shapes(kinds: dict[str, list[Mesh]]) -> dict[str, list[Mesh]]:
+    """More variants of people and two-wheelers, none of which moves those that were there."""
+    rng = np.random.default_rng(2026)
+    walking = [person(rng) for _ in range(12)]
+    return {
+        "person": people.walkers(rng, walking),
+        "bicyclist": people.cyclists(rng, two_wheeler("bicyclist", False)),
+        "motorcyclist": people.motorcyclists(rng, two_wheeler("motorcyclist", True)),
+        **{kind: people.two_wheelers(rng, kinds[kind][0], kind) for kind in ("bicycle", "motorcycle")},
+    }
+
+
+def _kinds() -> dict[str, list[Mesh]]:
     rng = np.random.default_rng(2024)
     two = {"bicycle": False, "motorcycle": True}
     return _vehicles() | {

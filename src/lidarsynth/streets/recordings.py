@@ -77,8 +77,9 @@ def draw_recording(rng: np.random.Generator) -> VirtualSensor:
 
 def draw_density(rng: np.random.Generator) -> Density:
     """More green, people, riders and works than usual, and kerbs of 2 to 14 cm; since 2026-11-25 also heavy vehicles,
-    fences of more kinds, crash barriers, panels and garages, in the same worlds."""
-    later = rng.spawn(1)[0]
+    fences of more kinds, crash barriers, panels and garages, and riders, people and bicycles of more shapes, in the
+    same worlds."""
+    later, last = rng.spawn(1)[0], rng.spawn(1)[0]
     return Density(
         traffic=float(rng.choice([1, 1.5, 2])),
         pedestrians=float(rng.choice([1, 2, 4])),
@@ -92,4 +93,8 @@ def draw_density(rng: np.random.Generator) -> Density:
         barriers=float(later.choice([0, 0, 0.5, 1.5])),
         panels=float(later.choice([0, 0.7, 2])),
         garages=float(later.choice([0, 0, 1])),
+        cyclists=float(last.choice([0, 0, 1])),
+        riders=float(last.choice([0, 1, 3])),
+        walkers=float(last.choice([0, 2, 5])),
+        racks=float(last.choice([0, 0.7, 1.5])),
     )

@@ -283,7 +283,7 @@ class CascadeModel(ScanModel):
         if self.network.classes is None:
             return self._named(recorded)
         told = self.network.classes, recorded, self.response, self.sensor, self.precision
-        seen = named(*told, more=GROWING if len(rows) > ROWS else None)  # without speckle between its beams
+        seen = named(*told, more=GROWING if len(rows) > ROWS else None, alone=True)  # without speckle between its beams
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         return self._named(recorded)
 

@@ -33,6 +33,9 @@ FAIR = 0.5
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
 # is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": 0.45, "terrain": 0.6}
+# Rows and columns on either side whose chances count as much as a pixel's own, where they are as far to this share of
+# the range: single pixels are of no class of their own (docs/training-default.md).
+BESIDE, AS_FAR = (1, 2), 0.02
 
 
 def weights() -> np.ndarray:
@@ -72,27 +75,54 @@ def named(
     precision: str = "fp32",
     least: float = 0.0,
     more: Mapping[str, float] | None = None,
+    alone: bool = False,
 ) -> list[RangeImage]:
     """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
     there is none, or where the network is less sure of it than `least`.
 
-    more  is added to the logits of these classes
+    more   is added to the logits of these classes
+    alone  each pixel by itself, instead of with those beside it on its surface
     """
     off = FAIR * np.log(weights())
     for word, logit in (more or {}).items():
         off[CLASS_NUMBER[word]] -= logit
     rays = response.told(rays_told(sensor))
     with torch.autocast(next(network.parameters()).device.type, torch.bfloat16, enabled=precision == "bf16"):
-        labels = [_classes(network, image, response.even(image.reflectance), rays, off, least) for image in images]
-    return [replace(image, label=label * image.mask) for image, label in zip(images, labels, strict=True)]
+        each = [_logits(network, image, response.even(image.reflectance), rays) for image in images]
+    taken = torch.from_numpy(off)[1:, None, None].float()  # 0 is no answer
+    answers = [_likeliest(logits - taken, image, least, alone) for logits, image in zip(each, images, strict=True)]
+    return [replace(image, label=label * image.mask) for image, label in zip(images, answers, strict=True)]
 
 
-def _classes(
-    network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays, off: np.ndarray, least: float = 0.0
-) -> np.ndarray:
-    """(H, W) of every ray, of reflectances (H, W) as the streets' sensor would report them, by logits less `off` (20,);
-    0 where all are less likely than `least`. One image at a time: four at once take a quarter longer, and longer sums
-    may round otherwise.
+def _likeliest(logits: Tensor, image: RangeImage, least: float, alone: bool) -> np.ndarray:
+    """(H, W) classes by logits (19, H, W) of those from 1 on; 0 where all are less likely than `least`."""
+    chances = logits if alone else of_surfaces(logits.softmax(0), torch.from_numpy(image.range * image.mask))
+    label = chances.argmax(0) + 1
+    if least > 0:
+        label = label * ((logits.softmax(0) if alone else chances).amax(0) >= least)
+    return label.numpy()
+
+
+def of_surfaces(chances: Tensor, metres: Tensor) -> Tensor:
+    """(C, H, W): of each pixel the mean of its chances (C, H, W) and of those beside it around the turn that returned
+    from as far; metres (H, W), 0 for no return, whose pixels keep their own."""
+    (up, across), height = BESIDE, len(metres)
+    total, count = chances.clone(), torch.ones_like(metres)
+    for down in range(-up, up + 1):
+        here, there = slice(max(down, 0), height + min(down, 0)), slice(max(-down, 0), height + min(-down, 0))
+        for right in range(-across, across + 1):
+            if not (down or right):
+                continue
+            near = metres[there].roll(right, 1)
+            alike = (near > 0) & ((near - metres[here]).abs() < AS_FAR * metres[here])
+            total[:, here].addcmul_(chances[:, there].roll(right, 2), alike.float())
+            count[here] += alike
+    return total / count
+
+
+def _logits(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays) -> Tensor:
+    """(19, H, W) of every ray and the classes from 1 on, told reflectances (H, W) as the streets' sensor would report
+    them. One image at a time: four at once take a quarter longer, and longer sums may round otherwise.
     """
     device, size = next(network.parameters()).device, (rays.elevation.shape[2], rays.elevation.shape[3])
     known = known_of(image.range[None], even[None], image.mask[None], True, size)
@@ -102,11 +132,7 @@ def _classes(
     parts = known.metres, known.reflectance, torch.from_numpy(around), *rays
     metres, shade, near, *told = (part.to(device) for part in parts)
     logits = network(around_the_turn(class_inputs(metres, shade, near, Rays(*told))))
-    each = (logits[0] - torch.from_numpy(off).to(logits)[:, None, None])[1:, :height, :width]  # 0 is no answer
-    label = each.argmax(0) + 1
-    if least > 0:
-        label = label * (each.float().softmax(0).amax(0) >= least)
-    return label.cpu().numpy()
+    return logits[0, 1:, :height, :width].float().cpu()
 
 
 def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
