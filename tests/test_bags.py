@@ -154,7 +154,7 @@ def test_a_bag_completed_keeps_every_measured_bit(tmp_path: Path):
     """Through the verb's own work: fields of the message as they were, new points marked, in the message's scales."""
     path = ros1(tmp_path)
     works = (Work(item, None, False) for item in inputs_of([path]).stream())
-    results = list(run(Job("complete", model="bilinear", picture=False), works))
+    results = list(run(Job("complete", model="bilinear", sensor="vlp-16", picture=False), works))
     assert [r.error for r in results] == [None] * 3
     with open_bag(path) as bag:
         for result, cloud in zip(results, bag.clouds("/points"), strict=True):

@@ -170,7 +170,7 @@ def test_points_of_another_frame_come_back_where_they_were(tmp_path: Path, capsy
     with pytest.raises(SystemExit, match="2"):
         main([*words, str(tmp_path / "a.ply"), "--strict"])
     assert "m above the origin" in (error := capsys.readouterr().err) and "--transform 0:0:-1." in error
-    main([*words, str(tmp_path / "a.ply")])
+    main([*words, str(tmp_path / "a.ply"), "--sensor", "hdl-64e-kitti"])
     assert "above the origin" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):  # the beams are no known sensor's, as the frame is another
         main(["project", *words[1:2], "--no-picture", "--out", str(tmp_path / "a.npz")])

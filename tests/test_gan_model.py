@@ -100,7 +100,7 @@ def test_what_a_gan_cannot_do_is_said(model: GanModel):
         model.generate(1, steps=32)
     with pytest.raises(ValueError, match="expected no sampler, since a GAN has none, found 'ddpm'"):
         model.generate(1, sampler="ddpm")
-    with pytest.raises(ValueError, match="expected n and batch_size of at least 1, found 0"):
+    with pytest.raises(ValueError, match="expected n, steps and batch_size of at least 1, found 0"):
         model.generate(0)
     image = model.generate(1)[0]
     with pytest.raises(ValueError, match="expected a method of auto, inversion, found 'repaint'"):

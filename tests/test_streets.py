@@ -270,7 +270,8 @@ def test_wrong_options_are_named():
     with pytest.raises(ValueError, match="expected a drive of at most"):
         draw_drive(0, 0, 3600, speed=30.0)
     for mount in (-2.0, 0.0, 500.0, np.nan):
-        with pytest.raises(ValueError, match=r"expected a mount above the road .* 0 to 100 m, found (-2|0|500|nan)$"):
+        why = r"expected a mount above the road .* 0 to 100 m, found (-2|0|500)$|expected finite numbers"
+        with pytest.raises(ValueError, match=why):
             LabelledStreets(0, 4, Sensor("line", (-10.0,), 64, mount=mount))
     with pytest.raises(IndexError, match=r"0\.\.3, got 4"):
         LabelledStreets(0, 4, Sensor("line", (-10.0,), 64))[4]

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from lidarsynth.lidar.scan import RangeImage, Scan
     from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor, read_sensor
     from lidarsynth.systems.diffusion.model import LidarModel
+    from lidarsynth.systems.scan_model import ScanModel
     from lidarsynth.weights.load import load
 
 __version__ = "0.1.0"
@@ -32,6 +33,7 @@ _HOME = {
     "get_sensor": "lidarsynth.lidar.sensor",
     "read_sensor": "lidarsynth.lidar.sensor",
     "LidarModel": "lidarsynth.systems.diffusion.model",
+    "ScanModel": "lidarsynth.systems.scan_model",
     "load": "lidarsynth.weights.load",
 }
 
@@ -40,6 +42,7 @@ __all__ = [
     "LidarModel",
     "RangeImage",
     "Scan",
+    "ScanModel",
     "Sensor",
     "corrupt",
     "evaluate",

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from lidarsynth.cli.arguments import arg
 from lidarsynth.cli.terminal import counted, say
+
+if TYPE_CHECKING:
+    from lidarsynth.streets.frame import LabelledStreets
 
 
 def streets(
@@ -36,9 +39,7 @@ def streets(
     groups: Annotated[float, arg(help="of people who stand together, per 100 m and side of the street.")] = 0.0,
     motorcycles: Annotated[float, arg(help="places with parked ones, likewise.")] = 0.0,
     works: Annotated[float, arg(help="construction sites, likewise.")] = 0.0,
-    cyclists: Annotated[
-        float, arg(help="on the sidewalk's edge, likewise; without any there is hardly a rider.")
-    ] = 0.0,
+    cyclists: Annotated[float, arg(help="on the sidewalk's edge, likewise.")] = 0.0,
     heavy: Annotated[float, arg(help="lorries, coaches and trailers that stand, likewise.")] = 0.0,
     walls: Annotated[float, arg(help="walls and fences of more kinds, likewise.")] = 0.0,
     barriers: Annotated[float, arg(help="crash barriers, likewise.")] = 0.0,
@@ -54,9 +55,8 @@ def streets(
     picture: Annotated[bool, arg(help="write overview.png, four frames with their boxes.")] = True,
 ) -> None:
     """Labelled scans of synthetic streets: classes, instances, 3-D boxes, poses; stopped, the same command goes on."""
-    from lidarsynth.data.street_sets import overview, with_those_there, write_streets
+    from lidarsynth.data.street_sets import with_those_there, write_streets
     from lidarsynth.lidar.sensor import get_sensor
-    from lidarsynth.pictures.render import save_png
     from lidarsynth.streets.areas import Density
     from lidarsynth.streets.frame import LabelledStreets, Options
     from lidarsynth.streets.weather import Weather
@@ -67,10 +67,17 @@ def streets(
     density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
-    workers = os.cpu_count() or 1 if workers is None else workers
-    for _ in counted((done, len(made)) for done in write_streets(out, made, format, workers)):
+    written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
+    for _ in counted((done, len(made)) for done in written):
         pass
     kept = f", more than -n {count} asks for" if made.count > count else ""
     say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}{kept}")
     if picture:
-        say(f"wrote {save_png(out / 'overview.png', overview(made))}")
+        _picture(made, out / "overview.png")
+
+
+def _picture(made: LabelledStreets, path: Path) -> None:
+    from lidarsynth.data.street_sets import overview
+    from lidarsynth.pictures.render import save_png
+
+    say(f"wrote {save_png(path, overview(made))}")

@@ -11,9 +11,11 @@ A step has the signature `step(denoiser, x_t, t, s, rng, previous) -> (x_s, x_0_
 | heun | Heun's method, exponential form (Hochbruck & Ostermann 2010) | 2 | 2 |
 """
 
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,9 +45,29 @@ def generators(seed: int, count: int, offset: int = 0) -> list[torch.Generator]:
     """One CPU generator per sample: sample i of a run draws from seed + i, here for i = offset .. offset + count - 1.
 
     With seed 0 these are the generators of R2DM's evaluation (seed = sample index). Draws do not depend on the batch
-    size or the device.
+    size or the device. Seeds beyond 32 bits are mixed down to them, which are all that torch's generator takes.
+
+    Raises ValueError for a seed that is no whole number, or negative.
     """
-    return [torch.Generator().manual_seed(seed + offset + index) for index in range(count)]
+    seed = checked_seed(seed)
+    return [_seeded(seed + offset + index) for index in range(count)]
+
+
+def checked_seed(seed: int) -> int:
+    """The seed as Python's own number. Raises ValueError for one that is no whole number, or negative."""
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        raise ValueError(f"expected a seed that is a whole number, found {seed!r}") from None
+    if number < 0:
+        raise ValueError(f"expected a seed of at least 0, found {number}")
+    return number
+
+
+def _seeded(seed: int) -> torch.Generator:
+    if seed >= 1 << 32:
+        seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
+    return torch.Generator().manual_seed(seed)
 
 
 def noise_like(x: Tensor, rng: Rng) -> Tensor:

@@ -27,7 +27,9 @@ def project(
     Points outside the range limits leave their pixel empty, also where they hide a farther point, as in the published
     program. Raises ValueError for an unknown method, and for unfolding when the points do not come ring by ring.
     """
-    sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
+    if not isinstance(scan, Scan):
+        raise ValueError(f"expected a Scan, found a {type(scan).__name__}")
+    sensor = get_sensor(sensor)
     sensor = sensor if width is None else sensor.resized(width=width)
     if method not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {method!r}")
@@ -87,6 +89,8 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     if method == "auto" and is_even_grid(sensor):
         return _rows_by_elevation(scan.xyz, sensor)
     ring, count = ring_of_points(scan)
+    if scan.ring is not None:
+        check_from_top(ring, scan.xyz)
     if method == "auto" and count != sensor.height:
         return _rows_by_elevation(scan.xyz, sensor)
     if count < sensor.height // 2 or count > 2 * sensor.height:
@@ -98,6 +102,25 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
         return np.where(ring < sensor.height, ring, -1)
     # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
     return np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
+
+
+def check_from_top(ring: np.ndarray, xyz: np.ndarray) -> None:
+    """Raises ValueError for rings (N,) of points (N, 3) that do not count from the highest beam, as their elevations
+    tell; a tilted sensor and single points among the others do not."""
+    part = slice(None, None, max(1, len(ring) // 20_000))
+    ring, (x, y, z) = ring[part], xyz[part].T
+    if len(ring) and ring.min() < 0:
+        raise ValueError(f"expected rings counted from 0, found {ring.min()}")
+    count = np.bincount(ring)
+    used = np.flatnonzero(count >= 5)
+    if len(used) < 8:
+        return
+    mean = np.bincount(ring, np.arctan2(z, _length(x, y)))[used] / count[used]
+    order = np.corrcoef(np.arange(len(used)), np.argsort(np.argsort(mean)))[0, 1]
+    if order > -0.5:
+        found = "them counted from the bottom" if order > 0.9 else "another order"
+        raise ValueError(f"expected rings counted from the top, 0 the highest beam, found {found}; give the scan such "
+                         "rings, or none")  # fmt: skip
 
 
 def pixel_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> Pixels:

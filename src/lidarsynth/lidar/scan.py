@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from lidarsynth.lidar.sensor import Sensor
 _UNKNOWN = np.zeros(0, np.float32)  # stands for a reflectance that is not given
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """N points in the sensor frame: x forward, y left, z up.
 
@@ -24,7 +24,8 @@ class Scan:
     extra        further fields of the file by name, each (N,), such as ambient or return_type; `new` is 1 for a point
                  that was filled in, 0 for a measured one; `confidence` as in `RangeImage`, 1 for a measured one
 
-    Raises ValueError when a shape does not fit.
+    Numbers of other types become float32. Raises ValueError when a shape does not fit, and for what is no array of
+    numbers.
     """
 
     xyz: np.ndarray
@@ -35,10 +36,12 @@ class Scan:
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self):
+        object.__setattr__(self, "xyz", _numbers("xyz", self.xyz))
         if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
             raise ValueError(f"xyz must be (N, 3), got {self.xyz.shape}")
-        if self.reflectance is _UNKNOWN:
-            object.__setattr__(self, "reflectance", np.zeros(len(self.xyz), np.float32))
+        given = None if self.reflectance is _UNKNOWN else self.reflectance
+        light = np.zeros(len(self.xyz), np.float32) if given is None else _numbers("reflectance", given)
+        object.__setattr__(self, "reflectance", light)
         own = {name: getattr(self, name) for name in ("reflectance", "ring", "time", "label")}
         for name, value in [*own.items(), *self.extra.items()]:
             if value is not None and np.shape(value) != (len(self.xyz),):
@@ -49,18 +52,32 @@ class Scan:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def __getitem__(self, index: np.ndarray | slice) -> Scan:
+    __iter__ = None  # a scan is no sequence of points
+
+    def __getitem__(self, index: np.ndarray | Sequence[int] | slice) -> Scan:
         """The scan of the chosen points: a boolean mask (N,), integer indices or a slice."""
+        if not isinstance(index, slice) and np.ndim(index) != 1:
+            raise IndexError(f"expected a mask, indices or a slice of points, found {index!r}")
         own = (self.xyz, self.reflectance, self.ring, self.time, self.label)
         chosen = [None if values is None else _chosen(values, index) for values in own]
         return Scan(*chosen, {name: _chosen(values, index) for name, values in self.extra.items()})  # type: ignore[arg-type]
 
 
-def _chosen(values: np.ndarray, index: np.ndarray | slice) -> np.ndarray:
+def _numbers(name: str, values: np.ndarray) -> np.ndarray:
+    """The array as float32. Raises ValueError for what is no array, is masked, or has no numbers."""
+    if not isinstance(values, np.ndarray) or isinstance(values, np.ma.MaskedArray):
+        raise ValueError(f"{name}: expected an array of numbers, found a {type(values).__name__}")
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: expected an array of numbers, found one of {values.dtype}")
+    return values if values.dtype == np.float32 else values.astype(np.float32)
+
+
+def _chosen(values: np.ndarray, index: np.ndarray | Sequence[int] | slice) -> np.ndarray:
     """values[index], by `take`, which is several times as fast."""
     if isinstance(index, slice):
         return values[index]
     index = np.asarray(index)
+    index = index if len(index) else index.astype(np.intp)
     if index.dtype != np.bool_:
         return values.take(index, axis=0)
     return values.take(np.flatnonzero(index), axis=0) if len(index) == len(values) else values[index]
@@ -91,6 +108,17 @@ def scan_of(points: np.ndarray) -> Scan:
     return Scan(xyz, light)
 
 
+def check_image(image: RangeImage) -> None:
+    """Raises ValueError for measured ranges that are negative or not finite, and reflectances outside 0 to 1."""
+    metres, light = (values[image.mask] for values in (image.range, image.reflectance))
+    if not (metres.min(initial=0) >= 0 and metres.max(initial=0) < np.inf):
+        raise ValueError(f"expected ranges in metres, finite and not negative, found {metres.min():g} to "
+                         f"{metres.max():g}")  # fmt: skip
+    if not (light.min(initial=0) >= 0 and light.max(initial=0) <= 1):
+        raise ValueError(f"expected a reflectance of 0 to 1, found {light.min():g} to {light.max():g}; divide it by "
+                         "its scale")  # fmt: skip
+
+
 def _check(xyz: np.ndarray, light: np.ndarray, where: str = "") -> None:
     if not np.isfinite(xyz).all():
         raise ValueError("expected finite points, found NaN or infinite ones; leave them out")
@@ -99,7 +127,7 @@ def _check(xyz: np.ndarray, light: np.ndarray, where: str = "") -> None:
                          "it by its scale")  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RangeImage:
     """One turn as an equirectangular image; row 0 is the highest beam, column 0 looks backwards (+180 degrees).
 
@@ -115,7 +143,8 @@ class RangeImage:
     surface      (H, W) float32, metres: of virtual streets, where exactly each ray meets something, whether it returned
                  or not, 0 for nothing; or None. It is not saved
 
-    Raises ValueError when a shape does not fit.
+    Points of the image are `xyz` where it has them, and of a completed scan `completed`: who changes `range` alone
+    changes neither. Raises ValueError when a shape does not fit, and for a mask that is not bool.
     """
 
     range: np.ndarray
@@ -132,8 +161,12 @@ class RangeImage:
         shape = (self.sensor.height, self.sensor.width)
         for name in ("range", "reflectance", "mask", "label", "confidence", "surface"):
             value = getattr(self, name)
+            if value is not None and not isinstance(value, np.ndarray):
+                raise ValueError(f"{name} must be an array, got a {type(value).__name__}")
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} must be {shape}, the sensor's beams and columns, got {value.shape}")
+        if self.mask.dtype != np.bool_:
+            raise ValueError(f"mask must be bool, got {self.mask.dtype}")
         if self.xyz is not None and self.xyz.shape != (*shape, 3):
             raise ValueError(f"xyz must be {(*shape, 3)}, got {self.xyz.shape}")
 
@@ -185,7 +218,7 @@ class RangeImage:
         return replace(self.keep(self.confidence >= least), completed=points)
 
     def keep(self, known: np.ndarray) -> RangeImage:
-        """The same image with every pixel outside `known` (H, W) bool emptied."""
+        """The same image with every pixel outside `known` (H, W) bool emptied, as points too: `completed` is gone."""
         if known.shape != self.shape:
             raise ValueError(f"known must be {self.shape}, got {known.shape}")
         mask = self.mask & known
@@ -200,4 +233,5 @@ class RangeImage:
             label=label,
             xyz=xyz,
             completed=None,
+            confidence=None if self.confidence is None else np.where(mask, self.confidence, zero),
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ class Sensor:
     dimness: tuple[float, ...] = ()
 
     def __post_init__(self):
+        self._as_plain_numbers()
         steps = np.diff(self.elevations)
         if len(self.elevations) < 1 or not np.all(steps < 0) or not np.all(np.abs(self.elevations) <= 90):
             raise ValueError(f"sensor {self.name}: elevations must fall from top to bottom within +-90 degrees, "
@@ -56,6 +58,8 @@ class Sensor:
         if not 0 <= self.min_range < self.max_range:
             raise ValueError(f"sensor {self.name}: expected 0 <= min_range < max_range, "
                              f"got {self.min_range} and {self.max_range}")  # fmt: skip
+        if not np.isfinite([*self.offsets, *self.dimness, self.mount]).all():
+            raise ValueError(f"sensor {self.name}: expected finite numbers, found NaN or infinite ones")
         if self.offsets and len(self.offsets) != len(self.elevations):
             raise ValueError(f"sensor {self.name}: offsets must have one height per beam ({len(self.elevations)}), "
                              f"got {len(self.offsets)}")  # fmt: skip
@@ -69,6 +73,19 @@ class Sensor:
             if not inside:
                 raise ValueError(f"sensor {self.name}: expected blocked (row, first, last) within {self.height} rows "
                                  f"and {self.width} columns, got {run}")  # fmt: skip
+
+    def _as_plain_numbers(self) -> None:
+        """Tuples of Python's own numbers, which compare, hash and are written as JSON, of lists and arrays too."""
+        try:
+            for name in ("elevations", "offsets", "tilt", "dimness"):
+                object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
+            for name in ("min_range", "max_range", "mount"):
+                if isinstance(value := getattr(self, name), np.generic):
+                    object.__setattr__(self, name, value.item())
+            object.__setattr__(self, "width", index(self.width))
+            object.__setattr__(self, "blocked", tuple(tuple(index(v) for v in run) for run in self.blocked))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"sensor {self.name}: expected numbers, whole ones of columns, found: {error}") from None
 
     @property
     def height(self) -> int:
@@ -284,9 +301,19 @@ SENSORS: dict[str, Sensor] = {
 }
 
 
-def get_sensor(name: str) -> Sensor:
-    """A sensor by its word (`hdl-64e`, ...) or from the path of a `.toml` / `.json` file. Raises ValueError."""
-    if name in SENSORS:
+def same_rays(one: Sensor, other: Sensor) -> bool:
+    """Whether both have the same beams and columns, whatever their names, limits and mounting."""
+    return all(getattr(one, name) == getattr(other, name) for name in ("elevations", "width", "offsets", "edges"))
+
+
+def get_sensor(name: str | Sensor) -> Sensor:
+    """A sensor by its word (`hdl-64e`, ...) or from the path of a `.toml` / `.json` file, or itself. Raises
+    ValueError."""
+    if isinstance(name, Sensor):
+        return name
+    if not isinstance(name, str | Path):
+        raise ValueError(f"expected a sensor or its word, found a {type(name).__name__}")
+    if (name := str(name)) in SENSORS:
         return SENSORS[name]
     if Path(name).suffix in (".toml", ".json"):
         return read_sensor(name)

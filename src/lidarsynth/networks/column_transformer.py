@@ -48,7 +48,8 @@ class ColumnTransformer(PixelDrawer):
 
     def __init__(self, width: int = 256, layers: int = 5, pixel: int = 192, blocks: int = 3):
         super().__init__(FEATURES, HYPOTHESES, SHADES, pixel, blocks)
-        self.place = nn.Parameter(0.02 * torch.randn(COLUMNS, width))
+        self.place = nn.Parameter(torch.empty(COLUMNS, width))
+        nn.init.normal_(self.place, std=0.02)
         self.enter = nn.Linear((3 + RAY_CHANNELS) * ROWS, width)
         self.layers = nn.ModuleList(Block(width) for _ in range(layers))
         self.leave = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, pixel))

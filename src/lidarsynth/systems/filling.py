@@ -3,6 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import index
+
+
+def whole(name: str, number: int | None) -> int | None:
+    """The number as Python's own, or None. Raises ValueError for one that is not whole."""
+    try:
+        return None if number is None else index(number)
+    except TypeError:
+        raise ValueError(f"expected {name} that is a whole number, found {number!r}") from None
+
+
+def check_counts(n: int, steps: int, batch_size: int, first: int) -> None:
+    """Raises ValueError for numbers of scans and steps that are not whole, or too small."""
+    for name, number in (("n", n), ("batch_size", batch_size), ("first", first)):
+        whole(name, number)
+    if min(n, steps, batch_size) < 1:
+        raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
+    if first < 0:
+        raise ValueError(f"expected first of at least 0, found {first}")
 
 
 @dataclass(frozen=True)
@@ -29,7 +48,7 @@ class Filling:
     def at_least_one(self) -> Filling:
         """The same. Raises ValueError for counts below 1."""
         for name in ("steps", "resamples"):
-            if (number := getattr(self, name)) is not None and number < 1:
+            if (number := whole(name, getattr(self, name))) is not None and number < 1:
                 raise ValueError(f"expected {name} of at least 1, found {number}")
         return self
 

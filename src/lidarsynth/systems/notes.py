@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Protocol
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.unseen import caution
 
@@ -27,7 +27,9 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
     filling  whether points are to be added
     """
     scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
-    if isinstance(scan, Scan):
+    if isinstance(scan, RangeImage):
+        check_image(scan)
+    else:
         if (text := stranger(model, scan, sensor)) is not None:
             warnings.warn(f'{model.experiment.name} {text}; use load("default")', stacklevel=3)
         if filling and (text := caution(scan)) is not None:

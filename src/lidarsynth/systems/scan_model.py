@@ -12,14 +12,16 @@ import numpy as np
 import torch
 from torch import nn
 
+from lidarsynth.diffusion.samplers import checked_seed
 from lidarsynth.experiment.folder import save
-from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import occupied, pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, same_rays
+from lidarsynth.networks.device import usual_torch
 from lidarsynth.systems.description import Description
-from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.filling import Filling, check_counts, whole
 from lidarsynth.systems.hub import push
 from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
@@ -111,9 +113,15 @@ class ScanModel(ABC):
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
 
-        Raises ValueError where the model only completes scans.
+        What does not fit is said at once, not with the first scan. Raises ValueError where the model only completes
+        scans.
         """
         raise self._generates_nothing()
+
+    def _checked(self, n: int, steps: int | None, seed: int, sampler: str | None, batch_size: int, first: int) -> None:
+        """Raises ValueError for what `stream` cannot do."""
+        check_counts(n, self.generation_steps(whole("steps", steps), sampler), batch_size, first)
+        checked_seed(seed)
 
     def complete(
         self,
@@ -138,8 +146,10 @@ class ScanModel(ABC):
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
         """
+        how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision)
         scan = noted(self, scan, filling=True)
-        return self.filled(scan, Filling(method, steps, resamples, sampler, seed, precision), known, on_step)
+        with usual_torch():
+            return self.filled(scan, how, known, on_step)
 
     def upsample(
         self,
@@ -167,8 +177,9 @@ class ScanModel(ABC):
         """
         if self.any_sensor:  # others are made to take another's
             scan = noted(self, scan, sensor_in, filling=True)
-        how = Filling(method, steps, resamples, sampler, seed, precision)
-        return self.upsampled(scan, how, sensor_in, on_step, times)
+        how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision)
+        with usual_torch():
+            return self.upsampled(scan, how, sensor_in, on_step, times)
 
     def realise(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
         """A simulator's scan, in which every ray returns, as the real sensor would have reported it.
@@ -181,8 +192,9 @@ class ScanModel(ABC):
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
         """
-        scan = noted(self, scan, sensor)
-        return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
+        scan, seed = noted(self, scan, sensor), checked_seed(seed)
+        with usual_torch():
+            return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`."""
@@ -208,7 +220,8 @@ class ScanModel(ABC):
         if not 0 <= least <= 1:
             raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
         scan = noted(self, scan, sensor)
-        return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
+        with usual_torch():
+            return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`."""
@@ -231,7 +244,7 @@ class ScanModel(ABC):
         """`complete` of a record."""
         scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
         model = self if how.precision is None else self.at_precision(how.precision)
-        model = model.suited_to(scan) if isinstance(scan, Scan) else model
+        model = model.suited_to(scan) if isinstance(scan, Scan) else model.suited_to_image(scan)
         if model is not self:
             return model.filled(scan, replace(how, precision=None), known, on_step)
         how = self.resolved(how)
@@ -322,6 +335,10 @@ class ScanModel(ABC):
         """
         return self if sensor in (None, self.sensor, self.sensor.name) else self.into(sensor)  # type: ignore[arg-type]
 
+    def suited_to_image(self, image: RangeImage) -> ScanModel:
+        """The model that completes this image, of whose rays its own images are; here itself."""
+        return self
+
     def at_precision(self, word: str) -> ScanModel:
         """The same model, its network at `fp32`, or `auto`, the fastest it knows. Raises ValueError for other words."""
         if word not in ("auto", "fp32"):
@@ -334,11 +351,14 @@ class ScanModel(ABC):
         return 1 if next(self.network.parameters()).device.type == "cpu" else batch_size
 
     def image_of(self, scan: Scan | RangeImage) -> RangeImage:
-        """The scan in this model's image. Raises ValueError for an image of another size."""
+        """The scan in this model's image. Raises ValueError for an image of other rays."""
         if isinstance(scan, Scan):
             return project(scan, self.sensor, self.experiment.data.projection)
         if scan.shape != (self.sensor.height, self.sensor.width):
             raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
+        if not same_rays(scan.sensor, self.sensor):
+            raise ValueError(f"expected an image of {self.sensor.name}'s beams, found one of {scan.sensor.name}'s; "
+                             "complete its points (`image.to_scan()`)")  # fmt: skip
         return scan
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
@@ -377,11 +397,3 @@ class ScanModel(ABC):
     def _generates_nothing(self) -> ValueError:
         return ValueError(f"{self.experiment.name}: expected a model that makes scans from noise, found "
                           f"{self.kind}; use complete or upsample")  # fmt: skip
-
-
-def imaged_by(experiment: Experiment, sensor: Sensor) -> Experiment:
-    """The experiment with images of another sensor."""
-    return with_fields(
-        experiment,
-        {"data.sensor": sensor.to_dict(), "data.height": sensor.height, "data.width": sensor.width},
-    )

@@ -15,6 +15,7 @@ from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
+from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.systems.hub import fetch, is_repository
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.table import SHIPPED, assemble, build_network, load_folder
@@ -90,4 +91,6 @@ def load(source: str | Path = "default", ema: bool = True, device: str | torch.d
 
     Raises ValueError, or OSError, with one line that says what was expected and what was found.
     """
-    return assemble(*load_parts(source, ema)).to(device)
+    check_device(device)
+    with usual_torch():
+        return assemble(*load_parts(source, ema)).to(device)

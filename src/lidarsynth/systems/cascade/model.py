@@ -11,19 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.diffusion.samplers import generators
+from lidarsynth.diffusion.samplers import checked_seed, generators
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points, project
-from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS, grid_rays
+from lidarsynth.networks.device import each_usually
 from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
 from lidarsynth.networks.rays import Rays, decode_range, padded
 from lidarsynth.streets.hdl64e import hidden, written_out
+from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.holes import with_holes_drawn
@@ -53,13 +54,13 @@ from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.known_pixels import sensor_that_made, with_known
 from lidarsynth.systems.precision import resolved_precision
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
+from lidarsynth.systems.scan_model import OnStep
 
 TIMES = 4  # as many beams
 
 
 @dataclass(frozen=True, repr=False)
-class CascadeModel(ScanModel):
+class CascadeModel(AnySensorModel):
     """A trained cascade with the sensor of its images, which `into` changes at no cost.
 
     network.coarse   velocity of flow matching on a grid of 16 beams x 128 columns of the sensor
@@ -75,39 +76,17 @@ class CascadeModel(ScanModel):
     network: Cascade
     sensor: Sensor
     experiment: Experiment
-    own: bool = True
     labelled: bool = False
     precision: str = "fp32"
     response: Response = AS_STREETS
     grain: Grain = GENERATED
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
-    any_sensor: ClassVar[bool] = True
     together: ClassVar[int] = 16
-
-    def into(self, sensor: Sensor | str) -> CascadeModel:
-        """The same model with images of another sensor."""
-        sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
-        return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor), own=False)
 
     def at_precision(self, word: str) -> CascadeModel:
         """The same model, its fill at `fp32`, `bf16`, or `auto`: bf16 where the processor multiplies it itself."""
         return replace(self, precision=resolved_precision(word, self._device))
-
-    def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> CascadeModel:
-        """The model with images of the sensor that made the scan; itself after `into`.
-
-        sensor  None = as recognised from the points; raises ValueError when it is not
-        """
-        if not self.own:
-            return self
-        if sensor is None:
-            sensor, reason = recognise(scan)
-            if sensor is None and lies_on(scan, self.sensor):
-                sensor = self.sensor  # the user's own, on which the model was tuned
-            if sensor is None:
-                raise ValueError(f"{reason}, or take model.into(sensor)")
-        return self.into(sensor)
 
     def with_labels(self) -> CascadeModel:
         """The same model, whose images also have the class of each return."""
@@ -137,9 +116,13 @@ class CascadeModel(ScanModel):
 
         Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """
+        self._checked(n, steps, seed, sampler, batch_size, first)
         how = sampling(self.network, steps, sampler)
-        if min(n, how[1], batch_size) < 1:
-            raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
+        return each_usually(self._drawn(n, how, checked_seed(seed), batch_size, first, on_step))
+
+    def _drawn(
+        self, n: int, how: tuple[str, int], seed: int, batch_size: int, first: int, on_step: OnStep
+    ) -> Iterator[RangeImage]:
         (rows, columns), tell, size = grid_of(self.sensor), on_step or (lambda: None), self.at_once(batch_size)
         count = max(size, block(how))
         rays_of = partial(self._grid_rays, count=count)

@@ -12,13 +12,23 @@ from torch import Tensor, nn
 
 from lidarsynth.diffusion import langevin, repaint
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.samplers import STEPS, Rng, State, even_log_snr, generators, sample, starting_noise
+from lidarsynth.diffusion.samplers import (
+    STEPS,
+    Rng,
+    State,
+    checked_seed,
+    even_log_snr,
+    generators,
+    sample,
+    starting_noise,
+)
 from lidarsynth.experiment.record import Experiment, Score
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.conditional import ConditionalUNet
+from lidarsynth.networks.device import each_usually
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.diffusion.description import DESCRIPTION
 from lidarsynth.systems.filling import Filling
@@ -66,10 +76,14 @@ class LidarModel(ScanModel):
 
         Raises ValueError for an unknown sampler or counts below 1, or below 11 for `langevin`.
         """
-        sampler, steps = self._sampler(sampler), self.generation_steps(steps, sampler)
-        if n < 1 or steps < 1 or batch_size < 1:
-            raise ValueError(f"expected n, steps and batch_size of at least 1, found {n}, {steps}, {batch_size}")
+        self._checked(n, steps, seed, sampler, batch_size, first)
+        steps = self.generation_steps(steps, sampler)
         size = self.at_once(batch_size)
+        return each_usually(self._drawn(n, steps, checked_seed(seed), self._sampler(sampler), size, first, on_step))
+
+    def _drawn(
+        self, n: int, steps: int, seed: int, sampler: str, size: int, first: int, on_step: OnStep
+    ) -> Iterator[RangeImage]:
         for start in range(first, n, size):
             rng = generators(seed, size, offset=start)  # also of the last batch: a smaller one would round differently
             x_1 = self._start(self._blank(size), rng, sampler == "langevin")

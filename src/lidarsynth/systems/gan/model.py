@@ -10,19 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.diffusion.samplers import generators
+from lidarsynth.diffusion.samplers import checked_seed, generators
 from lidarsynth.experiment.record import Adversarial, Experiment
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.networks.device import each_usually
 from lidarsynth.networks.gan.inverse_depth import to_inverse_depth
 from lidarsynth.networks.gan.inversion import invert, unit_rms
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
+from lidarsynth.systems.any_sensor import imaged_by
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.gan.description import DESCRIPTION
 from lidarsynth.systems.known_pixels import with_known
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
+from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 METHODS = ("auto", "inversion")
 STEPS = 500  # of an inversion, as published
@@ -71,12 +73,12 @@ class GanModel(ScanModel):
         Whether a ray returns is decided by the same noise in all scans, as in DUSty's evaluation. Raises ValueError for
         a sampler, for more than one step and for counts below 1.
         """
-        self.generation_steps(steps, sampler)
-        if n < 1 or batch_size < 1:
-            raise ValueError(f"expected n and batch_size of at least 1, found {n} and {batch_size}")
+        self._checked(n, steps, seed, sampler, batch_size, first)
+        return each_usually(self._drawn(n, checked_seed(seed), self.at_once(batch_size), first, on_step))
+
+    def _drawn(self, n: int, seed: int, size: int, first: int, on_step: OnStep) -> Iterator[RangeImage]:
         fixed = torch.Generator().manual_seed(0)
         uniform = torch.rand(1, 1, *self._size, generator=fixed).to(self._device)
-        size = self.at_once(batch_size)
         for start in range(first, n, size):
             streams = generators(seed, size, offset=start)
             z = torch.stack([self._latent(rng) for rng in streams])
@@ -105,7 +107,7 @@ class GanModel(ScanModel):
         Known pixels come back exactly as they were, in metres; reflectance is 0 everywhere, since the network knows
         none. Filled pixels are those that return more likely than not. Raises ValueError when nothing is measured.
         """
-        rng = torch.Generator().manual_seed(how.seed)
+        (rng,) = generators(how.seed, 1)
         w = self._inverted(image, known & image.mask, self.calls(how), rng, on_step)
         with torch.no_grad():
             images = self.network.synthesize(w, torch.full((1, 1, 1, 1), 0.5, device=self._device)).image
@@ -119,7 +121,7 @@ class GanModel(ScanModel):
         """
         if perfect.shape != self._size:
             raise ValueError(f"expected an image of {self._size}, found {perfect.shape}")
-        rng = torch.Generator().manual_seed(seed)
+        (rng,) = generators(seed, 1)
         w = self._inverted(perfect, perfect.mask, steps, rng, None)
         uniform = torch.rand(1, 1, *self._size, generator=rng).to(self._device)
         with torch.no_grad():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -10,13 +10,14 @@ import torch
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.interpolation import Interpolation, interpolate
+from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.description import DESCRIPTION
 from lidarsynth.systems.known_pixels import with_known
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
+from lidarsynth.systems.scan_model import OnStep
 
 
 def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImage:
@@ -31,7 +32,7 @@ def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImag
 
 
 @dataclass(frozen=True, repr=False)
-class InterpolationModel(ScanModel):
+class InterpolationModel(AnySensorModel):
     """An interpolation with the sensor of its images.
 
     Its network has no parameters; the name of its experiment is the method.
@@ -42,12 +43,6 @@ class InterpolationModel(ScanModel):
     experiment: Experiment
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "an interpolation"
-    any_sensor: ClassVar[bool] = True
-
-    def into(self, sensor: Sensor | str) -> InterpolationModel:
-        """The same interpolation in images of another sensor."""
-        sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
-        return replace(self, sensor=sensor, experiment=imaged_by(self.experiment, sensor))
 
     def resolved(self, how: Filling) -> Filling:
         """The request itself. Raises ValueError for a method, a sampler or more than one step."""

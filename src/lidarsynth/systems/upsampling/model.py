@@ -13,16 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.diffusion.samplers import generators
 from lidarsynth.experiment.record import Experiment, Upsampling
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.iln import ILN, LIIF
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
+from lidarsynth.systems.any_sensor import imaged_by
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.known_pixels import with_known
-from lidarsynth.systems.scan_model import OnStep, ScanModel, imaged_by
+from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.systems.upsampling.description import DESCRIPTION
 
 HARDLY = 0.02  # share of a row's pixels; of a beam with fewer known ones nothing is known
@@ -164,7 +166,7 @@ class UpsamplingModel(ScanModel):
             if on_step is not None:
                 on_step()
         else:
-            mean, std = mc_dropout(self.network, x, torch.Generator().manual_seed(how.seed), self.calls(how), on_step)
+            mean, std = mc_dropout(self.network, x, generators(how.seed, 1)[0], self.calls(how), on_step)
             y = remove_uncertain(mean, std, self._group.threshold)
         return (y[0, 0].flip(0) * self._group.norm).cpu().numpy()
 

@@ -1,0 +1,58 @@
+"""Models of any sensor: each scan is completed in the image of the sensor that made it, until `into` names another."""
+
+from __future__ import annotations
+
+from abc import ABC
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.lidar.recognition import lies_on, recognise
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
+from lidarsynth.systems.scan_model import ScanModel
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class AnySensorModel(ScanModel, ABC):
+    """A frozen record with `sensor` and `experiment`, whose network knows none of them."""
+
+    any_sensor: ClassVar[bool] = True
+
+    @property
+    def own(self) -> bool:
+        """Whether scans are completed in the images of their own sensors: until `into`."""
+        return not self.experiment.data.fixed
+
+    def into(self, sensor: Sensor | str) -> Self:
+        """The same model with images of another sensor, or of this one alone."""
+        sensor = get_sensor(sensor)
+        experiment = imaged_by(self.experiment, sensor, fixed=True)
+        return replace(self, sensor=sensor, experiment=experiment)  # type: ignore[type-var]
+
+    def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> Self:
+        """The model with images of the sensor that made the scan; itself after `into`.
+
+        sensor  None = as recognised from the points; raises ValueError when it is not
+        """
+        if not self.own:
+            return self
+        if sensor is None:
+            sensor, reason = recognise(scan)
+            if sensor is None and lies_on(scan, self.sensor):
+                sensor = self.sensor  # the user's own, on which the model was tuned
+            if sensor is None:
+                raise ValueError(f"{reason}, or take model.into(sensor)")
+        return self.into(sensor)
+
+    def suited_to_image(self, image: RangeImage) -> Self:
+        """The model with images of this one's rays; itself after `into`."""
+        return self.into(image.sensor) if self.own and not same_rays(image.sensor, self.sensor) else self
+
+
+def imaged_by(experiment: Experiment, sensor: Sensor, fixed: bool = False) -> Experiment:
+    """The experiment with images of another sensor; `fixed`, whatever sensor made the scans."""
+    size = {"data.height": sensor.height, "data.width": sensor.width}
+    return with_fields(experiment, {"data.sensor": sensor.to_dict(), **size, "data.fixed": fixed})
