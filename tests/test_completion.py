@@ -19,7 +19,7 @@ from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import interpolated
 from lidarsynth.systems.table import assemble
-from lidarsynth.verbs.completion import complete_scan, judged, named_sensor, upsample_scan
+from lidarsynth.verbs.completion import complete_scan, hidden_part, judged, named_sensor, upsample_scan
 
 FLAT = Sensor("flat", (2.0, 0.0, -2.0, -4.0), width=8, min_range=1.0, max_range=50.0)
 
@@ -197,13 +197,24 @@ def test_repaint_takes_the_steps_of_the_sampler_that_is_named(model: LidarModel)
 # the table
 
 
+def test_of_a_thinned_scan_only_beams_that_returned_are_hidden_and_judged():
+    truth = image(np.array([[10.0] * 8, [0.0] * 8, [20.0, 0.0] * 4, [0.0] * 8]))
+    known, judge = hidden_part(truth, "beams:2", 0)
+    assert known[0].all() and judge[2].all() and known.sum() == judge.sum() == 8
+    known, judge = hidden_part(truth, "points:0.5", 0)
+    assert not judge[[1, 3]].any() and not known[[1, 3]].any() and (known | judge)[[0, 2]].all()
+    for recipe, found in (("beams:1", "none"), ("sector:360", "every")):
+        with pytest.raises(ValueError, match=f"some of the measured pixels, found '{recipe}', which hides {found}"):
+            hidden_part(truth, recipe, 0)
+
+
 def test_errors_are_over_hidden_pixels_with_empty_ones_as_zero():
     truth = image(np.array([[10.0] * 8, [20.0] * 8, [0.0] * 8, [40.0] * 8]))
     known = np.zeros((4, 8), bool)
     known[[0, 3]] = True
     before = truth.keep(known)
     guess = image(np.array([[10.0] * 8, [23.0] * 8, [1.0] * 8, [40.0] * 8]))
-    errors = judged(guess, before, known, truth)
+    errors = judged(guess, before, known, truth, ~known)
     assert list(errors) == ["lidarsynth", "nearest", "bilinear", "bicubic", "left empty"]
     assert {e.pixels for e in errors.values()} == {16}
     assert errors["lidarsynth"].range_mae == pytest.approx((3 + 1) / 2)
@@ -262,7 +273,7 @@ def test_figures_have_a_row_per_image_and_views(model: LidarModel):
 
 def test_refusals_say_both_sides(model: LidarModel):
     scan = room(SENSORS["hdl-64e-kitti"].resized(width=64))
-    with pytest.raises(ValueError, match="hides at least one pixel, found 'points:1'"):
+    with pytest.raises(ValueError, match="hides some of the measured pixels, found 'points:1', which hides none"):
         complete_scan(model, scan, "points:1")
     with pytest.raises(ValueError, match="expected points within hdl-64e-kitti/16's view, found none of"):
         complete_scan(model, replace(scan, xyz=scan.xyz * np.float32(1000)))

@@ -64,7 +64,7 @@ def test_a_denser_scan_keeps_the_rings_of_its_points(street: Scan):
 def test_points_that_were_filled_in_stay_so(street: Scan):
     model = ls.load("default")
     half = replace(street[street.xyz[:, 0] > 0], extra={})
-    with pytest.warns(UserWarning, match="found none in 1[78]. degrees of the turn"):
+    with pytest.warns(UserWarning, match="found hardly any in 1[78]. degrees of the turn"):
         once = model.complete(half).to_scan()
     with pytest.warns(UserWarning, match="that were filled in before"):
         whole = model.complete(once)
@@ -131,6 +131,16 @@ def test_the_widest_gap_of_a_turn(turn: np.ndarray, wide: int):
     xyz = np.stack([9 * np.cos(angle), 9 * np.sin(angle), 0 * angle], 1).astype(np.float32)
     assert widest_gap(xyz) == wide
     assert (caution(Scan(xyz)) is None) == (wide < 45)
+
+
+def test_stray_points_do_not_fill_a_gap_and_old_ones_do_not_hide_it():
+    rng = np.random.default_rng(0)
+    angle = np.radians(np.concatenate([rng.uniform(0, 230, 9000), rng.uniform(230, 360, 8)]))
+    scan = Scan(np.stack([9 * np.cos(angle), 9 * np.sin(angle), 0 * angle], 1).astype(np.float32))
+    said = caution(scan)
+    assert said is not None and "hardly any in 12" in said and "filled in before" not in said
+    both = caution(replace(scan, extra={"new": np.ones(len(scan), np.uint8)}))
+    assert both is not None and "filled in before" in both and "hardly any in 12" in both
 
 
 def test_bad_arrays_are_told_by_the_library():

@@ -49,8 +49,36 @@ def test_points_without_return_are_dropped_and_counted(scan: Scan, tmp_path: Pat
     table[9, :3] = 0
     table.astype(np.float32).tofile(tmp_path / "scan.bin")
     found, dropped = read_with_report(tmp_path / "scan.bin")
-    assert dropped == 4
-    same(found, scan[np.setdiff1d(np.arange(N), [3, 5, 7, 9])], ("xyz", "reflectance"))
+    assert dropped == 3
+    dark = replace(scan, reflectance=np.where(np.arange(N) == 7, np.float32(0), scan.reflectance))
+    same(found, dark[np.setdiff1d(np.arange(N), [3, 5, 9])], ("xyz", "reflectance"))
+
+
+def test_single_intensities_above_a_scale_do_not_change_it(tmp_path: Path):
+    values = np.random.default_rng(0).random(5000).astype(np.float32)
+    for high in (1.5, 2.0, 300.0):
+        bright = np.append(values, np.float32(high))
+        with pytest.warns(UserWarning, match=f"0-1, as most are, found 1 of 5001 above it, up to {high:g}"):
+            np.testing.assert_array_equal(reflectance_from(bright), np.append(values, np.float32(1)))
+    with pytest.warns(UserWarning, match="above it, up to 1.4"):
+        assert reflectance_from(values * np.float32(1.5))[:100].mean() > 0.5
+    whole = np.round(values * 255)
+    np.testing.assert_array_equal(reflectance_from(whole), (whole / np.float64(255)).astype(np.float32))
+    with pytest.warns(UserWarning, match="0-255, as most are"):
+        assert reflectance_from(np.append(whole, np.float32(300)))[:-1].mean() > 0.4
+    np.testing.assert_allclose(reflectance_from(np.append(whole, whole * 200)).max(), whole.max() * 200 / 65535)
+    with pytest.raises(FileError, match="expected an intensity of 0-1"):
+        reflectance_from(np.append(values, np.float32(2)), "unit")
+
+
+def test_nuscenes_files_that_someone_scaled_stay_so(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.normal(0, 10, (500, 3)), rng.random(500), np.zeros(500)]).astype("<f4")
+    table.tofile(tmp_path / "a.pcd.bin")
+    np.testing.assert_array_equal(read(tmp_path / "a.pcd.bin").reflectance, table[:, 3])
+    table[:, 3] = np.round(table[:, 3] * 3)  # dark, but whole numbers
+    table.tofile(tmp_path / "b.pcd.bin")
+    np.testing.assert_allclose(read(tmp_path / "b.pcd.bin").reflectance, table[:, 3] / 255, rtol=1e-6)
 
 
 def test_rings_of_one_sensor_are_read_by_the_numbers_of_the_file(scan: Scan, tmp_path: Path):

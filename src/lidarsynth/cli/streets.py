@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -68,8 +69,7 @@ def streets(
     options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
-    for _ in counted((done, len(made)) for done in written):
-        pass
+    deque(counted((done, len(made)) for done in written), maxlen=0)
     kept = f", more than -n {count} asks for" if made.count > count else ""
     say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}{kept}")
     if picture:

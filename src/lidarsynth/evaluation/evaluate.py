@@ -45,7 +45,7 @@ def evaluate(
     samples: Samples,
     reference: Samples,
     protocol: str | EvaluationProtocol = "bev-1",
-    sensor: str | None = None,
+    sensor: str | Sensor | None = None,
     seed: int = 0,
     batch_size: int = 4,
     device: str = "cpu",
@@ -59,13 +59,14 @@ def evaluate(
     sensor     of samples that are points or tensors, where neither the reference nor the protocol tells
     seed       of the subsets of the squared MMDs
 
-    Rows whose network is not there are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values
+    Published networks that a protocol asks for are downloaded once, as `load` downloads releases; rows whose network is
+    not to be had are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values
     that are not finite, statistics of another protocol, a device that is not here.
     """
     start = time.monotonic()
     _check_numbers({"batch_size": (batch_size, 1), "seed": (seed, 0)})
     check_device(device)
-    record = get_protocol(protocol) if isinstance(protocol, str) else protocol
+    record = protocol if isinstance(protocol, EvaluationProtocol) else get_protocol(protocol)
     judge = _judge_pairs if record.pairs else _judge_sets
     report = judge(_Run(record, sensor, batch_size, device, on_images), _single(samples), _single(reference), seed)
     return replace(report, seconds=time.monotonic() - start)
@@ -83,7 +84,7 @@ class _Run:
     """What all steps of one evaluation share."""
 
     protocol: EvaluationProtocol
-    sensor: str | None
+    sensor: str | Sensor | None
     batch_size: int
     device: str
     on_images: OnImages
@@ -108,8 +109,9 @@ class _Run:
     def notes(self, judged: ImageSet | None, truth: ImageSet | None, drawn: Sensor) -> tuple[str, ...]:
         """What is unlike in the images that were read, or statistics stand for, and judged as those of `drawn`."""
         sides = {"samples": judged, "the reference": truth}
-        told = unused_sensor(self.sensor, judged, drawn) + unlike_sensors(sides, drawn)
-        return told + tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides)
+        named = self.sensor.name if isinstance(self.sensor, Sensor) else self.sensor
+        told = unused_sensor(named, judged, drawn) + unlike_sensors(sides, drawn)
+        return told + tensors_taken(sides, drawn, named) + unlike_metres(sides)
 
     def networks(self, sensor: Sensor) -> Loaded:
         return load_networks(self.protocol, sensor.width, self.device, self.on_images)
@@ -307,7 +309,9 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
 
 
 def _single(samples: Samples) -> Samples:
-    """A list of one path as the path."""
+    """A list of one path as the path. Raises ValueError for what is no set of scans."""
+    if not isinstance(samples, str | Path | Sequence):
+        raise ValueError(f"expected a folder, files or a list of range images, found a {type(samples).__name__}")
     if not isinstance(samples, str | Path) and len(samples) == 1 and isinstance(samples[0], str | Path):
         return samples[0]
     return samples

@@ -42,7 +42,9 @@ def read_pcd_bin(data: bytes) -> Fields:
     """
     fields = _floats(data, 5, "")
     fields["x"], fields["y"] = fields["y"], -fields["x"]
-    if np.nanmax(fields["intensity"], initial=0) <= 255:
+    light = fields["intensity"]
+    unit = np.nanmax(light, initial=0) <= 1 and np.mean((light > 0) & (light < 1)) > 0.5  # scaled by someone before
+    if not unit and np.nanmax(light, initial=0) <= 255:
         fields["intensity"] = fields["intensity"] / np.float32(255)  # the format fixes the scale, however dark the scan
     return fields
 

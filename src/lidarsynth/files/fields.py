@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -55,7 +56,8 @@ def find(fields: Fields, name: str) -> str | None:
 def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, int] | None = None) -> tuple[Scan, int]:
     """The scan of N columns, and how many points it lost.
 
-    Points with a non-finite coordinate or intensity, or at exactly (0, 0, 0) (no return), are dropped and counted.
+    Points with a non-finite coordinate, or at exactly (0, 0, 0) (no return), are dropped and counted; an intensity that
+    is not finite is 0.
     `intensity`: see `reflectance_from`; `rings`: see `on_rings`. Ring numbers that do not count from the top, and times
     that are no seconds, stay among the further fields as the file has them. Raises FileError (without the path) for
     anything that is not one LiDAR turn.
@@ -72,7 +74,8 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
                         f"found {_listed(fields)}; --intensity none takes it for 0")  # fmt: skip
     else:
         values = _numbers(fields[name], name)
-    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & np.isfinite(values) & ((x != 0) | (y != 0) | (z != 0))
+    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
+    values = values if np.isfinite(values[keep]).all() else np.where(np.isfinite(values), values, 0)
     if not keep.any():
         raise FileError(f"expected at least one finite point away from the origin, found none in {len(x)}")
     dropped = int(len(keep) - keep.sum())
@@ -148,17 +151,36 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
     """(N,) float32 in [0, 1] from finite intensities of 0-1 ("unit"), 0-255 ("byte") or 0-65535 ("uint16").
 
     "auto": an 8-bit type is 0-255, other integers are 0-255 up to 255 and 0-65535 above; floats are 0-1 up to 1, 0-255
-    up to 255, 0-65535 above. A scan of floats so dark that no point exceeds 1 of 255 is the one case to force by hand.
-    Raises FileError when the values do not fit the scale.
+    up to 255, 0-65535 above, but that one in a thousand may be brighter than its scale, and most of fractions up to 2
+    are 0-1; both are taken for the most there is, with a warning. A scan of floats so dark that no point exceeds 1 of
+    255 is the one case to force by hand. Raises FileError when the values do not fit the scale.
     """
     low, high = float(values.min()), float(values.max())
     if intensity == "auto":
-        limits = {name: limit for name, limit in SCALES.items() if values.dtype.kind == "f" or name != "unit"}
-        intensity = next((name for name, limit in limits.items() if high <= limit), "uint16")
+        intensity = _scale_of(values, high)
+        limit = SCALES[intensity]
+        if low >= 0 and limit < high <= SCALES["uint16"]:
+            above = int((values > limit).sum())
+            warnings.warn(f"expected an intensity of 0-{limit:.0f}, as most are, found {above} of {len(values)} above "
+                          f"it, up to {high:.6g}: taken for {limit:.0f}", stacklevel=2)  # fmt: skip
+            values, high = np.minimum(values, limit), limit
     limit = SCALES[intensity]
     if low < 0 or high > limit:
         raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}")
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
+
+
+def _scale_of(values: np.ndarray, high: float) -> str:
+    """The scale of intensities of which `high` is the greatest; see `reflectance_from`."""
+    if values.dtype.kind != "f":
+        return "byte" if high <= 255 else "uint16"
+    if high <= 1:
+        return "unit"
+    usual = float(np.partition(values, int(0.999 * (len(values) - 1)))[int(0.999 * (len(values) - 1))])
+    fractions = float(np.mean(values[::16] % 1 > 0)) > 0.5
+    if fractions and usual <= 2:
+        return "unit"
+    return "byte" if high <= 255 or (usual <= 255 and len(values) >= 1000) else "uint16"
 
 
 def rings_from_top(ring: np.ndarray, xyz: np.ndarray) -> np.ndarray:

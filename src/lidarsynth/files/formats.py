@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedIOBase
 from pathlib import Path
@@ -74,9 +74,12 @@ def read_with_report(
     labels     a SemanticKITTI `.label` file with one word per point of the file
     words      likewise, of any ids, which are kept as they are in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last to read, as the file numbers them; None = all
+    Of `.bin` and `.npy`, `new` and `confidence` come from the files that `write` puts beside them, where these fit.
     Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`), other fields as `extra`.
     Raises FileError, a ValueError of one line "path: expected ..., found ...".
     """
+    if rings is not None and not (isinstance(rings, tuple) and len(rings) == 2):
+        raise ValueError(f"expected rings (first, last), found {rings!r}")
     if intensity not in INTENSITIES:
         raise ValueError(f"expected an intensity of {', '.join(INTENSITIES)}, found {intensity!r}")
     reader = READERS[_suffix(path, READERS, "read")]
@@ -87,6 +90,8 @@ def read_with_report(
         fields["label"] = read_labels(labels, len(next(iter(fields.values()), ())))
     if words is not None:
         fields["raw_label"] = read_words(words, len(next(iter(fields.values()), ())))
+    if _is_bare(path):
+        fields = _marks_beside(Path(path), len(next(iter(fields.values()), ()))) | fields
     with _naming(path):
         return scan_from_fields(fields, intensity, rings)
 
@@ -142,6 +147,7 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     if path.is_dir():
         raise FileError(f"{path}: expected the name of a file to write, found a folder")
     if isinstance(content, Scan) and suffix in BARE:  # before the file itself: where that stands, all is whole
+        _without_marks(path, content.extra)
         for name, kind in BESIDE.items():
             if name in content.extra:
                 values = content.extra[name].astype(kind).tobytes()
@@ -167,6 +173,28 @@ def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:
             write_to(file)
     except OSError as error:
         raise FileError(f"{path}: expected an existing, writable folder with room, found: {error.strerror}") from error
+
+
+def _is_bare(path: str | Path) -> bool:
+    name = Path(path).name.lower()
+    return name.endswith(BARE) and not name.endswith(".pcd.bin")
+
+
+def _marks_beside(path: Path, count: int) -> Fields:
+    """Of a file of so many points, what `write` put beside it of a filled scan, where it has as many."""
+    marks = {name: path.with_suffix(f".{name}") for name in BESIDE}
+    fit = {n: p for n, p in marks.items() if p.is_file() and p.stat().st_size == count * BESIDE[n].itemsize > 0}
+    return {name: np.fromfile(place, BESIDE[name]) for name, place in fit.items()}
+
+
+def _without_marks(path: Path, stay: Iterable[str]) -> None:
+    """Removes the marks of the points of a file that is about to be replaced, but for those that are written anew."""
+    try:
+        count = len(next(iter(READERS[path.suffix.lower()](path.read_bytes()).values()), ()))
+    except (OSError, FileError):  # no such file, or none of ours
+        return
+    for name in _marks_beside(path, count).keys() - set(stay):
+        path.with_suffix(f".{name}").unlink(missing_ok=True)
 
 
 def _suffix(path: str | Path, known: dict, verb: str) -> str:

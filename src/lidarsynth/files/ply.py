@@ -159,6 +159,8 @@ def _skip(data: bytes, at: int, element: Element, dtypes: dict[tuple[str, ...], 
 def write_ply(file: BufferedIOBase, scan: Scan) -> None:
     """The scan as binary PLY: x y z intensity (reflectance 0-1), and ring, timestamp, label where known."""
     table = scan_table(scan)
+    if other := [n for n in table.dtype.names or () if table.dtype[n].str[1:] not in WRITTEN]:
+        raise FileError(f"expected fields of numbers in .ply, found {other[0]} of {table.dtype[other[0]]}")
     properties = [f"property {WRITTEN[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
     header = [
         "ply",

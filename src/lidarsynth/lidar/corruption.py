@@ -96,6 +96,8 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
 
     Several joined by `+` apply together. Raises ValueError that names the part it could not read.
     """
+    if not isinstance(image, RangeImage):
+        raise ValueError(f"expected a range image, such as project gives, found a {type(image).__name__}")
     rng = np.random.default_rng(seed)
     known = np.ones(image.shape, bool)
     for part in recipe.split("+"):

@@ -8,23 +8,29 @@ from lidarsynth.lidar.measured import were_new
 from lidarsynth.lidar.scan import Scan
 
 WIDE = 45  # degrees: confidences were fitted on wider holes, too, but what stands there is anyone's guess
+FEW = 0.15  # share of the usual points of a degree that are hardly any
 
 
 def caution(scan: Scan) -> str | None:
     """What must be said of the completion of a scan, in one line, or None."""
+    said = []
     if before := int(were_new(scan).sum()):
-        return f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): they " \
-               "are taken as they are, and stay marked"  # fmt: skip
-    if (wide := widest_gap(scan.xyz)) > WIDE:
-        return f"expected points all around, found none in {wide} degrees of the turn: what is put there is a guess"
-    return None
+        said.append(f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): "
+                    "they are taken as they are, and stay marked")  # fmt: skip
+    if len(scan) and (wide := widest_gap(scan.xyz)) > WIDE:
+        said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there "
+                    "is a guess")  # fmt: skip
+    return "; ".join(said) or None
 
 
 def widest_gap(xyz: np.ndarray) -> int:
-    """Whole degrees of the widest arc of the turn, seen from above, in which no point (N, 3) stands; 360 of none."""
-    seen = np.zeros(360, bool)
-    seen[np.floor(np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))).astype(int) % 360] = True
-    if not seen.any():
+    """Whole degrees of the widest arc of the turn, seen from above, in which hardly a point (N, 3) stands; 360 of none.
+
+    Stray points there do not count: fewer, of any three degrees, than 15 % of the usual number.
+    """
+    if not len(xyz):
         return 360
-    at = np.flatnonzero(seen)
+    count = np.bincount(np.floor(np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))).astype(int) % 360, minlength=360)
+    around = count + np.roll(count, 1) + np.roll(count, -1)
+    at = np.flatnonzero((count > 0) & (around >= FEW * np.median(around[around > 0])))
     return int(np.diff(at, append=at[0] + 360).max()) - 1

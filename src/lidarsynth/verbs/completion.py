@@ -30,11 +30,13 @@ class Filled:
     image   in the model's sensor, measured pixels exactly as they were
     drawn   gives the images of the picture by caption: before, after and, where known, the truth
     errors  of the hidden pixels by method, where the truth is known
+    given   the scan, where its points are to be drawn and counted for the first image, which holds one a pixel
     """
 
     image: RangeImage
     drawn: Callable[[], Mapping[str, RangeImage]]
     errors: Mapping[str, Errors]
+    given: Scan | None = None
 
     @property
     def shown(self) -> Mapping[str, RangeImage]:
@@ -53,7 +55,8 @@ class Filled:
         if len(shown) == 1:
             return portrait(self.image)
         after = next(name for name, image in shown.items() if image is self.image)
-        return before_and_after(shown, {after: self.points})
+        before = {} if self.given is None else {next(iter(shown)): self.given}
+        return before_and_after(shown, before | {after: self.points})
 
 
 def complete_scan(
@@ -65,28 +68,47 @@ def complete_scan(
     sensor: Sensor | None = None,
     least: float | None = None,
 ) -> Filled:
-    """Fill a scan; with a corruption `recipe` hide part of it first and judge the hidden pixels against it.
+    """Fill a scan; with a corruption `recipe` hide part of it first and judge the hidden pixels against it: of beams
+    that returned anything, for others, as of a thinned scan, say nothing of the truth.
 
     sensor  that made the scan, for a model of any sensor; None = as recognised
     least   confidence of new points that stay; None = all
 
-    Raises ValueError when no point is in view, the recipe hides nothing, or `least` meets a model without confidences.
+    Raises ValueError when no point is in view, the recipe hides no point or all of them, or `least` meets a model
+    without confidences.
     """
     model = model.suited_to(scan, sensor)
     if recipe is None:
         filled = _sure(model.filled(scan, how, on_step=on_step), least)
-        return Filled(filled, lambda: {"measured": _measured(model, scan, filled), "completed": filled}, {})
+        return Filled(filled, lambda: {"measured": _measured(model, scan, filled), "completed": filled}, {}, scan)
     truth = model.image_of(scan)
     if not truth.mask.any():
         raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
-    known = corrupt(truth, recipe, how.seed)
-    if known.all():
-        raise ValueError(f"expected a corruption that hides at least one pixel, found {recipe!r}")
+    known, judge = hidden_part(truth, recipe, how.seed)
     before = truth.keep(known)
     whole = model.filled(before, how, known, on_step)
     filled = _sure(whole, least)
     shown = {f"input, {recipe}": before, "completed": filled, "truth": truth}
-    return Filled(filled, lambda: shown, judged(whole, before, known, truth))  # what is left out would count as 0 m
+    errors = judged(whole, before, known, truth, judge)  # of the whole: what is left out would count as 0 m
+    return Filled(filled, lambda: shown, errors)
+
+
+def hidden_part(truth: RangeImage, recipe: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels (H, W) bool stay known, and which hidden ones can be judged, both of beams that returned anything.
+
+    Raises ValueError for a recipe that hides no measured pixel, or all of them.
+    """
+    rows = np.flatnonzero(truth.mask.any(1))
+    beams = RangeImage(truth.range[rows], truth.reflectance[rows], truth.mask[rows], truth.sensor.rows(rows.tolist()))
+    known, judge = np.zeros(truth.shape, bool), np.zeros(truth.shape, bool)
+    known[rows] = corrupt(beams, recipe, seed)
+    judge[rows] = ~known[rows]
+    hides, leaves = (truth.mask & judge).any(), (truth.mask & known).any()
+    if not (hides and leaves):
+        found = "every" if hides else "none"
+        raise ValueError(f"expected a corruption that hides some of the measured pixels, found {recipe!r}, which hides "
+                         f"{found}")  # fmt: skip
+    return known, judge
 
 
 def check_confident(model: ScanModel, how: Filling, least: float | None) -> None:
@@ -115,11 +137,13 @@ def _measured(model: ScanModel, scan: Scan, filled: RangeImage) -> RangeImage:
     return filled.keep((x != 0) | (y != 0) | (z != 0))
 
 
-def judged(filled: RangeImage, before: RangeImage, known: np.ndarray, truth: RangeImage) -> dict[str, Errors]:
-    """Errors of the pixels outside `known`: of the model, of each interpolation, and of leaving them empty."""
+def judged(
+    filled: RangeImage, before: RangeImage, known: np.ndarray, truth: RangeImage, judge: np.ndarray
+) -> dict[str, Errors]:
+    """Errors of the pixels to `judge`: of the model, of each interpolation of `known`, and of leaving them empty."""
     results = {"lidarsynth": filled}
     results |= {name: interpolated(before, known, name) for name in METHODS}
-    return {name: reconstruction_errors(r, truth, ~known) for name, r in {**results, "left empty": before}.items()}
+    return {name: reconstruction_errors(r, truth, judge) for name, r in {**results, "left empty": before}.items()}
 
 
 def upsample_scan(
@@ -143,7 +167,7 @@ def upsample_scan(
         measured = project(replace(scan, ring=None), filled.sensor, "spherical")
         return {f"measured, {sensor_in.name}": measured, "upsampled": filled}
 
-    return Filled(filled, drawn, {})
+    return Filled(filled, drawn, {}, scan)
 
 
 def named_sensor(scan: Scan, path: Path, flag: str, given: str | None, own: Sensor | None = None) -> Sensor:

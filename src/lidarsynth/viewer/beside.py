@@ -38,7 +38,7 @@ def read_shown(path: Path, intensity: str = "auto") -> Shown:
     if dropped:
         notes.append(f"{dropped} points without a return or not finite were dropped")
     for name in BESIDE if path.name.lower().endswith(BARE) else ():
-        if (marks := path.with_suffix(f".{name}")).is_file():
+        if (marks := path.with_suffix(f".{name}")).is_file() and name not in scan.extra:
             scan, note = _with_marks(scan, name, marks, dropped)
             notes += note
     boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])

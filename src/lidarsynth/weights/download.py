@@ -60,6 +60,8 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
     except (OSError, http.client.HTTPException) as error:
         if path.is_file():  # another process was faster
             return
+        if part.is_file() and not part.stat().st_size:
+            part.unlink(missing_ok=True)
         place = f"without a network, put the file at {path}"
         raise ValueError(f"{url}: expected a download, found {_reason(error)}; {place}") from None
 

@@ -51,7 +51,7 @@ from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.description import Description
-from lidarsynth.systems.filling import Filling
+from lidarsynth.systems.filling import Filling, whole
 from lidarsynth.systems.known_pixels import sensor_that_made, with_known
 from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep
@@ -193,9 +193,11 @@ class CascadeModel(AnySensorModel):
         if how.precision is not None:
             model = self.at_precision(how.precision)
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
-        scan, times = as_scan(scan), TIMES if times is None else times
+        scan, times = as_scan(scan), whole("times", times) or TIMES
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
+        if not sparse.mask.any():
+            raise ValueError(f"expected points within {own.name}'s view, found none of {len(scan)} points")
         model = self.into(written_out(own).denser(times))
         image, known = spread(sparse, model.sensor, times)
         filled = model.fill(image, known, how, on_step)
