@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 
 import lidarsynth as ls
-from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
 from lidarsynth.streets.reader import SyntheticStreets
@@ -36,10 +35,7 @@ loaded = cache(ls.load)
 def own_image(path: Path) -> RangeImage:
     """A scan in the rays of the sensor that made it."""
     scan = ls.read(path)
-    sensor, reason = recognise(scan)
-    if sensor is None:
-        raise ValueError(f"{path}: {reason}")
-    return loaded("nearest").into(sensor).image_of(scan)
+    return loaded("nearest").suited_to(scan).image_of(scan)
 
 
 def every(image: RangeImage, step: int) -> np.ndarray:

@@ -208,3 +208,18 @@ def test_it_learns_a_road(rays: torch.Tensor, draft: torch.Tensor):
     returned = grid.returned.float().mean()
     assert losses[0] < 0.1
     assert losses[1] < -returned * math.log(64 / 1.9) - 1 and losses[2] < -2
+
+
+def test_known_pixels_stay_and_others_are_drawn_around_them(
+    network: ColumnTransformer, rays: torch.Tensor, draft: torch.Tensor, drawn: Grid
+):
+    here = torch.zeros(2, ROWS, COLUMNS, dtype=torch.bool)
+    here[:, :, 20:60], here[0, 3, 100] = True, True
+    other = known_grid(torch.full((2, ROWS, COLUMNS), 7.0), torch.full((2, ROWS, COLUMNS), 0.25))
+    found = draw(network, rays, draft, rngs(), sharp=0.5, heat=1.0, known=(other, here))
+    for part, given, free in zip(found, other, drawn, strict=True):
+        assert_close(part[here], given[here])
+        assert_close(part[:, :, :20], free[:, :, :20])  # drawn before any is known
+    assert (found.code[:, :, 60:64] != drawn.code[:, :, 60:64]).any()
+    again = draw(network, rays, draft, rngs(), sharp=0.5, heat=1.0, known=(drawn, here))
+    assert_close(again.code, drawn.code)  # what it would have drawn changes nothing

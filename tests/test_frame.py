@@ -133,7 +133,7 @@ def test_points_on_no_beams_have_no_stand():
 
 def test_a_scan_whose_ground_is_at_zero_is_not_upside_down():
     frame = check_frame(moved(street("hdl-64e-kitti"), parse_transform("0:0:1.9:0:0:0")))
-    assert frame.faults == ("with the sensor 2.10 m above the origin",)
+    assert frame.faults == ("with the sensor 1.90 m above the origin",)
 
 
 @pytest.mark.parametrize("axis", [axis for axis in AXES if axis not in ("+z", "-z")])
@@ -160,7 +160,9 @@ def test_cones_have_their_axis_height_and_elevations():
     matrix = parse_transform("0:0:0.5:1:2:0")
     cones = fit_cones(transformed(scan.xyz, matrix), scan.ring)
     np.testing.assert_allclose(cones.axis, matrix[:3, 2], atol=2e-3)
-    assert cones.height == pytest.approx(0.5, abs=0.01) and cones.residual < 0.1 < cones.upright
+    np.testing.assert_allclose(cones.origin, [0, 0, 0.5], atol=0.06)
+    assert cones.origin[2] == pytest.approx(0.5, abs=0.01)
+    assert cones.residual < 0.1 < cones.upright
     for row in (20, 60):
         ring = fit_ring(scan.xyz[scan.ring == row])
         assert ring.elevation == pytest.approx(sensor.elevations[row], abs=1e-3)
@@ -232,7 +234,8 @@ def test_a_moved_real_scan_is_found_out(move: str, shared: Path):
     assert MOVES[move][1].split(".")[0] in str(check_frame(moved(scan, parse_transform(MOVES[move][0]))).warning())
 
 
-def test_a_sweep_in_the_vehicles_frame_is_raised(shared: Path):
+def test_a_sweep_in_the_vehicles_frame_is_raised_and_ahead(shared: Path):
     pytest.importorskip("pyarrow", reason="pyarrow comes with the extra `data`")
     frame = check_frame(read(shared / "scans" / "other" / "argoverse2_2xvlp32c.feather"))
-    assert "1.56 m above the origin" in str(frame.warning())
+    assert re.search("1.3. m ahead of and 1.[56]. m above the origin", str(frame.warning()))
+    np.testing.assert_allclose(frame.transform[:3, 3], [-1.35, 0, -1.56], atol=0.05)

@@ -1,11 +1,13 @@
 """The sensor is found from the points alone, on real scans and on ideal ones; what is not known is asked for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lidarsynth.files.formats import read
+from lidarsynth.lidar.own_beams import own_beams, stray_rings
 from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
@@ -92,6 +94,51 @@ def test_points_of_no_spinning_sensor_are_asked_for():
     assert name is None and "from +90.0 to +90.0 degrees" in reason
 
 
+def moved(name: str, *beams: tuple[int, float]) -> Sensor:
+    """A unit of a known sensor with some beams elsewhere: (row, degrees)."""
+    elevations = list(SENSORS[name].elevations)
+    for row, degrees in beams:
+        elevations[row] = degrees
+    return replace(SENSORS[name], elevations=tuple(elevations))
+
+
+@pytest.mark.parametrize("rings", [True, False])
+def test_rings_off_their_beams_are_told_and_their_beams_taken_as_they_are(rings: bool):
+    unit, table = moved("pandar64", (62, -14.7), (63, -19.5)), SENSORS["pandar64"]
+    scan = turn(unit, rings)
+    assert recognise(scan)[0] == "pandar64", "most rings are where they should be"
+    text = str(stray_rings(scan, table))
+    assert "found 2 of 64 up to 5.4 degrees off (62, 63)" in text and "\n" not in text
+    found = own_beams(scan, table)
+    np.testing.assert_allclose(found.elevations, unit.elevations, atol=0.01)
+    assert found.name == table.name and found.elevations[:62] == table.elevations[:62]
+
+
+def test_beams_are_only_moved_as_far_as_they_stay_in_order():
+    table = SENSORS["vlp-16"]
+    scan = turn(moved("vlp-16", (15, -18.0)))
+    assert scan.ring is not None
+    crossed = replace(scan, ring=np.where(scan.ring == 12, 3, scan.ring))[scan.ring != 3]  # one where another is
+    assert "found 2 of 16 up to 18.0 degrees off (3, 15)" in str(stray_rings(crossed, table))
+    np.testing.assert_allclose(own_beams(crossed, table).elevations, [*table.elevations[:15], -18.0], atol=0.01)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_no_ring_of_a_known_sensor_strays(name: str):
+    """Nor of a few points, of some beams only, of a unit a little off the table, or of a sensor that leans."""
+    table = SENSORS[name]
+    off = np.random.default_rng(2).uniform(-0.05, 0.05, table.height)
+    unit = replace(table, elevations=tuple(np.array(table.elevations) + off))
+    angle = np.radians(2.0)
+    lean = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], np.float32)
+    whole = turn(table)
+    tilted = Scan(whole.xyz @ lean.T, whole.reflectance, ring=whole.ring)
+    some = turn(table, rows=slice(1, None, 4))
+    for scan in (whole, turn(table, rings=False), turn(table, keep=0.05), turn(unit), tilted, some):
+        assert stray_rings(scan, table) is None
+        assert own_beams(scan, table) is table
+
+
 @pytest.mark.parametrize(
     ("name", "sensor"),
     [
@@ -104,6 +151,16 @@ def test_points_of_no_spinning_sensor_are_asked_for():
 def test_real_scans_of_other_sensors(name: str, sensor: str, shared: Path):
     found, reason = recognise(read(shared / "scans" / "other" / name))
     assert found == sensor, reason
+
+
+def test_only_the_real_scan_whose_rings_stray_is_told_so(shared: Path, kitti: list[Scan]):
+    other = [read(shared / "scans" / "other" / name) for name in
+             ("nuscenes_hdl32e.pcd.bin", "fast_gicp_251370668.pcd", "sensorscalibration_top.pcd")]  # fmt: skip
+    for scan in (*other, *kitti):
+        assert stray_rings(scan, SENSORS[str(recognise(scan)[0])]) is None
+    panda = read(shared / "scans" / "other" / "pandaset_pandar64_0001.pcd")
+    assert "found 2 of 64 up to 5.4 degrees off (62, 63)" in str(stray_rings(panda, SENSORS["pandar64"]))
+    np.testing.assert_allclose(own_beams(panda, SENSORS["pandar64"]).elevations[62:], (-14.7, -19.5), atol=0.2)
 
 
 def test_two_stacked_sensors_are_asked_for(shared: Path):

@@ -13,9 +13,17 @@ def info(
         Positional[str],
         arg(help="a model, preset, release or sensor; or a file or folder: scans, bag, capture, cache, statistics."),
     ] = "default",
+    transform: Annotated[
+        str | None,
+        arg(metavar="T", help="brings a scan into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4."),
+    ] = None,
+    axes: Annotated[str, arg(metavar="XYZ", help="where x, y, z of a scan point: CARLA has fru, AirSim frd.")] = "flu",
+    mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above a scan's z = 0.")] = None,
+    rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
     seed: NoSeed = 0,
 ) -> None:
     """What a model, a preset, a sensor, a file or a folder is."""
     from lidarsynth.verbs.description import describe
+    from lidarsynth.verbs.inputs import Reading, parse_rings, read_transform
 
-    say(describe(what))
+    say(describe(what, Reading(transform=read_transform(transform, mount, axes), rings=parse_rings(rings))))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -152,7 +151,7 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
 
     "auto": an 8-bit type is 0-255, other integers are 0-255 up to 255 and 0-65535 above; floats are 0-1 up to 1, 0-255
     up to 255, 0-65535 above, but that one in a thousand may be brighter than its scale, and most of fractions up to 2
-    are 0-1; both are taken for the most there is, with a warning. A scan of floats so dark that no point exceeds 1 of
+    are 0-1; what is above its scale is taken for the most there is. A scan of floats so dark that no point exceeds 1 of
     255 is the one case to force by hand. Raises FileError when the values do not fit the scale.
     """
     low, high = float(values.min()), float(values.max())
@@ -160,9 +159,6 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
         intensity = _scale_of(values, high)
         limit = SCALES[intensity]
         if low >= 0 and limit < high <= SCALES["uint16"]:
-            above = int((values > limit).sum())
-            warnings.warn(f"expected an intensity of 0-{limit:.0f}, as most are, found {above} of {len(values)} above "
-                          f"it, up to {high:.6g}: taken for {limit:.0f}", stacklevel=2)  # fmt: skip
             values, high = np.minimum(values, limit), limit
     limit = SCALES[intensity]
     if low < 0 or high > limit:

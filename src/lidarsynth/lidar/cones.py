@@ -8,22 +8,24 @@ import numpy as np
 
 NEAR = 2.0  # metres: nearer points are the carrier's own, and their angle says little of the beam
 ROUNDS = 12
-POINTS = 8_000  # of a scan are enough
+POINTS = 4_000  # of a scan are enough
+STEPS, WEIGHED = 12, 4  # of Gauss-Newton at most, and how often points are weighed anew in each
+STRIDE, CLOSE = 1.5, 0.01  # metres: no step is longer, for far off cones fit too; and a shorter one is the last
 
 
 @dataclass(frozen=True)
 class Cones:
-    """How the rings of a scan stand in its frame: z = t_ring rho + a x + b y + h.
+    """How the rings of a scan stand in its frame: z = h + a (x - p) + b (y - q) + t_ring rho, rho from the axis.
 
     axis      (3,) unit vector that the sensor turns about
-    height    metres of the sensor's origin in the frame, along z
+    origin    (3,) metres: p, q, h of the cones' common apex
     residual  degrees, a robust standard deviation, of the points from their cones
     upright   degrees, the same of cones about z through the frame's origin
-    error     (3,) standard errors of a, b (radians) and h (metres)
+    error     (5,) standard errors of p, q, h (metres) and a, b (radians)
     """
 
     axis: np.ndarray
-    height: float
+    origin: np.ndarray
     residual: float
     upright: float
     error: np.ndarray
@@ -34,41 +36,57 @@ class Cones:
         return float(np.degrees(np.arccos(np.clip(self.axis[2], -1, 1))))
 
     def apart(self, deviations: float) -> bool:
-        """Whether tilt or height differ from none by more than so many standard errors."""
-        tilt = np.hypot(*self.axis[:2]) / max(float(np.max(self.error[:2])), 1e-12)
-        return bool(max(tilt, abs(self.height) / max(float(self.error[2]), 1e-12)) > deviations)
+        """Whether axis or origin differ from the frame's own by more than so many standard errors."""
+        found = np.append(self.origin, self.axis[:2])
+        return bool((np.abs(found) > deviations * np.maximum(self.error, 1e-12)).any())
 
 
 def fit_cones(xyz: np.ndarray, ring: np.ndarray, seed: int = 0) -> Cones:
     """The cones of points (N, 3) metres by their rings (N,): common axis and origin, each ring its own elevation.
 
-    Angles are fitted, v = z / rho = t_ring + a cos + b sin + h / rho, by least squares that give less weight to points
-    far off (Huber, and none beyond six deviations). Raises ValueError for fewer than 100 points beyond 2 m.
+    Angles are fitted, v = (z - h - a x - b y) / rho = t_ring with x, y and rho from (p, q), by Gauss-Newton steps of
+    least squares that give less weight to points far off (Huber, and none beyond six deviations). Raises ValueError for
+    fewer than 100 points beyond 2 m.
     """
-    rho = np.hypot(xyz[:, 0], xyz[:, 1])
-    chosen = np.flatnonzero(rho > NEAR)
+    chosen = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) > NEAR)
     if len(chosen) < 100:
         raise ValueError(f"expected at least 100 points beyond {NEAR:g} m to fit rings to, found {len(chosen)}")
-    chosen = np.random.default_rng(seed).permutation(chosen)[:POINTS]
-    x, y, z = xyz[chosen].astype(np.float64).T
-    rho = rho[chosen].astype(np.float64)
+    if len(chosen) > POINTS:
+        chosen = np.random.default_rng(seed).choice(chosen, POINTS, replace=False, shuffle=False)
+    points = xyz[chosen].astype(np.float64)
     _, ring = np.unique(ring[chosen], return_inverse=True)
-    known = np.stack([x / rho, y / rho, 1 / rho], axis=1)
-    values, weight = z / rho, np.ones(len(rho))
-    fitted = np.zeros(3)
-    normal, scale = np.eye(3), 1.0
-    for _ in range(ROUNDS):
-        left = np.stack([_without_mean(known[:, k], ring, weight) for k in range(3)], axis=1)
+    fitted, weight, scale, error = np.zeros(5), np.ones(len(points)), 1.0, np.zeros(5)
+    for _ in range(STEPS):
+        x, y, z = (points - fitted[:3]).T
+        rho = np.maximum(np.hypot(x, y), NEAR / 4)
+        values = (z - fitted[3] * x - fitted[4] * y) / rho
+        slopes = np.stack([-values * x / rho**2, -values * y / rho**2, 1 / rho, x / rho, y / rho], axis=1)
+        step, error, scale, weight = _stepped(slopes, values, ring, weight)
+        length = float(np.linalg.norm(step[:3]))
+        fitted += step * min(1.0, STRIDE / max(length, CLOSE))
+        if length < CLOSE:
+            break
+    axis = np.array([-fitted[3], -fitted[4], 1.0])
+    values = points[:, 2] / np.hypot(points[:, 0], points[:, 1])
+    spread = float(np.degrees(_deviation(values - _medians(values, ring)[ring])))
+    return Cones(axis / np.linalg.norm(axis), fitted[:3], float(np.degrees(scale)), spread, error)
+
+
+def _stepped(
+    slopes: np.ndarray, values: np.ndarray, ring: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Coefficients of slopes (N, k) that explain values (N,) but for each ring's mean: (k,), their standard errors
+    (k,), the deviation of what is left, and the weights (N,) that go with it."""
+    step, scale, normal = np.zeros(slopes.shape[1]), 1.0, np.eye(slopes.shape[1])
+    for _ in range(WEIGHED):
+        left = np.stack([_without_mean(slope, ring, weight) for slope in slopes.T], axis=1)
         right = _without_mean(values, ring, weight)
-        normal = (left * weight[:, None]).T @ left + 1e-9 * np.eye(3)
-        fitted = np.linalg.solve(normal, (left * weight[:, None]).T @ right)
-        residual = right - left @ fitted
+        normal = (left * weight[:, None]).T @ left + 1e-9 * np.eye(len(step))
+        step = np.linalg.solve(normal, (left * weight[:, None]).T @ right)
+        residual = right - left @ step
         scale = _deviation(residual)
         weight = robust_weight(residual, scale)
-    axis = np.array([-fitted[0], -fitted[1], 1.0])
-    spread = float(np.degrees(_deviation(values - _medians(values, ring)[ring])))
-    errors = np.sqrt(np.diag(np.linalg.inv(normal))) * scale
-    return Cones(axis / np.linalg.norm(axis), float(fitted[2]), float(np.degrees(scale)), spread, errors)
+    return step, np.sqrt(np.diag(np.linalg.inv(normal))) * scale, scale, weight
 
 
 @dataclass(frozen=True)

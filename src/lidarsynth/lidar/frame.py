@@ -1,7 +1,8 @@
 """Whether a scan's points are in their sensor's frame (x forward, y left, z up, the sensor at the origin), or in which.
 
 Rings tell: they are cones about the axis that the sensor turns about, through its origin (`cones.fit_cones`), so a scan
-that was raised, tilted or written in other axes shows it, whatever the road does. The ground tells up from down.
+that was shifted, raised, tilted or written in other axes shows it, whatever the road does. The ground tells up from
+down.
 """
 
 from __future__ import annotations
@@ -10,20 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarsynth.lidar.cones import fit_cones, onto_z
-from lidarsynth.lidar.crowding import ORIGINS, stand_of_beams
+from lidarsynth.lidar.cones import onto_z
+from lidarsynth.lidar.crowding import ORIGINS
 from lidarsynth.lidar.ground import levels, road_axis
-from lidarsynth.lidar.recognition import recognise, rings_by_elevation, rings_in_order
+from lidarsynth.lidar.origin import BESIDE, TILTED, Turned, place_of, rings_of, to_undo, turned
+from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 
-RAISED = 0.6  # metres; beams of an HDL-64E leave up to 0.2 m above its origin
-TILTED = 2.0  # degrees; no real scan at hand exceeds 0.3
-FIT = 2.0  # degrees: cones that fit worse are none
-SURE = 6.0  # standard errors
 CLEAR = 0.7  # degrees: cones that fit better leave no doubt of the axis
+CLEARLY = 0.5  # of the residual about z: cones about another axis that fit better are the scan's
 UPSIDE = 1.5  # times more level ground above than below
 TURN = 64  # parts of a turn, whose directions tell which way it goes
 ACROSS = -0.2  # `road_axis` of a road that runs along y; of 133 real scans the lowest is -0.11
+TOLD = 0.05  # metres: shifts that are said
 
 # Which axis of the file is up -> rotation into x forward, y left, z up, and the words for it.
 AXES: dict[str, tuple[tuple[tuple[int, int, int], ...], str]] = {
@@ -52,7 +52,9 @@ class Frame:
     @property
     def lifted(self) -> bool:
         """Whether all that is wrong is how high the origin is: of a sensor that was learned so, it is right."""
-        return bool(self.faults) and np.array_equal(self.transform[:3, :3], np.eye(3))
+        level = self.transform.copy()
+        level[2, 3] = 0
+        return bool(self.faults) and np.array_equal(level, np.eye(4))
 
     def warning(self) -> str | None:
         """One line that says what the points are and what to do, or None."""
@@ -70,75 +72,61 @@ def check_frame(scan: Scan) -> Frame:
     Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height and tilt
     by where elevations crowd.
     """
-    up, has_rings = _upright(scan)
-    rotation, words = np.array(AXES[up][0], np.float64), AXES[up][1]
-    tip, height = _stand(scan, rotation, has_rings)
+    up, points = _upright(scan)
+    rotation, words, xyz = np.array(AXES[up][0], np.float64), AXES[up][1], points.xyz
+    place = place_of(scan, points)
     faults, hints = [words] if words else [], []
-    tilt = float(np.degrees(np.arccos(np.clip(tip[2, 2], -1, 1))))
-    if tilt > TILTED:
-        faults.append(f"tilted by {tilt:.1f} degrees")
-        rotation = tip @ rotation
-    if abs(height) > RAISED:
-        faults.append(f"with the sensor {abs(height):.2f} m {'above' if height > 0 else 'below'} the origin")
+    if place.tilt > TILTED:
+        faults.append(f"tilted by {place.tilt:.1f} degrees")
+        tip = onto_z(place.axis)
+        rotation, xyz = tip @ rotation, (xyz @ tip.T).astype(np.float32)
+        place = replace(place, axis=tip @ place.axis, origin=tip @ place.origin)
+    if (origin := to_undo(scan, xyz, place)).any():
+        faults.append(f"with the sensor {_away(origin)} the origin")
     if not faults and road_axis(scan.xyz) < ACROSS:
         hints.append("with the road along y, as if turned by 90 degrees")
         rotation = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[2, 3] = -height if abs(height) > RAISED else 0.0
+    matrix[:3, :3], matrix[:3, 3] = rotation, -origin
     return Frame(tuple(faults), tuple(hints), matrix)
 
 
-def _stand(scan: Scan, rotation: np.ndarray, has_rings: bool) -> tuple[np.ndarray, float]:
-    """`_tilt_and_height`, also of a scan whose rings are not said."""
-    xyz = (scan.xyz @ rotation.T).astype(np.float32)
-    if scan.ring is not None or rings_in_order(xyz) is not None:
-        return _tilt_and_height(scan, rotation) if has_rings else (np.eye(3), 0.0)
-    if (stand := stand_of_beams(xyz)) is not None:
-        return onto_z(stand[0]), stand[1]
-    return np.eye(3), 0.0
+def _away(origin: np.ndarray) -> str:
+    """Where (3,) metres are, as words before "the origin"."""
+    ways = (("ahead of", "behind"), ("left of", "right of"), ("above", "below"))
+    told = [f"{abs(v):.2f} m {way[int(v < 0)]}" for v, way in zip(origin, ways, strict=True) if abs(v) > TOLD]
+    return " and ".join([", ".join(told[:-1]), told[-1]]) if told[1:] else told[0]
 
 
-def _tilt_and_height(scan: Scan, rotation: np.ndarray) -> tuple[np.ndarray, float]:
-    """The rotation that puts the sensor's axis onto z after `rotation`, and its height in metres above the origin then.
-
-    Height counts along the sensor's axis. The fit is linear in a tilt, so it is repeated on what it straightened.
-    """
-    tip, height = np.eye(3), 0.0
-    for _ in range(3):
-        xyz = (scan.xyz @ (tip @ rotation).T - np.array([0, 0, height])).astype(np.float32)
-        if (ring := rings_of(scan, xyz)) is None:
-            break
-        cones = fit_cones(xyz, ring)
-        if cones.residual > FIT or not cones.apart(SURE):
-            break  # cones about z through the origin fit as well
-        if cones.tilt < TILTED / 10 and abs(cones.height) < RAISED / 2:
-            break
-        tip, height = onto_z(cones.axis) @ tip, height + cones.height * float(cones.axis[2])
-    return tip, height
-
-
-def _upright(scan: Scan) -> tuple[str, bool]:
-    """Which of AXES points up, and whether the scan has rings about it. Nothing found: z."""
-    fits: dict[str, float] = {}
-    for axis in "zyx":  # the first that fits well is it
-        if (fit := _residual(scan, np.array(AXES["+" + axis][0]))) is not None and fit < FIT:
-            fits[axis] = fit
-            if fit < CLEAR:
+def _upright(scan: Scan) -> tuple[str, Turned]:
+    """Which of AXES points up, and the points turned so. Nothing found: z."""
+    about: dict[str, Turned] = {}
+    best, residual = "", np.inf
+    for axis in "zyx":
+        points = turned(scan, np.array(AXES["+" + axis][0]), BESIDE if axis == "z" else (0.0,))
+        about[axis] = points
+        if points.cones is not None and points.cones.residual < CLEARLY * residual:
+            best, residual = axis, points.cones.residual
+            if residual < CLEAR:
                 break
-    if fits:
-        best = min(fits, key=lambda axis: fits[axis])
-        return _side(scan, best), True
+    if best:
+        side = _side(scan, best, about[best])
+        return side, about[best] if side[0] == "+" else turned(scan, np.array(AXES[side][0]))
     shares = {axis: _shares(scan, axis) for axis in AXES}
     level = max(shares, key=lambda axis: shares[axis])
     clear = shares[level] > max(0.6, UPSIDE * shares["+z"]) and shares["+z"] < 1 / 3
-    return (level if clear else "+z"), False
+    return (level, turned(scan, np.array(AXES[level][0]))) if clear else ("+z", about["z"])
 
 
-def _side(scan: Scan, axis: str) -> str:
+def _side(scan: Scan, axis: str, points: Turned) -> str:
     """+axis or -axis: where the ground is below the sensor, wherever the origin; where both sides look alike, where the
-    beams are a known sensor's; and of beams that are so either way, as an OS1's, from where they turn to the right."""
-    seen = _from_sensor(scan, np.array(AXES["+" + axis][0]))
+    beams are a known sensor's; and of beams that are so either way, as an OS1's, from where they turn to the right.
+
+    points  of the scan, turned so that +axis is up
+    """
+    rotation, seen = np.array(AXES["+" + axis][0]), scan
+    if points.told and points.cones is not None:
+        seen = replace(scan, xyz=(scan.xyz - points.cones.origin @ rotation).astype(np.float32))
     upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > 0.6 and upper > UPSIDE * lower:
         return "+" + axis
@@ -147,7 +135,7 @@ def _side(scan: Scan, axis: str) -> str:
         return ("+" if up else "-") + axis
     if lower > UPSIDE * upper and lower > 1 / 3:
         return "-" + axis
-    return ("-" if up and turns_left(seen.xyz @ np.array(AXES["+" + axis][0], np.float32).T, scan.time) else "+") + axis
+    return ("-" if up and turns_left(seen.xyz @ rotation.T.astype(np.float32), scan.time) else "+") + axis
 
 
 def turns_left(xyz: np.ndarray, time: np.ndarray | None) -> bool:
@@ -165,17 +153,6 @@ def turns_left(xyz: np.ndarray, time: np.ndarray | None) -> bool:
     return bool((step > 0).mean() > 0.9 and step.sum() > np.pi)
 
 
-def _from_sensor(scan: Scan, rotation: np.ndarray) -> Scan:
-    """The scan, its origin at the height along the axis that `rotation` makes z from which its rings are cones, where
-    rings are said."""
-    xyz = scan.xyz @ rotation.T.astype(np.float32)
-    ring = scan.ring if scan.ring is not None else rings_in_order(xyz)
-    if ring is None:
-        return scan
-    height = fit_cones(xyz, ring).height
-    return replace(scan, xyz=(scan.xyz - height * rotation[2]).astype(np.float32))
-
-
 def _known(scan: Scan, up: str, lift: float) -> bool:
     """Whether the beams are a known sensor's, were `up` the upper side and they left its origin `lift` metres above."""
     xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T + np.array([0, 0, lift], np.float32)
@@ -183,28 +160,9 @@ def _known(scan: Scan, up: str, lift: float) -> bool:
     return recognise(Scan(xyz, scan.reflectance, ring=ring))[0] is not None
 
 
-def _residual(scan: Scan, rotation: np.ndarray) -> float | None:
-    """Degrees by which the points miss cones about the axis that `rotation` makes z, or None without rings."""
-    xyz = scan.xyz @ rotation.T.astype(np.float32)
-    ring = rings_of(scan, xyz)
-    try:
-        return None if ring is None else fit_cones(xyz, ring).residual
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-
-
 def _shares(scan: Scan, up: str) -> float:
     """The share of the cells around the sensor that have points of one level below, were `up` the upper side."""
     return levels(scan.xyz @ np.array(AXES[up][0], np.float32).T)[0].share
-
-
-def rings_of(scan: Scan, xyz: np.ndarray | None = None) -> np.ndarray | None:
-    """(N,) ring of each point by its field, else by the order of the points (of `xyz`, where turned), else by crowded
-    elevations, else None."""
-    xyz = scan.xyz if xyz is None else xyz
-    ring = scan.ring if scan.ring is not None else rings_in_order(xyz)
-    ring = rings_by_elevation(xyz) if ring is None else ring
-    return None if ring is None or np.count_nonzero(np.bincount(ring)) < 4 else ring
 
 
 WAYS = {"f": (1, 0, 0), "b": (-1, 0, 0), "l": (0, 1, 0), "r": (0, -1, 0), "u": (0, 0, 1), "d": (0, 0, -1)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,10 +11,18 @@ from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
 from lidarsynth.lidar.ground import plane
 from lidarsynth.lidar.motion import straighten
+from lidarsynth.lidar.recognition import recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.turns import several_turns
 
 NEAR, FEWEST = 3.0, 200  # metres; points of a ring that a fit needs
+THIN, SEEN = 5, 0.5  # points of a ring that is a row all the same; metres, where so few are beyond NEAR
+SAME, CLOSEST = 0.1, 0.02  # of the usual spacing: rings of one beam; degrees: no sensor's beams are closer
+SMEARED = 0.1  # degrees: known sensors' points lie within 0.03 of their beams where nothing has moved them
+# Times as many columns as the fullest ring has points where it has any, LEAST degrees of the turn or more; more columns
+# are steps from one beam's points to another's.
+DENSER, LEAST = 2.0, 30
 SAMPLE = 1500  # points of a ring and scan are enough
 HALVED = 0.5  # of the residual: heights that explain less are bent rings of a moving car
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
@@ -31,7 +39,10 @@ class LearnedSensor:
     rings     the fit of each row
     returned  (H, W) share of the scans in which a pixel returned
     scans     how many scans it was learned from; `left` says why others were not used, in words
-    missing   how many rings have too few points, and are no rows
+    missing   how many rings have hardly any points, and are no rows
+    thin      how many have too few points for a fit: these tell their beams roughly
+    merged    how many rings were of another's beam, and are one row with it
+    turns     what is to be said of a scan of more than one turn, or None
     """
 
     sensor: Sensor
@@ -40,31 +51,35 @@ class LearnedSensor:
     scans: int
     left: tuple[str, ...]
     missing: int = 0
+    thin: int = 0
+    merged: int = 0
+    turns: str | None = None
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     """The sensor that took the scans: points with a ring field, or ring after ring in the file.
 
     Beams are fitted over all scans, z = tan(e) rho + h, with h = 0 unless heights halve the residual; a row's height is
-    the neighbours' where its own points cannot tell it. Columns come from the azimuths' steps, mount and tilt from the
-    ground (medians over the scans), blocked rays from what never returned in five scans or more. Raises ValueError
-    without rings, or with too few points.
+    the neighbours' where its own points cannot tell it. Rings of one beam are one row. Columns come from the azimuths'
+    steps, mount and tilt from the ground (medians over the scans), blocked rays from what never returned in five scans
+    or more. Raises ValueError without rings, with too few points, or where most beams are wider than SMEARED.
     """
     kept, left = _alike(scans)
-    count = int(kept[0][1].max()) + 1
-    points: list[list[np.ndarray]] = [[] for _ in range(count)]
+    points = _pooled(kept)
     steps, depths, grounds = [], [], []
-    for number, (scan, ring) in enumerate(kept):
-        rng = np.random.default_rng(number)
-        for row, xyz in _rows(straighten(scan.xyz, ring, scan.time), ring, count):
-            points[row].append(rng.permutation(xyz)[:SAMPLE])
+    for scan, ring in kept:
         steps.append(_step(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((np.quantile(depth, 0.001), depth.max()))
         grounds += [found] if (found := plane(scan.xyz)) is not None else []
-    rings, rows = _fit_rows(points)
+    guessed = _guessed(kept[0][0])
+    rings, row_of = _fit_rows(points, FEWEST if guessed else THIN)
+    thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
+    merged = len(points) - missing - len(rings)
+    _check_sharp(rings, merged, kept[0][0], guessed)
+    kept = [(scan, row_of[ring]) for scan, ring in kept]
     width = max(round(2 * np.pi / float(np.median(steps))), 4)
-    returned = _returned(kept, width, rows)
+    returned = _returned(kept, width, len(rings))
     order = np.argsort([-ring.elevation for ring in rings])
     rings, returned = [rings[i] for i in order], returned[order]
     heights = tuple(round(ring.height, 3) for ring in rings)
@@ -80,58 +95,137 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         tilt=(round(float(ground[1]), 2), round(float(ground[2]), 2)),
         blocked=blocked_runs(returned, len(kept)),
     )
-    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), count - len(rows))
+    turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
+    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), missing, thin, merged, turns)
+
+
+def _guessed(scan: Scan) -> bool:
+    """Whether nothing but elevations tells the scan's rings."""
+    return scan.ring is None and rings_in_order(scan.xyz) is None
+
+
+def _named(known: str) -> str:
+    return f"it is a scan of {known}: --sensor {known}"
+
+
+def _check_sharp(rings: list[Ring], merged: int, scan: Scan, guessed: bool) -> None:
+    """Raises ValueError where most beams are wide, and where those of a known sensor were guessed and some are, or are
+    in pieces."""
+    fits = [ring for ring in rings if ring.points >= FEWEST]
+    wide = sum(ring.residual > SMEARED for ring in fits)
+    most = 2 * wide > len(fits)
+    if not most and not (guessed and (merged or wide)):
+        return
+    if (known := recognise(scan)[0]) is None and not most:
+        return
+    way = _named(known) if known else "give scans with rings, in the sensor's frame (lidarsynth info SCAN tells it)"
+    pieces = f" and {merged} in pieces" if guessed and merged else ""
+    raise ValueError(f"expected points within {SMEARED} degrees of their beams, found {wide} of {len(fits)} beams "
+                     f"wider{pieces}: {way}")  # fmt: skip
 
 
 def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[str]]:
     """(scan, ring of each point) of the scans with the usual number of rings, and in words what was left out."""
     found: list[tuple[Scan, np.ndarray]] = []
-    without = 0
+    without: list[Scan] = []
     for scan in scans:
         ring = rings_of(scan)
         if ring is None:
-            without += 1
+            without.append(scan)
         else:
             found.append((scan, ring))
     if not found:
+        known = "" if not without or (name := recognise(without[0])[0]) is None else f": {_named(name)}"
         raise ValueError(
             "expected scans with a ring field, one ring after the other, or beams that elevations show, "
-            f"found none in {without}"
+            f"found none in {len(without)}{known}"
         )
     counts = np.array([int(ring.max()) + 1 for _, ring in found])
     usual = int(np.bincount(counts).argmax())
     kept = [pair for pair, count in zip(found, counts, strict=True) if count == usual]
-    left = [f"{without} without rings"] if without else []
+    left = [f"{len(without)} without rings"] if without else []
     left += [f"{len(found) - len(kept)} with other than {usual} rings"] if len(kept) < len(found) else []
     return kept, left
 
 
+def _pooled(kept: list[tuple[Scan, np.ndarray]]) -> list[np.ndarray]:
+    """(N, 3) points of each ring, of all scans, at most SAMPLE of each."""
+    count = int(kept[0][1].max()) + 1
+    points: list[list[np.ndarray]] = [[] for _ in range(count)]
+    for number, (scan, ring) in enumerate(kept):
+        rng = np.random.default_rng(number)
+        for row, xyz in _rows(straighten(scan.xyz, ring, scan.time), ring, count):
+            points[row].append(rng.permutation(xyz)[:SAMPLE])
+    return [np.concatenate(parts) for parts in points]
+
+
 def _rows(xyz: np.ndarray, ring: np.ndarray, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """(row, its points beyond NEAR)."""
-    far = np.hypot(xyz[:, 0], xyz[:, 1]) > NEAR
+    """(row, its points beyond NEAR, or beyond SEEN where those are fewer than THIN)."""
+    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    lacking = np.bincount(ring[rho > NEAR], minlength=count) < THIN
+    far = rho > np.where(lacking[ring], SEEN, NEAR)
     order = np.argsort(ring[far], kind="stable")
     parts = np.split(xyz[far][order], np.cumsum(np.bincount(ring[far], minlength=count))[:-1])
     return enumerate(parts)
 
 
-def _fit_rows(points: list[list[np.ndarray]]) -> tuple[list[Ring], list[int]]:
-    """The fit of each row with points enough, and which rows those are."""
-    pooled = [np.concatenate(parts) if parts else np.zeros((0, 3), np.float32) for parts in points]
-    rows = [row for row, xyz in enumerate(pooled) if len(xyz) >= FEWEST]
+def _fit_rows(points: list[np.ndarray], least: int = THIN) -> tuple[list[Ring], np.ndarray]:
+    """The fit of each row, and the row of each ring: -1 of those of fewer than `least` points, one of several on one
+    beam."""
+    size = np.array([len(xyz) for xyz in points])
+    rows = np.flatnonzero(size >= FEWEST)
     if len(rows) < 2:
         raise ValueError(f"expected rings of at least {FEWEST} points beyond {NEAR:g} m, found {len(rows)}")
-    free, flat = ([fit_ring(pooled[row], height) for row in rows] for height in (None, 0.0))
+    group = _of_one_beam(_fits([points[row] for row in rows]))
+    fits = _fits([np.concatenate([points[row] for row in rows[group == own]]) for own in range(group.max() + 1)])
+    row_of = np.full(len(points), -1)
+    row_of[rows] = group
+    few = np.flatnonzero((size >= least) & (size < FEWEST))
+    row_of[few] = len(fits) + np.arange(len(few))
+    return fits + _roughly([points[row] for row in few], few, rows, [fits[own] for own in group]), row_of
+
+
+def _roughly(points: list[np.ndarray], few: np.ndarray, rows: np.ndarray, fits: list[Ring]) -> list[Ring]:
+    """The beams of rings `few` of few points, at the heights of their neighbours `rows`, and between these."""
+    elevations, heights = ([getattr(fit, key) for fit in fits] for key in ("elevation", "height"))
+    falling = (np.diff(elevations) < 0).all()
+    found = []
+    for row, xyz in zip(few, points, strict=True):
+        fit, after = fit_ring(xyz, float(np.interp(row, rows, heights))), int(np.searchsorted(rows, row))
+        inside = falling and 0 < after < len(rows)
+        if inside and not elevations[after] < fit.elevation < elevations[after - 1]:  # stray points
+            fit = replace(fit, elevation=float(np.interp(row, rows, elevations)))
+        found.append(fit)
+    return found
+
+
+def _of_one_beam(fits: list[Ring]) -> np.ndarray:
+    """(R,) int: rings of one beam are of one number, as those of two turns in one file; numbers rise with the rings."""
+    elevations = np.array([fit.elevation for fit in fits])
+    order = np.argsort(-elevations, kind="stable")
+    gaps = -np.diff(elevations[order])
+    apart = gaps[gaps > CLOSEST]
+    usual = float(np.median(apart)) if len(apart) else CLOSEST
+    group = np.zeros(len(fits), int)
+    group[order[1:]] = np.cumsum(gaps > SAME * usual)
+    _, first, same = np.unique(group, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[same]
+
+
+def _fits(points: list[np.ndarray]) -> list[Ring]:
+    """The fit of each row's points."""
+    free, flat = ([fit_ring(xyz, height) for xyz in points] for height in (None, 0.0))
     gain = np.median([fit.residual for fit in free]) / np.median([fit.residual for fit in flat])
     sure = np.array([fit.height_error < CERTAIN for fit in free])
     if gain > HALVED or not sure.any():
-        return flat, rows
+        return flat
     heights = np.interp(
-        np.arange(len(rows)), np.flatnonzero(sure), [f.height for f, s in zip(free, sure, strict=True) if s]
+        np.arange(len(points)), np.flatnonzero(sure), [f.height for f, s in zip(free, sure, strict=True) if s]
     )
     return [
-        fit if known else fit_ring(pooled[row], float(height))
-        for row, fit, known, height in zip(rows, free, sure, heights, strict=True)
-    ], rows
+        fit if known else fit_ring(xyz, float(height))
+        for xyz, fit, known, height in zip(points, free, sure, heights, strict=True)
+    ]
 
 
 def _falling(elevations: list[float]) -> tuple[float, ...]:
@@ -142,24 +236,28 @@ def _falling(elevations: list[float]) -> tuple[float, ...]:
 
 
 def _step(xyz: np.ndarray, ring: np.ndarray) -> float:
-    """Radians between neighbouring columns: the median step along the rings, steps over lost points left out."""
+    """Radians between neighbouring columns: the median step along the rings, steps over lost points left out, and such
+    that the fullest ring, had it returned as often all around, is at least half full."""
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     order = np.lexsort((azimuth, ring))
     step = np.diff(azimuth[order])[np.diff(ring[order]) == 0]
     usual = np.median(step[step > 1e-5])
-    return float(np.mean(step[(step > 0.25 * usual) & (step < 1.5 * usual)]))
+    degree = np.floor(np.degrees(azimuth)).astype(int) % 360
+    count = np.bincount(ring.astype(int) * 360 + degree, minlength=360 * (int(ring.max()) + 1)).reshape(-1, 360)
+    seen = (count > 0).sum(axis=1)
+    most = float((360 * count.sum(axis=1) / np.maximum(seen, 1)).max(initial=0, where=seen >= LEAST))
+    found = float(np.mean(step[(step > 0.25 * usual) & (step < 1.5 * usual)]))
+    return found if most == 0 else max(found, 2 * np.pi / (DENSER * most))
 
 
-def _returned(kept: list[tuple[Scan, np.ndarray]], width: int, rows: list[int]) -> np.ndarray:
-    """(rows, width) share of the scans in which a ray returned."""
-    place = np.full(max(rows) + 1, -1)
-    place[rows] = np.arange(len(rows))
-    total = np.zeros((len(rows), width), np.int32)
-    for scan, ring in kept:
-        inside = (ring <= max(rows)) & (place[np.minimum(ring, max(rows))] >= 0)
+def _returned(kept: list[tuple[Scan, np.ndarray]], width: int, rows: int) -> np.ndarray:
+    """(rows, width) share of the scans in which a ray returned; points of row -1 are of none."""
+    total = np.zeros((rows, width), np.int32)
+    for scan, row in kept:
+        inside = row >= 0
         turn = (1 - np.arctan2(scan.xyz[inside, 1], scan.xyz[inside, 0]) / np.pi) / 2
         seen = np.zeros_like(total, bool)
-        seen[place[ring[inside]], (turn * width).astype(int).clip(0, width - 1)] = True
+        seen[row[inside], (turn * width).astype(int).clip(0, width - 1)] = True
         total += seen
     return total / len(kept)
 

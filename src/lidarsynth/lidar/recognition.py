@@ -83,10 +83,10 @@ def _by_rings(
     xyz: np.ndarray, ring: np.ndarray, among: Mapping[str, Sensor], whole: bool = False
 ) -> tuple[str | None, str]:
     """`whole`: of at least nine tenths of the sensor's beams only."""
-    beams = _beams(xyz, ring)
+    _, beams = beams_of(xyz, ring)
     if len(beams) < 2:
         return None, f"{len(beams)} rings of at least 5 points"
-    middle = _elevation(beams, 0.0)
+    middle = median_elevations(beams)
     order = np.argsort(-middle, kind="stable")
     beams, middle = beams[order], middle[order]
     found = f"{len(beams)} rings from {middle[0]:+.1f} to {middle[-1]:+.1f} degrees"
@@ -102,8 +102,9 @@ def _by_rings(
     return None, found
 
 
-def _beams(xyz: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """(rings, ENOUGH, 3) points of each ring of at least 5, evenly from those beyond FAR, where those are 5 too."""
+def beams_of(xyz: np.ndarray, ring: np.ndarray, fewest: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (rings,) of the rings of at least `fewest` points, and points (rings, ENOUGH, 3) of each, evenly from
+    those beyond FAR, where those are 5 at least."""
     if (ring[1:] < ring[:-1]).any():
         order = np.argsort(ring, kind="stable")
         xyz, ring = xyz[order], ring[order]
@@ -116,7 +117,8 @@ def _beams(xyz: np.ndarray, ring: np.ndarray) -> np.ndarray:
     last = np.where(enough, farther[ends][:, None], ends[:, None]) - 1
     rank = first + np.linspace(0, (last - first)[:, 0], ENOUGH, axis=1).astype(int)
     place = np.where(enough, np.flatnonzero(far)[np.minimum(rank, far.sum() - 1)] if far.any() else rank, rank)
-    return xyz[place[ends - starts >= 5]]
+    enough = ends - starts >= fewest
+    return ring[starts[enough]], xyz[place[enough]]
 
 
 def _far(points: np.ndarray) -> np.ndarray:
@@ -135,7 +137,7 @@ def _whole_error(beams: np.ndarray, middle: np.ndarray, sensor: Sensor) -> float
         return None
     offsets, table = np.array(sensor.offsets), np.array(sensor.elevations)
     places = [slice(first, first + len(beams)) for first in range(spare + 1)]
-    seen = (_elevation(beams, offsets[rows]) if sensor.offsets else middle for rows in places)
+    seen = (median_elevations(beams, offsets[rows]) if sensor.offsets else middle for rows in places)
     return min(float(np.median(np.abs(e - table[rows]))) for e, rows in zip(seen, places, strict=True))
 
 
@@ -143,21 +145,21 @@ def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:
     """Mean distance of the rings from the nearest beams, in units of the spacing there; None if two meet one beam."""
     if len(beams) >= 0.9 * sensor.height or sensor.height < 32:
         return None
-    table, plain = np.array(sensor.elevations), _elevation(beams, 0.0)[:, None]
+    table, plain = np.array(sensor.elevations), median_elevations(beams)[:, None]
     near = np.argsort(np.abs(table - plain), axis=1)[:, :16]  # an offset of 0.2 m moves a near ring by a few beams
-    seen = _elevation(beams[:, None], np.array(sensor.offsets)[near]) if sensor.offsets else plain
-    distance = np.abs(seen - table[near]) / _spacing(sensor)[near]
+    seen = median_elevations(beams[:, None], np.array(sensor.offsets)[near]) if sensor.offsets else plain
+    distance = np.abs(seen - table[near]) / spacing(sensor)[near]
     rows = near[np.arange(len(near)), distance.argmin(axis=1)]
     return float(np.minimum(distance.min(axis=1), 1.0).mean()) if len(set(rows)) == len(beams) else None
 
 
-def _elevation(points: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
+def median_elevations(points: np.ndarray, offset: np.ndarray | float = 0.0) -> np.ndarray:
     """(...) median elevations in degrees of rings (..., N, 3), seen from `offset` metres above the sensor's origin."""
     height = points[..., 2] - np.asarray(offset, points.dtype)[..., None]
     return np.median(np.degrees(np.arctan2(height, np.hypot(points[..., 0], points[..., 1]))), axis=-1)
 
 
-def _spacing(sensor: Sensor) -> np.ndarray:
+def spacing(sensor: Sensor) -> np.ndarray:
     """(H,) degrees from each beam to its nearer neighbour."""
     gaps = -np.diff(np.array(sensor.elevations))
     return np.minimum(np.concatenate([gaps[:1], gaps]), np.concatenate([gaps, gaps[-1:]]))
@@ -185,7 +187,7 @@ def _share_on_beams(points: np.ndarray, sensor: Sensor) -> float:
     flat = np.hypot(points[:, 0], points[:, 1])[:, None]
     away = np.degrees(np.arctan2(points[:, 2:] - offsets, flat)) - table  # (N, H)
     row = np.abs(away).argmin(axis=1)
-    off = np.abs(away[np.arange(len(row)), row]) / _spacing(sensor)[row]
+    off = np.abs(away[np.arange(len(row)), row]) / spacing(sensor)[row]
     used = np.bincount(row[off < 0.1], minlength=sensor.height) > 0
     return float(((off < 0.1).mean() - (off > 0.4).mean()) * used.mean())
 

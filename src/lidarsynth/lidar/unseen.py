@@ -6,6 +6,7 @@ import numpy as np
 
 from lidarsynth.lidar.measured import were_new
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.turns import several_turns
 
 WIDE = 45  # degrees: confidences were fitted on wider holes, too, but what stands there is anyone's guess
 FEW = 0.15  # share of the usual points of a degree that are hardly any
@@ -18,8 +19,10 @@ def caution(scan: Scan) -> str | None:
         said.append(f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): "
                     "they are taken as they are, and stay marked")  # fmt: skip
     if len(scan) and (wide := widest_gap(scan.xyz)) > WIDE:
-        said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there "
-                    "is a guess")  # fmt: skip
+        said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there is "
+                    "a guess, most of which a least confidence of 0.5 leaves out; repaint draws a street")  # fmt: skip
+    if (turns := several_turns(scan)) is not None:
+        said.append(turns)
     return "; ".join(said) or None
 
 

@@ -120,9 +120,11 @@ def draw(
     on_column: Callable[[], None] = lambda: None,
     sharp: float = SHARP,
     heat: float = HEAT,
+    known: tuple[Grid, Tensor] | None = None,
 ) -> Grid:
     """Grids of rays (B, 8, 16, 128) after drafts (B, 7, 16, 128), each by a generator of its own.
 
+    known  grids, and which of their pixels (B, 16, 128) bool stay as they are; None = all are drawn
     sharp  the scale of what strays from its hypothesis, of that of recorded scans, whose noise is in it
     heat   of ranges and of whether rays return: below 1, the likeliest are chosen more often
     """
@@ -159,12 +161,9 @@ def draw(
             of_shade = network.shades(drawn, code, expected[0], copies, copied)
             lower = picked(*of_shade, u[:, 3:5], 1, 1, TONES)
             back = ((u[:, 0] < (drawn.returns / heat).sigmoid()) & (ray[:, 6] < 0.5)).float()
-            pixel = Grid(code * back, lower * back, back)
-            lower = pixel.shade
-            near, beneath = (
-                [nearness(pixel.code, back, ray), *near],
-                torch.cat([relative(pixel, ray), beneath[:, :-3]], 1),
-            )
+            pixel = _as_known(Grid(code * back, lower * back, back), known, i, j)
+            lower, near = pixel.shade, [nearness(pixel.code, pixel.returned, ray), *near]
+            beneath = torch.cat([relative(pixel, ray), beneath[:, :-3]], 1)
             column.append(pixel)
         for part, new in zip(grid, zip(*column, strict=True), strict=True):
             part[..., j] = torch.stack(new[::-1], 1)
@@ -172,6 +171,14 @@ def draw(
         memory.see(torch.stack(near[:ROWS], 1))
         on_column()
     return grid
+
+
+def _as_known(pixel: Grid, known: tuple[Grid, Tensor] | None, row: int, column: int) -> Grid:
+    """Pixels (B,) as they are known, where they are."""
+    if known is None:
+        return pixel
+    of, here = (Grid(*(part[:, row, column] for part in known[0])), known[1][:, row, column])
+    return Grid(*(torch.where(here, k, p) for k, p in zip(of, pixel, strict=True)))
 
 
 def _shades_left(grid: Grid, column: int) -> list[tuple[Tensor, ...]]:

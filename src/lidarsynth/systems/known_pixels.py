@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidarsynth.lidar.own_beams import own_beams
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -28,7 +29,8 @@ def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
         sensor_in, reason = recognise(scan)
         if sensor_in is None:
             raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
-    return get_sensor(sensor_in) if isinstance(sensor_in, str) else sensor_in
+        return own_beams(scan, get_sensor(sensor_in))
+    return get_sensor(sensor_in)
 
 
 def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeImage, np.ndarray]:

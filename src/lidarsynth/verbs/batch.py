@@ -33,6 +33,7 @@ from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 
+THIN = 0.1  # of the usual points of a ring; fewer do not make it one more than a sensor's beams
 FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
 FIELDS = {"realise": realised_fields, "label": labelled_fields}  # of a bag's messages; of the others, `message_fields`
 
@@ -181,9 +182,12 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
 
 def _misfit(scan: Scan, job: Job) -> str | None:
     """That the points cannot be of the sensor that was named as theirs, in one line."""
-    if job.sensor is None or job.verb not in ("complete", "upsample", "label"):
+    if job.sensor is None or job.verb not in ("complete", "upsample", "label", "realise"):
         return None
     sensor = get_sensor(job.sensor)
+    if scan.ring is not None and len(scan):  # what learning a sensor may leave out is no other sensor's
+        _, own, count = np.unique(scan.ring, return_inverse=True, return_counts=True)
+        scan = scan[count[own] >= THIN * np.median(count)]
     found = misfit(scan.xyz, sensor, scan.ring)
     return found and f"expected points of {sensor.name}, found {found}: is it another sensor, or another frame " \
                      "(--transform, --mount)?"  # fmt: skip

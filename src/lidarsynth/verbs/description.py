@@ -14,15 +14,21 @@ from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.systems.table import build_network, system_of
-from lidarsynth.verbs.file_kinds import file_lines
+from lidarsynth.verbs.file_kinds import file_lines, moves
+from lidarsynth.verbs.inputs import Reading
 from lidarsynth.weights.load import load_parts, shipped
 
 
-def describe(what: str) -> str:
-    """Lines about a scan file, a sensor, a preset, or weights as `load` takes them. Raises ValueError for others."""
-    path = Path(what)
-    if lines := file_lines(path):
+def describe(what: str, reading: Reading | None = None) -> str:
+    """Lines about a scan file, a sensor, a preset, or weights as `load` takes them. Raises ValueError for others.
+
+    reading  how scans are read; where it moves points or takes rings of them, what holds no scan is refused
+    """
+    path, reading = Path(what), reading or Reading()
+    if lines := file_lines(path, reading):
         return _table(str(path), lines)
+    if moves(reading):
+        raise ValueError(f"{what}: expected a scan to move or take rings of, found a word, a sensor or a model")
     if what in SENSORS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
     if what in PRESETS and what not in shipped() and not path.is_dir():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -17,11 +18,11 @@ from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
-from lidarsynth.lidar.frame import check_frame
+from lidarsynth.lidar.frame import check_frame, transformed
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict
-from lidarsynth.verbs.inputs import has_scans, is_stream
+from lidarsynth.verbs.inputs import Reading, has_scans, is_stream
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 
@@ -29,10 +30,16 @@ Lines = dict[str, str]
 LOOKED_AT = 400  # packets of a capture that are counted
 
 
-def file_lines(path: Path) -> Lines | None:
+def moves(reading: Reading) -> bool:
+    """Whether points are to be moved, or some rings of them taken."""
+    return reading.transform is not None or reading.rings is not None
+
+
+def file_lines(path: Path, reading: Reading) -> Lines | None:
     """What a path is, as lines by title, or None for what is no file of ours to tell: a model, a sensor, a word.
 
-    Raises FileError, in one line, for a file that is broken or of no kind that is known.
+    reading  of which transform and rings count
+    Raises FileError, in one line, for a file that is broken or of no kind that is known, or holds no scan to move.
     """
     model = path.name in (WEIGHTS, RECORD) or (path.is_dir() and (path / RECORD).exists())
     if model or path.suffix.lower() in MODELS:
@@ -44,13 +51,20 @@ def file_lines(path: Path) -> Lines | None:
     if path.is_dir():
         if not any(path.iterdir()):
             raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
-        return _bag(path) if is_bag(path) else _cache(path) if (path / INDEX).exists() else _folder(path)
+        if is_bag(path):
+            return _bag(path, reading)
+        if not (path / INDEX).exists():
+            return _folder(path, reading)
     if path.name.lower().endswith(tuple(READERS)):
-        return _image(path) | _scan_file(path)
+        return _image(path) | _scan_file(path, reading)
     if is_bag(path):
-        return _bag(path)
+        return _bag(path, reading)
     if is_capture(path):
-        return _capture(path)
+        return _capture(path, reading)
+    if moves(reading):
+        raise FileError(f"{path}: expected a scan to move or take rings of, found another kind of file or folder")
+    if path.is_dir():
+        return _cache(path)
     if path.suffix.lower() in KINDS:
         return KINDS[path.suffix.lower()](path)
     if lines := other_lines(path):
@@ -72,19 +86,21 @@ def _image(path: Path) -> Lines:
                     f"{image.mask.mean():.1%} of its pixels filled"}  # fmt: skip
 
 
-def _scan_file(path: Path) -> Lines:
+def _scan_file(path: Path, reading: Reading) -> Lines:
     """Of a scan; also of one without intensities, for which other verbs want to be told that."""
     try:
-        return scan_lines(*read_with_report(path))
+        return scan_lines(*read_with_report(path, rings=reading.rings), reading)
     except FileError as error:
         if "--intensity none" not in str(error):
             raise
         none = {"reflectance": "none in the file: --intensity none for the other verbs"}
-        return scan_lines(*read_with_report(path, "none")) | none
+        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | none
 
 
-def scan_lines(scan: Scan, dropped: int = 0) -> Lines:
-    """Points, range, reflectance, fields, sensor and frame of a scan."""
+def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
+    """Points, range, reflectance, fields, sensor and frame of a scan, moved as `reading` says."""
+    if reading.transform is not None:
+        scan = replace(scan, xyz=transformed(scan.xyz, reading.transform))
     name, reason = recognise(scan)
     depth, light = np.linalg.norm(scan.xyz, axis=1), scan.reflectance
     own = [field for field in ("ring", "time", "label") if getattr(scan, field) is not None]
@@ -99,7 +115,7 @@ def scan_lines(scan: Scan, dropped: int = 0) -> Lines:
     return lines | ({"frame": warning} if warning else {})
 
 
-def _bag(path: Path) -> Lines:
+def _bag(path: Path, reading: Reading) -> Lines:
     with open_bag(path) as bag:
         lines = {"kind": f"bag of {bag.seconds:.1f} s, {len(bag.topics)} topics"}
         for topic in bag.topics:
@@ -109,8 +125,8 @@ def _bag(path: Path) -> Lines:
         for name in clouds:
             first = next(bag.clouds(name), None)
             if isinstance(first, Cloud):
-                scan, dropped = scan_from_fields(first.fields, _scale(first))
-                lines |= {f"{name}: {key}": text for key, text in scan_lines(scan, dropped).items()}
+                scan, dropped = scan_from_fields(first.fields, _scale(first), reading.rings)
+                lines |= {f"{name}: {key}": text for key, text in scan_lines(scan, dropped, reading).items()}
     return lines
 
 
@@ -119,16 +135,16 @@ def _scale(cloud: Cloud) -> str:
     return "auto" if any(name.lower() in known for name in cloud.fields) else "none"
 
 
-def _capture(path: Path) -> Lines:
+def _capture(path: Path, reading: Reading) -> Lines:
     sizes = Counter((p.sender, len(p.payload)) for p in islice(datagrams(path), LOOKED_AT))
     listed = ", ".join(f"{count} of {size} bytes as {sender}" for (sender, size), count in sizes.most_common(6))
     listed += ", ..." if len(sizes) > 6 else ""
     lines = {"kind": "network capture", "packets": f"{listed or 'none'} (of the first {LOOKED_AT})"}
     found = senders(path)
     for sender in found:
-        scan, dropped = scan_from_fields(next(capture_turns(path, None, sender)))
+        scan, dropped = scan_from_fields(next(capture_turns(path, None, sender)), rings=reading.rings)
         title = "first turn" if len(found) == 1 else f"--topic {sender}"
-        lines |= {f"{title}: {key}": text for key, text in scan_lines(scan, dropped).items()}
+        lines |= {f"{title}: {key}": text for key, text in scan_lines(scan, dropped, reading).items()}
     return lines
 
 
@@ -141,11 +157,13 @@ def _cache(path: Path) -> Lines:
     return lines | {key: str(len(told[key])) for key in ("sequences", "skipped", "missing")}
 
 
-def _folder(path: Path) -> Lines:
+def _folder(path: Path, reading: Reading) -> Lines:
     """A folder of scans, or of bags and captures: what it holds, what else, and the first scan."""
     files, streams = scan_files(path) if has_scans(path) else [], sorted(p for p in path.iterdir() if is_stream(p))
     if not files and not streams:
         raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
+    if not files and moves(reading):
+        raise FileError(f"{path}: expected a scan to move or take rings of, found bags and captures: name one of them")
     if not files:
         listed = ", ".join(p.name for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
         return {"kind": f"folder of {len(streams)} bags and captures", "files": listed}
@@ -153,7 +171,7 @@ def _folder(path: Path) -> Lines:
     if rest := _counted(path, files):
         lines["passed over"] = rest
     try:
-        first = {f"first: {key}": text for key, text in _scan_file(files[0]).items()}
+        first = {f"first: {key}": text for key, text in _scan_file(files[0], reading).items()}
     except FileError as error:
         first = {"first: broken": str(error)}
     return lines | {"first": str(files[0].relative_to(path))} | first

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
-from lidarsynth.lidar.learning import FEWEST, NEAR, LearnedSensor, learn_sensor
+from lidarsynth.lidar.learning import FEWEST, NEAR, SMEARED, LearnedSensor, learn_sensor
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.inputs import Input, Inputs
 
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
-SMEARED = 0.1  # degrees: known sensors' points lie within 0.03 of their beams where nothing has moved them
 
 
 def learn(inputs: Inputs, name: str) -> LearnedSensor:
@@ -87,8 +86,9 @@ def summary(learned: LearnedSensor) -> str:
 
 
 def doubts(learned: LearnedSensor) -> list[str]:
-    """Why the beams are not to be trusted, a line each: points more than SMEARED degrees off some, rings left out."""
-    name, known, missing = learned.sensor.name, len(learned.rings), learned.missing
+    """Why the beams are not to be trusted, a line each: points more than SMEARED degrees off some, rings of few points,
+    beams of several rings, scans of several turns."""
+    name, known = learned.sensor.name, len(learned.rings)
     smeared = sum(ring.residual > SMEARED for ring in learned.rings)
     found = []
     if smeared:
@@ -96,9 +96,15 @@ def doubts(learned: LearnedSensor) -> list[str]:
             f"{name}: expected points within {SMEARED} degrees of their beams, found {smeared} of {known} beams wider: "
             "its elevations may be off; give scans with rings, as the sensor sent them, or name the sensor"
         )
-    if missing:
+    if few := learned.missing + learned.thin:
+        kept = f" of the fit, {learned.thin} with their few points as rows" if learned.thin else ""
         found.append(
-            f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {missing + known} rings, found fewer in "
-            f"{missing}, which are left out: give scans of wider places, or more of them"
+            f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {few + known - learned.thin} rings, found "
+            f"fewer in {few}, which are left out{kept}: give scans of wider places, or more of them"
         )
+    took = f"{learned.merged} rings are taken as one beam with another"
+    if learned.turns:
+        found.append(f"{name}: {learned.turns} ({took if learned.merged else 'its columns may be too many'})")
+    elif learned.merged:
+        found.append(f"{name}: expected each beam in one ring, found its points in two (twice in the file?): {took}")
     return found

@@ -1,6 +1,10 @@
-"""Large holes, where nothing is known around: a coarse grid of them by RePaint."""
+"""Large holes, where nothing is known around: drawn as generated scans are, around what is known."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -8,68 +12,104 @@ from torch import Tensor
 
 from lidarsynth.diffusion import repaint
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.samplers import even_log_snr, noise_like
+from lidarsynth.diffusion.samplers import State, even_log_snr, noise_like
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.systems.cascade.known import widened
-from lidarsynth.systems.cascade.layout import velocity
+from lidarsynth.networks.column_neighbours import known_grid
+from lidarsynth.networks.column_transformer import draw
+from lidarsynth.networks.drafts import drafted
+from lidarsynth.systems.cascade.known import band_of, best_known, widened
+from lidarsynth.systems.cascade.layout import RaysOf, detailed, one_thread, to_draft, velocity
 from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep
 
 
+class Told(NamedTuple):
+    """What is known of an image (H, W): metres, 0 where nothing returned, reflectance, and which pixels."""
+
+    metres: np.ndarray
+    reflectance: np.ndarray
+    known: np.ndarray
+
+
 def repainted(
-    denoiser: Denoiser, known: Tensor, here: Tensor, rng: list[torch.Generator], how: Filling, on_step: OnStep
-) -> Tensor:
-    """x_0 (B, 3, 16, 128) that agrees with `known` `here` (B, 1, 16, 128) bool, after a resolved request's steps."""
+    denoiser: Denoiser,
+    known: Tensor,
+    here: Tensor,
+    rng: list[torch.Generator],
+    how: Filling,
+    on_step: OnStep,
+    to_the_end: bool = True,
+) -> State:
+    """The state of x_0, or of a draft, that agrees with `known` (B, 3, 16, 128) `here` (B, 1, 16, 128) bool, after a
+    resolved request's steps."""
     assert how.steps is not None and how.resamples is not None
-    x_1 = x_0 = noise_like(known, rng)
-    for state in repaint.repaint(
-        denoiser, x_1, known, here, rng, steps=how.steps, resamples=how.resamples, grid=even_log_snr
-    ):
-        x_0 = state.x_s
-        if on_step is not None:
-            on_step()
-    return x_0
+    times = even_log_snr if to_the_end else to_draft
+    states = repaint.repaint(
+        denoiser, noise_like(known, rng), known, here, rng, steps=how.steps, resamples=how.resamples, grid=times
+    )
+    *_, last = map(partial(_told, on_step or (lambda: None)), states)
+    return last
+
+
+def _told(on_step: Callable[[], object], state: State) -> State:
+    on_step()
+    return state
 
 
 def with_holes_drawn(
     network: Cascade,
-    told: tuple[np.ndarray, np.ndarray, np.ndarray],
-    grid: tuple[np.ndarray, ...],
-    cell: np.ndarray,
-    beams: tuple[Sensor, np.ndarray, Tensor, Tensor],
+    told: Told,
+    sensor: Sensor,
+    unevenness: np.ndarray,
+    rays_of: RaysOf,
     rng: list[torch.Generator],
     how: Filling,
     on_step: OnStep,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Metres, reflectance and known pixels (H, W), as `told`, with a grid of new ones where nothing is known around.
+) -> Told:
+    """What is told, with a grid of new pixels where nothing is known around.
 
-    grid   rows and columns (16, 128), which know most; cell: which of its cells know any
-    beams  the sensor, how dim the grid's beams are (16, 1), its rays (1, 8, 16, 128) and standing elevations
+    unevenness  (H, 1) how dim beams are
+    rays_of     rows, columns -> rays (1, 8, R, C) and standing elevations (1, R, C)
+
+    A draft of the whole turn, which agrees with what is known, by RePaint; then the columns, of which known pixels stay
+    as they are, and what is between. Without columns, RePaint to the end.
     """
-    sensor, dim, rays, standing = beams
-    values = (torch.from_numpy(v[grid].astype(np.float32))[None].to(rays.device) for v in told[:2])
-    here, dimness = (torch.from_numpy(part).to(rays.device) for part in (told[2][grid][None, None], dim))
-    known = network.coarse.encode(*values, standing, dimness)  # type: ignore[call-arg]
+    rows, columns, cell = best_known(told.known)
+    rays, standing = rays_of(rows, columns)
+    metres, shade, known = (part[np.ix_(rows, columns)][None] for part in told)
+    values = torch.from_numpy(metres.astype(np.float32)).to(rays), torch.from_numpy(shade.astype(np.float32)).to(rays)
+    here, dim = torch.from_numpy(known).to(rays.device), torch.from_numpy(unevenness[rows]).to(rays)
+    code = network.coarse.encode(*values, standing, dim)
     # What is known guides; a sector lost erred 6.1 m for 4.3 with both.
-    x_0 = repainted(velocity(network, rays, guided=False), known, here, rng, how, on_step)
-    drawn, shades = network.coarse.decode(x_0, standing, dimness)
-    new = (part[0].cpu().numpy() for part in (straightened(drawn, grid[0].ravel(), sensor), shades))
-    return with_grid(told, grid, ~widened(cell), *new, sensor)  # type: ignore[call-arg]
+    denoiser = velocity(network, rays, guided=False)
+    state = repainted(denoiser, code, here[:, None], rng, how, on_step, network.columns is None)
+    if network.columns is None:
+        drawn, light = network.coarse.decode(state.x_s, standing, dim)
+        parts = straightened(drawn, rows, sensor), light, rows, columns
+    else:
+        after = drafted(network.coarse, state.x_s, state.s, rays, standing)
+        with one_thread():
+            grid = draw(network.columns, rays, after, rng, known=(known_grid(values[0], values[1] + dim), here))
+        parts = detailed(network, grid, rows, columns, rays_of, sensor, rng)
+    new = parts[0][0].cpu().numpy(), parts[1][0].cpu().numpy()
+    return _placed(told, ~widened(cell), *new, parts[2], parts[3], sensor.max_range)
 
 
-def with_grid(
-    told: tuple[np.ndarray, np.ndarray, np.ndarray],
-    grid: tuple[np.ndarray, ...],
+def _placed(
+    told: Told,
     hole: np.ndarray,
     metres: np.ndarray,
     reflectance: np.ndarray,
-    sensor: Sensor,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Metres, reflectance and known pixels (H, W), with those of the `grid` (16, 128) where there is a `hole`."""
-    whole = tuple(part.copy() for part in told)
-    metres = np.where(metres > sensor.max_range, 0, metres)
-    for part, new in zip(whole, (metres, reflectance, True), strict=True):
-        part[grid] = np.where(hole, new, part[grid])
-    return whole  # type: ignore[return-value]
+    rows: np.ndarray,
+    columns: np.ndarray,
+    farthest: float,
+) -> Told:
+    """What is told, with pixels (R, C) of these rows and columns where a cell (16, 128) is a `hole`."""
+    whole, grid = Told(*(part.copy() for part in told)), np.ix_(rows, columns)
+    height, width = told.known.shape
+    inside = hole[np.ix_(band_of(rows, height, hole.shape[0]), band_of(columns, width, hole.shape[1]))]
+    for part, new in zip(whole, (np.where(metres > farthest, 0, metres), reflectance, True), strict=True):
+        part[grid] = np.where(inside, new, part[grid])
+    return whole

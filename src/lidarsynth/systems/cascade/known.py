@@ -68,14 +68,24 @@ def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, 
 
 
 def best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each of 16 x 128 bands the row and the column with most known pixels, and which cells hold any: (16, 128)."""
+    """Of each of 16 x 128 bands the row and the column with most known pixels, and which cells hold any: (16, 128).
+
+    Of bands of the same height the same row of each, so that there is one between each two wherever there can be.
+    """
     rows, columns = (
         np.linspace(0, size, count + 1).astype(int) for size, count in zip(told.shape, (ROWS, COLUMNS), strict=True)
     )
     row = np.array([a + told[a:b].sum(1).argmax() for a, b in pairwise(rows)])
+    if len(told) % ROWS == 0:
+        row = rows[:-1] + told.sum(1).reshape(ROWS, -1).sum(0).argmax()
     column = np.array([a + told[:, a:b].sum(0).argmax() for a, b in pairwise(columns)])
     cell = np.add.reduceat(np.add.reduceat(told.astype(int), rows[:-1], 0), columns[:-1], 1) > 0
     return row, column, cell
+
+
+def band_of(places: np.ndarray, size: int, count: int) -> np.ndarray:
+    """Which of `count` bands of rows or columns 0 .. size - 1, as `best_known` has them, each of the places is in."""
+    return np.searchsorted(np.linspace(0, size, count + 1).astype(int), places, side="right") - 1
 
 
 def widened(cell: np.ndarray) -> np.ndarray:

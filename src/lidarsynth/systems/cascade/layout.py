@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import torch
@@ -64,16 +65,20 @@ def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
     return Denoiser(answers, flow(BOUND), "velocity", clip=False, condition=(rays,))
 
 
+def to_draft(schedule: Schedule, steps: int, t: float = DRAFT) -> Tensor:
+    """steps + 1 times from 1 to t, equally far apart in log_snr."""
+    first, last = schedule.log_snr(torch.tensor([1.0, t], dtype=torch.float64)).tolist()
+    return schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64)).clamp(max=1)
+
+
 def draft(network: Cascade, rays: Tensor, standing: Tensor, rng: list[torch.Generator], t: float = DRAFT) -> Tensor:
     """(B, 7, 16, 128) what `drafted` says of noise that was led to time t, for rays (B, 8, 16, 128) of standing
     elevations (B, 16, 128) in radians, each by a generator of its own."""
 
-    def to_draft(schedule: Schedule, steps: int) -> Tensor:
-        first, last = schedule.log_snr(torch.tensor([1.0, t], dtype=torch.float64)).tolist()
-        return schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64)).clamp(max=1)
-
     x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
-    *_, last = sample(velocity(network, rays, guided=True), x_1, STEPS["dpmpp-2m"], DRAFT_STEPS, rng, to_draft)
+    *_, last = sample(
+        velocity(network, rays, guided=True), x_1, STEPS["dpmpp-2m"], DRAFT_STEPS, rng, partial(to_draft, t=t)
+    )
     return drafted(network.coarse, last.x_s, last.s, rays, standing)
 
 
@@ -120,16 +125,7 @@ def grids(
         after = draft(network, told, standing, rng)
         with one_thread():
             grid = draw(network.columns, told, after, rng, on_step)
-        grid = _straight(grid, rows, sensor)
-        grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
-        grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
-        if len(rows) > ROWS:
-            grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
-        grid = landed(grid, rng)
-        shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
-        dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
-        parts = (_metres(grid), (shade - dim).clamp(0, 1) * grid.returned)
-        return parts[0][..., order], parts[1][..., order], rows, columns[order]
+        return detailed(network, grid, rows, columns, rays_of, sensor, rng)
     dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
     for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
@@ -137,6 +133,28 @@ def grids(
         on_step()
     metres, shade = network.coarse.decode(network.settled(x_0, told), standing, dim)
     return straightened(metres, rows, sensor), shade, rows, columns
+
+
+def detailed(
+    network: Cascade,
+    grid: Grid,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    rays_of: RaysOf,
+    sensor: Sensor,
+    rng: list[torch.Generator],
+) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
+    """As `grids`, of drawn columns: put straight, with what is between them and between their beams."""
+    grid = _straight(grid, rows, sensor)
+    grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
+    grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
+    if len(rows) > ROWS:
+        grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
+    grid = landed(grid, rng)
+    shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
+    dim = torch.from_numpy(unevenness(sensor)[rows]).to(shade.device)
+    parts = (_metres(grid), (shade - dim).clamp(0, 1) * grid.returned)
+    return parts[0][..., order], parts[1][..., order], rows, columns[order]
 
 
 def _finer(

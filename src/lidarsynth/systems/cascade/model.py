@@ -27,7 +27,7 @@ from lidarsynth.streets.hdl64e import hidden, written_out
 from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
-from lidarsynth.systems.cascade.holes import with_holes_drawn
+from lidarsynth.systems.cascade.holes import Told, with_holes_drawn
 from lidarsynth.systems.cascade.images import (
     GENERATED,
     SPECKLE,
@@ -43,7 +43,7 @@ from lidarsynth.systems.cascade.images import (
     textured,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import best_known, known_of, rays_told, spread, unanswered
+from lidarsynth.systems.cascade.known import known_of, rays_told, spread, unanswered
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
@@ -156,11 +156,9 @@ class CascadeModel(AnySensorModel):
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
             grid_of(self.sensor)  # refuses those that are smaller
-            rows, columns, cell = best_known(told)
-            dim, grid = own.response.unevenness(self.sensor)[rows], np.ix_(rows, columns)
-            beams = self.sensor, dim, *own._grid_rays(rows, columns, 1)
-            parts = with_holes_drawn(self.network, (metres, reflectance, told), grid, cell, beams, rng, how, on_step)
-            metres, reflectance, told = parts
+            dim, rays_at = own.response.unevenness(self.sensor), partial(own._grid_rays, count=1)
+            parts = Told(metres, reflectance, told), self.sensor, dim, rays_at, rng, how, on_step
+            metres, reflectance, told = with_holes_drawn(self.network, *parts)
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
