@@ -1,12 +1,18 @@
 """Large holes are drawn as streets are, around what is known."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
+import torch
 
 import lidarsynth as ls
+from lidarsynth.diffusion.samplers import generators
 from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.systems.cascade.holes import Told, _placed
+from lidarsynth.systems.cascade.holes import Told, _placed, with_holes_drawn
 from lidarsynth.systems.cascade.known import band_of, best_known
+from lidarsynth.systems.filling import Filling
 
 HDL = ls.get_sensor("hdl-64e-kitti")
 
@@ -32,6 +38,20 @@ def test_what_is_known_stays_and_the_hole_is_a_street(halves: list[tuple[ls.Rang
             x, y, z = of.points()[mask].T
             ground.append(np.mean(np.abs(z[np.hypot(x, y) < 12] + HDL.mount) < 0.3))
         assert ground[1] > 0.5 * ground[0], "the ground goes on"
+
+
+def test_what_is_drawn_reads_as_dim_as_the_beams_do():
+    """Of beams that read 0.2 less than others, what is drawn does too: as much as what is known of the same street."""
+    image, model = SyntheticStreets(4321, 16, replace(HDL, name="own")).image(0), ls.load("default")
+    known = ls.corrupt(image, "sector:180:180")
+    own, dim = model.into(image.sensor), np.full((64, 1), 0.2, np.float32)
+    told = Told(image.range * image.mask, np.maximum(image.reflectance - dim, 0), known)
+    how, rays_of = Filling("repaint", 2, 1), partial(own._grid_rays, count=1)
+    with torch.inference_mode():
+        parts = model.network, told, image.sensor, dim, rays_of, generators(1, 1), how, None
+        drawn = with_holes_drawn(*parts)
+    new = drawn.known & ~known & (drawn.metres > 0)
+    assert drawn.reflectance[new].mean() < told.reflectance[known & image.mask].mean() + 0.08
 
 
 def test_samples_of_a_hole_differ_by_their_seeds(halves: list[tuple[ls.RangeImage, ls.RangeImage]]):

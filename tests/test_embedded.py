@@ -189,6 +189,7 @@ def test_wrong_arguments_get_one_line(model: ls.ScanModel, scan: ls.Scan, image:
         "expected a sensor or its word, found a NoneType": lambda: model.into(None),  # type: ignore[arg-type]
         "expected a sensor or its word, found a int": lambda: model.label(scan, 3),  # type: ignore[arg-type]
         "expected times that is a whole number, found 2.0": lambda: model.upsample(scan, times=2.0),  # type: ignore[arg-type]
+        "expected a whole number of at least 2 times .*, found 0": lambda: model.upsample(scan, "vlp-16", times=0),
         "expected rings .first, last., found '0-31'": lambda: ls.read("x.pcd", rings="0-31"),  # type: ignore[arg-type]
         "expected a folder, files or .* found a RangeImage": lambda: ls.evaluate(image, [image]),  # type: ignore[arg-type]
         "expected a protocol of .*, found None": lambda: ls.evaluate([image], [image], protocol=None),  # type: ignore[arg-type]

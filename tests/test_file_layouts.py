@@ -189,7 +189,7 @@ def test_nuscenes_is_turned_into_our_frame_and_counts_rings_from_the_bottom(scan
     table.tofile(tmp_path / "scan.pcd.bin")
     found = read(tmp_path / "scan.pcd.bin")
     np.testing.assert_array_equal(found.xyz, scan.xyz, "x is forward everywhere")
-    np.testing.assert_allclose(found.reflectance, dark, rtol=1e-5)
+    np.testing.assert_allclose(found.reflectance, dark, rtol=1e-6)
     np.testing.assert_array_equal(found.ring, scan.ring)
 
 

@@ -60,8 +60,8 @@ def evaluate(
     seed       of the subsets of the squared MMDs
 
     Published networks that a protocol asks for are downloaded once, as `load` downloads releases; rows whose network is
-    not to be had are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values
-    that are not finite, statistics of another protocol, a device that is not here.
+    not to be had are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values that are not
+    finite, statistics of another protocol, a device that is not here.
     """
     start = time.monotonic()
     _check_numbers({"batch_size": (batch_size, 1), "seed": (seed, 0)})

@@ -20,7 +20,7 @@ def caution(scan: Scan) -> str | None:
                     "they are taken as they are, and stay marked")  # fmt: skip
     if len(scan) and (wide := widest_gap(scan.xyz)) > WIDE:
         said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there is "
-                    "a guess, most of which a least confidence of 0.5 leaves out; repaint draws a street")  # fmt: skip
+                    "a guess; of default's a least confidence of 0.5 leaves most out, repaint draws one")  # fmt: skip
     if (turns := several_turns(scan)) is not None:
         said.append(turns)
     return "; ".join(said) or None

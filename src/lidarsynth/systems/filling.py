@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from operator import index
 
 
-def whole(name: str, number: int | None) -> int | None:
-    """The number as Python's own, or None. Raises ValueError for one that is not whole."""
+def whole(name: str, number: int) -> int:
+    """The number as Python's own. Raises ValueError for one that is not whole."""
     try:
-        return None if number is None else index(number)
+        return index(number)
     except TypeError:
         raise ValueError(f"expected {name} that is a whole number, found {number!r}") from None
 
@@ -48,7 +48,7 @@ class Filling:
     def at_least_one(self) -> Filling:
         """The same. Raises ValueError for counts below 1."""
         for name in ("steps", "resamples"):
-            if (number := whole(name, getattr(self, name))) is not None and number < 1:
+            if (number := getattr(self, name)) is not None and whole(name, number) < 1:
                 raise ValueError(f"expected {name} of at least 1, found {number}")
         return self
 

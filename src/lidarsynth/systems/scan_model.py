@@ -120,7 +120,8 @@ class ScanModel(ABC):
 
     def _checked(self, n: int, steps: int | None, seed: int, sampler: str | None, batch_size: int, first: int) -> None:
         """Raises ValueError for what `stream` cannot do."""
-        check_counts(n, self.generation_steps(whole("steps", steps), sampler), batch_size, first)
+        asked = None if steps is None else whole("steps", steps)
+        check_counts(n, self.generation_steps(asked, sampler), batch_size, first)
         checked_seed(seed)
 
     def complete(

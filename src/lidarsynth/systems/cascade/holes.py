@@ -70,7 +70,7 @@ def with_holes_drawn(
 ) -> Told:
     """What is told, with a grid of new pixels where nothing is known around.
 
-    unevenness  (H, 1) how dim beams are
+    unevenness  (H, 1) how much less than the mean beam each reads, in reflectance
     rays_of     rows, columns -> rays (1, 8, R, C) and standing elevations (1, R, C)
 
     A draft of the whole turn, which agrees with what is known, by RePaint; then the columns, of which known pixels stay
@@ -92,7 +92,7 @@ def with_holes_drawn(
         after = drafted(network.coarse, state.x_s, state.s, rays, standing)
         with one_thread():
             grid = draw(network.columns, rays, after, rng, known=(known_grid(values[0], values[1] + dim), here))
-        parts = detailed(network, grid, rows, columns, rays_of, sensor, rng)
+        parts = detailed(network, grid, (rows, columns), rays_of, sensor, unevenness, rng)
     new = parts[0][0].cpu().numpy(), parts[1][0].cpu().numpy()
     return _placed(told, ~widened(cell), *new, parts[2], parts[3], sensor.max_range)
 

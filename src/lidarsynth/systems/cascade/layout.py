@@ -125,7 +125,7 @@ def grids(
         after = draft(network, told, standing, rng)
         with one_thread():
             grid = draw(network.columns, told, after, rng, on_step)
-        return detailed(network, grid, rows, columns, rays_of, sensor, rng)
+        return detailed(network, grid, (rows, columns), rays_of, sensor, unevenness(sensor), rng)
     dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
     for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
@@ -138,13 +138,18 @@ def grids(
 def detailed(
     network: Cascade,
     grid: Grid,
-    rows: np.ndarray,
-    columns: np.ndarray,
+    places: tuple[np.ndarray, np.ndarray],
     rays_of: RaysOf,
     sensor: Sensor,
+    dimness: np.ndarray,
     rng: list[torch.Generator],
 ) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
-    """As `grids`, of drawn columns: put straight, with what is between them and between their beams."""
+    """As `grids`, of a grid (B, 16, 128) of drawn columns: put straight, with what is between them and their beams.
+
+    places   its rows (16,) and columns (128,) of the sensor
+    dimness  (H, 1) how much less than the mean beam each of the sensor's reads, in reflectance
+    """
+    rows, columns = places
     grid = _straight(grid, rows, sensor)
     grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
     grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
@@ -152,7 +157,7 @@ def detailed(
         grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
     grid = landed(grid, rng)
     shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
-    dim = torch.from_numpy(unevenness(sensor)[rows]).to(shade.device)
+    dim = torch.from_numpy(dimness[rows]).to(shade.device)
     parts = (_metres(grid), (shade - dim).clamp(0, 1) * grid.returned)
     return parts[0][..., order], parts[1][..., order], rows, columns[order]
 

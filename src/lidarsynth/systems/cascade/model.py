@@ -191,7 +191,7 @@ class CascadeModel(AnySensorModel):
         if how.precision is not None:
             model = self.at_precision(how.precision)
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
-        scan, times = as_scan(scan), whole("times", times) or TIMES
+        scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
         sparse = self.into(own).image_of(scan)
         if not sparse.mask.any():
