@@ -35,7 +35,7 @@ def upsample(
     sensor_in: Annotated[SensorWord, arg(name="from")] = None,
     sensor_out: SensorOut = None,
     times: Annotated[
-        int | None, arg(metavar="INT", help="as many beams as its sensor has, in its own view; default 4 without --to.")
+        int | None, arg(metavar="INT", help="as many beams as the scan has, in its own view; default 4 without --to.")
     ] = None,
     model: Source = "default",
     method: Method = "auto",

@@ -17,6 +17,7 @@ from lidarsynth.networks.rays import Rays, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
 
 ANSWERS = 0.02  # of the rays of a beam
+FEW = 3  # beams that may be apart by chance
 
 
 def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
@@ -65,6 +66,13 @@ def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, 
         xyz = np.zeros((*shape, 3), np.float32)
         xyz[::times] = sparse.xyz
     return RangeImage(metres, shade, mask, sensor, xyz=xyz), known
+
+
+def beam_step(sparse: RangeImage) -> tuple[int, int]:
+    """(k, first): the scan holds every k-th beam of its sensor from the first on; 1 where it has beams side by side."""
+    beams = np.flatnonzero(sparse.mask.mean(1) > ANSWERS)
+    step = int(np.gcd.reduce(np.diff(beams))) if len(beams) > FEW else 1
+    return step, int(beams[0]) % step if len(beams) else 0
 
 
 def best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ from lidarsynth.streets.hdl64e import hidden, written_out
 from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.cascade.gaps import straight_in_gaps
 from lidarsynth.systems.cascade.holes import Told, with_holes_drawn
 from lidarsynth.systems.cascade.images import (
     GENERATED,
@@ -43,7 +44,7 @@ from lidarsynth.systems.cascade.images import (
     textured,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import known_of, rays_told, spread, unanswered
+from lidarsynth.systems.cascade.known import beam_step, known_of, rays_told, spread, unanswered
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
@@ -167,6 +168,7 @@ class CascadeModel(AnySensorModel):
                 response = tried(own.response, fill, image, known, reflectance, rays, self.tuned)
             own = replace(own, response=response)
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
+        filled = straight_in_gaps(filled, told) if noise is None else filled
         filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), image, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
@@ -182,6 +184,8 @@ class CascadeModel(AnySensorModel):
     ) -> RangeImage:
         """`upsample` of a record: of the scan's own sensor in `times` as many beams, or, after `into`, of that one.
 
+        Of every k-th beam of a sensor, a thinned scan, `times` as many as it holds: those of the sensor, where that is k.
+
         `to_scan()` gives every measured point bit by bit beside the new ones.
         """
         if not self.own:
@@ -196,7 +200,13 @@ class CascadeModel(AnySensorModel):
         sparse = self.into(own).image_of(scan)
         if not sparse.mask.any():
             raise ValueError(f"expected points within {own.name}'s view, found none of {len(scan)} points")
-        model = self.into(written_out(own).denser(times))
+        step, first = beam_step(sparse)
+        if step > 1 and times % step == 0:
+            times //= step
+        elif step > 1:
+            own = written_out(own).rows(range(first, own.height, step))
+            sparse = self.into(own).image_of(scan)
+        model = self.into(written_out(own).denser(times) if times > 1 else own)
         image, known = spread(sparse, model.sensor, times)
         filled = model.fill(image, known, how, on_step)
         loose = replace(scan, ring=None)
