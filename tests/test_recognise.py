@@ -11,6 +11,7 @@ from lidarsynth.lidar.own_beams import own_beams, stray_rings
 from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.unseen import caution
 
 
 def turn(sensor: Sensor, rings: bool = True, keep: float = 0.8, rows: slice = slice(None)) -> Scan:
@@ -161,6 +162,8 @@ def test_only_the_real_scan_whose_rings_stray_is_told_so(shared: Path, kitti: li
     panda = read(shared / "scans" / "other" / "pandaset_pandar64_0001.pcd")
     assert "found 2 of 64 up to 5.4 degrees off (62, 63)" in str(stray_rings(panda, SENSORS["pandar64"]))
     np.testing.assert_allclose(own_beams(panda, SENSORS["pandar64"]).elevations[62:], (-14.7, -19.5), atol=0.2)
+    assert "found 2 of 64" in str(caution(panda, SENSORS["pandar64"])), "named by hand, its data sheet's are taken"
+    assert caution(panda) is None
 
 
 def test_two_stacked_sensors_are_asked_for(shared: Path):

@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.lidar.measured import were_new
+from lidarsynth.lidar.own_beams import stray_rings
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
 
 WIDE = 45  # degrees: confidences were fitted on wider holes, too, but what stands there is anyone's guess
 FEW = 0.15  # share of the usual points of a degree that are hardly any
 
 
-def caution(scan: Scan) -> str | None:
-    """What must be said of the completion of a scan, in one line, or None."""
+def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
+    """What must be said of the completion of a scan, in one line, or None.
+
+    sensor  that it is said to be of; of one that was recognised, beams are taken where the scan has them
+    """
     said = []
     if before := int(were_new(scan).sum()):
         said.append(f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): "
@@ -23,6 +28,8 @@ def caution(scan: Scan) -> str | None:
                     "a guess; of default's a least confidence of 0.5 leaves most out, repaint draws one")  # fmt: skip
     if (turns := several_turns(scan)) is not None:
         said.append(turns)
+    if sensor is not None and (strays := stray_rings(scan, sensor)) is not None:
+        said.append(strays)
     return "; ".join(said) or None
 
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Protocol
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 
 
@@ -32,7 +32,7 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
     else:
         if (text := stranger(model, scan, sensor)) is not None:
             warnings.warn(f'{model.experiment.name} {text}; use load("default")', stacklevel=3)
-        if filling and (text := caution(scan)) is not None:
+        if filling and (text := caution(scan, None if sensor is None else get_sensor(sensor))) is not None:
             warnings.warn(text, stacklevel=3)
     return scan
 

@@ -205,7 +205,7 @@ def _caution(scan: Scan, job: Job, work: Work) -> str | None:
     """What must be said of the points that are to be completed, in one line."""
     if not work.check or job.verb not in ("complete", "upsample"):
         return None
-    text = caution(scan)
+    text = caution(scan, None if job.sensor is None else get_sensor(job.sensor))
     return text and f"{work.item.path}: {text}"
 
 

@@ -14,7 +14,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of
-from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 
 ANSWERS = 0.02  # of the rays of a beam
 FEW = 3  # beams that may be apart by chance
@@ -73,6 +73,20 @@ def beam_step(sparse: RangeImage) -> tuple[int, int]:
     beams = np.flatnonzero(sparse.mask.mean(1) > ANSWERS)
     step = int(np.gcd.reduce(np.diff(beams))) if len(beams) > FEW else 1
     return step, int(beams[0]) % step if len(beams) else 0
+
+
+def denser(sensor: Sensor, held: tuple[int, int], times: int) -> tuple[Sensor, Sensor, int]:
+    """(of, dense, every): `times` as many beams as a scan of the sensor holds, `held` as `beam_step` says; beam i of
+    the sensor `of`, in which the scan's image is, is beam `every` * i of `dense`.
+
+    Raises ValueError for `times` below 2.
+    """
+    step, first = held
+    if times > 1 and times % step == 0:
+        times //= step
+        return sensor, written_out(sensor).denser(times) if times > 1 else sensor, times
+    some = written_out(sensor).rows(range(first, sensor.height, step)) if step > 1 else sensor
+    return some, written_out(some).denser(times), times
 
 
 def best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

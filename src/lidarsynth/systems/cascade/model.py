@@ -44,7 +44,7 @@ from lidarsynth.systems.cascade.images import (
     textured,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import beam_step, known_of, rays_told, spread, unanswered
+from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, unanswered
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
@@ -184,7 +184,7 @@ class CascadeModel(AnySensorModel):
     ) -> RangeImage:
         """`upsample` of a record: of the scan's own sensor in `times` as many beams, or, after `into`, of that one.
 
-        Of every k-th beam of a sensor, a thinned scan, `times` as many as it holds: those of the sensor, where that is k.
+        Of a scan that holds every k-th beam of its sensor, as many times these: the sensor's own, where that is k.
 
         `to_scan()` gives every measured point bit by bit beside the new ones.
         """
@@ -200,14 +200,11 @@ class CascadeModel(AnySensorModel):
         sparse = self.into(own).image_of(scan)
         if not sparse.mask.any():
             raise ValueError(f"expected points within {own.name}'s view, found none of {len(scan)} points")
-        step, first = beam_step(sparse)
-        if step > 1 and times % step == 0:
-            times //= step
-        elif step > 1:
-            own = written_out(own).rows(range(first, own.height, step))
-            sparse = self.into(own).image_of(scan)
-        model = self.into(written_out(own).denser(times) if times > 1 else own)
-        image, known = spread(sparse, model.sensor, times)
+        beams, dense, every = denser(own, beam_step(sparse), times)
+        if beams != own:
+            sparse = self.into(beams).image_of(scan)
+        model = self.into(dense)
+        image, known = spread(sparse, dense, every)
         filled = model.fill(image, known, how, on_step)
         loose = replace(scan, ring=None)
         pixels = pixel_of_points(loose, filled.sensor, "spherical")
