@@ -210,7 +210,20 @@ def test_a_folder_of_other_weights_is_refused_and_one_of_the_same_is_not(run: Ru
     words = ("generate", "-n", 1, "--out", tmp_path / "g", "--steps", 2, "--no-picture", "--model")
     assert run(*words, tiny).code == 0
     assert "0 of them new" in run(*words, same).out
-    refused(run(*words, other), "weights")
+    asked, found = (f"{{'model': '{folder}'}}" for folder in (other, tiny))
+    refused(run(*words, other), f"expected a folder of scans made with {asked}, found {found}; use another --out")
+
+
+def test_a_folder_of_another_sensor_is_refused_by_name_and_one_of_before_goes_on(run: Run, tmp_path: Path):
+    words = ("generate", "-n", 1, "--out", tmp_path, "--no-picture", "--steps", 1, "--sensor")
+    record = tmp_path / "generate.json"
+    assert run(*words, "vlp-16").code == 0
+    refused(run(*words, "hdl-32e"), "made with {'sensor': 'hdl-32e'}, found {'sensor': 'vlp-16'}; use")
+    before = {key: value for key, value in json.loads(record.read_text()).items() if key not in ("model", "sensor")}
+    record.write_text(json.dumps(before))
+    assert "0 of them new" in run(*words, "vlp-16").out
+    told = "made with {'model': 'default', 'sensor': 'hdl-32e', 'weights': "
+    refused(run(*words, "hdl-32e"), told, f"found {{'weights': '{before['weights']}'}}; use")
 
 
 def test_scans_of_others_are_not_taken_for_generated_ones(run: Run, tiny: Path, tmp_path: Path):

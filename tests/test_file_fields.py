@@ -144,6 +144,15 @@ def test_labels_of_another_data_set_are_left_out(scan: Scan, tmp_path: Path):
     assert read(tmp_path / "scan.pcd").label is None
 
 
+def test_files_without_points_are_said_to_have_none(tmp_path: Path):
+    np.save(tmp_path / "empty.npy", np.zeros((0, 3), np.float32))
+    with pytest.raises(FileError, match=r"expected 1 to 10000000 points of one turn, found 0$"):
+        read(tmp_path / "empty.npy", intensity="none")
+    np.savez(tmp_path / "grid.npz", **{axis: np.ones((4, 5)) for axis in "xyz"})
+    with pytest.raises(FileError, match=r"points of one turn, found an array \(4, 5\)$"):
+        read(tmp_path / "grid.npz", intensity="none")
+
+
 def test_every_usual_name_is_lower_case_and_unique():
     names = [usual for usuals in NAMES.values() for usual in usuals]
     assert len(names) == len(set(names)) and all(name == name.lower() for name in names)

@@ -149,3 +149,61 @@ def test_our_npz_is_plain_numpy(scan: Scan, image: RangeImage, tmp_path: Path):
     with np.load(tmp_path / "image.npz", allow_pickle=False) as arrays:
         assert json.loads(str(arrays["sensor"]))["width"] == 32
     assert zipfile.is_zipfile(io.BytesIO((tmp_path / "scan.npz").read_bytes()))
+
+
+CARLA = """ply
+format ascii 1.0
+element vertex 2
+property float32 x
+property float32 y
+property float32 z
+property float32 CosAngle
+property uint32 ObjIdx
+property uint8 ObjTag
+property short high
+end_header
+9.5 0 -1.25 0.9731 4000000000 7 32767
+9.5 1 -1.25 0.5 12 255 32768
+"""
+
+
+def properties(path: Path) -> list[list[str]]:
+    header = path.read_bytes().split(b"end_header")[0].decode()
+    return [line.split()[1:] for line in header.splitlines() if line.startswith("property")]
+
+
+def test_fields_of_an_ascii_ply_keep_the_types_it_declares(tmp_path: Path):
+    (tmp_path / "carla.ply").write_text(CARLA)
+    found = read(tmp_path / "carla.ply", intensity="none")
+    kinds = {name: column.dtype.str[1:] for name, column in found.extra.items()}
+    assert kinds == {"CosAngle": "f4", "ObjIdx": "u4", "ObjTag": "u1", "high": "f8"}, "32768 is no short"
+    write(tmp_path / "again.ply", found)
+    written = properties(tmp_path / "again.ply")
+    assert written[4:7] == [["float", "CosAngle"], ["uint", "ObjIdx"], ["uchar", "ObjTag"]]
+    (tmp_path / "late.ply").write_text(CARLA.replace("CosAngle", "t").replace("0.9731", "0.5000000001"))
+    np.testing.assert_allclose(read(tmp_path / "late.ply", intensity="none").time - 0.5, [1e-10, 0], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        (np.array([-5, 7]), "int"),
+        (np.array([0, 2**32 - 1]), "uint"),
+        (np.array([0, 2**31], np.uint64), "uint"),
+        (np.array([-1, 2**32]), "double"),
+        (np.array([0, 3 * 2**61], np.uint64), "double"),
+    ],
+)
+def test_whole_numbers_of_64_bits_are_written_in_types_that_ply_has(values: np.ndarray, kind: str, tmp_path: Path):
+    write(tmp_path / "a.ply", Scan(np.ones((2, 3), np.float32), extra={"of": values}))
+    assert properties(tmp_path / "a.ply")[-1] == [kind, "of"]
+    assert read(tmp_path / "a.ply").extra["of"].tolist() == values.tolist()
+
+
+@pytest.mark.parametrize("value", [2**53 + 1, -(2**53) - 1, 2**63 - 1])
+def test_what_no_type_of_ply_holds_stays_of_64_bits(value: int, tmp_path: Path):
+    """Times in nanoseconds: some readers do not know the type, ours gives them back as they were."""
+    scan = Scan(np.ones((2, 3), np.float32), extra={"of": np.array([0, value])})
+    write(tmp_path / "a.ply", scan)
+    assert properties(tmp_path / "a.ply")[-1] == ["int64", "of"]
+    np.testing.assert_array_equal(read(tmp_path / "a.ply", intensity="none").extra["of"], scan.extra["of"])

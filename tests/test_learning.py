@@ -1,6 +1,7 @@
 """A sensor learned from its scans is the sensor that made them, ideal or real."""
 
 import lzma
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.learning import blocked_runs, learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, read_sensor
-from lidarsynth.verbs.learned_sensor import doubts, sensor_toml
+from lidarsynth.lidar.sensor import SENSORS, Sensor, read_sensor
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.verbs.learned_sensor import doubts, sensor_toml, summary
 
 
 def unpacked(path: Path) -> Scan:
@@ -34,6 +36,46 @@ def test_an_ideal_sensor_is_learned(name: str):
     np.testing.assert_allclose(found.offsets or 0.0, known.offsets or 0.0, atol=0.01)
     assert found.mount == pytest.approx(1.7, abs=0.2)
     assert np.abs(found.tilt).max() < 0.2
+
+
+def seen(few: Sensor, count: int = 4) -> list[Scan]:
+    pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+    streets = SyntheticStreets(0, 64, few)
+    return [streets.image(index).to_scan() for index in range(0, 16 * count, 16)]
+
+
+@pytest.mark.parametrize(
+    ("elevations", "mount", "tilt"),
+    [
+        (np.linspace(5, -15, 10), 1.5, (0.0, 0.0)),
+        (np.linspace(10, -10, 10), 1.5, (0.0, 0.0)),
+        (np.linspace(15, -15, 12), 2.2, (12.0, -8.0)),
+        (np.linspace(2, -8, 6), 1.8, (0.0, 0.0)),
+        (np.linspace(15, -15, 16), 0.4, (0.0, 0.0)),
+        (np.array(SENSORS["vlp-32c"].elevations), 1.73, (0.0, 0.0)),
+    ],
+)
+def test_few_beams_tell_how_the_sensor_stands(elevations: np.ndarray, mount: float, tilt: tuple[float, float]):
+    """Some stand lower or tilted: of walls and cars the beams just below the horizon see more than of the ground."""
+    few = Sensor("few", tuple(elevations.tolist()), 1024, 0.5, mount=mount, tilt=tilt)
+    learned = learn_sensor(seen(few), "own")
+    assert learned.sensor.mount == pytest.approx(mount, abs=0.15)
+    np.testing.assert_allclose(learned.sensor.tilt, tilt, atol=1.0)
+    assert learned.afloat is None
+
+
+def test_scans_that_do_not_tell_the_mount_are_told():
+    turns = [turn(SENSORS["vlp-16"], rings=True) for _ in range(4)]
+    shifted = [replace(scan, xyz=scan.xyz * np.float32(1 + k)) for k, scan in enumerate(turns)]
+    above = [scan[scan.xyz[:, 2] > -0.5] for scan in turns]
+    for scans, why in ((shifted, r"as far below in most scans, found it 1\.\d+ to \d\.\d+ m"), (above, "found 0 of 4")):
+        learned = learn_sensor(scans, "own")
+        assert (learned.sensor.mount, learned.sensor.tilt) == (1.73, (0.0, 0.0))
+        assert "how far above the ground is not known" in summary(learned)
+        (line,) = (line for line in doubts(learned) if "mount" in line)
+        assert re.search(
+            rf"own: expected .*{why}.*: mount and tilt are not learned, 1\.73 m and level are written", line
+        )
 
 
 def test_smeared_and_missing_beams_are_told():

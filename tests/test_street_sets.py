@@ -1,6 +1,7 @@
 """Data sets of labelled streets: read back by the published formats, stopped and gone on with, others refused."""
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,12 +10,13 @@ import pytest
 
 from lidarsynth.cli.main import main
 from lidarsynth.data.layouts.calibration import AXES, PROJECTION
-from lidarsynth.data.layouts.kitti import label_line
+from lidarsynth.data.layouts.kitti import in_view, label_line
 from lidarsynth.data.layouts.nuscenes_tables import quaternion
 from lidarsynth.data.nuscenes import nuscenes
-from lidarsynth.data.street_sets import LAYOUTS, write_streets
+from lidarsynth.data.street_sets import LAYOUTS, chunks, write_streets
 from lidarsynth.files.formats import read
 from lidarsynth.files.labels import read_labels
+from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
@@ -121,6 +123,20 @@ def test_kitti_labels_are_the_boxes():
     np.testing.assert_allclose(found, [*pixels.min(axis=0), *pixels.max(axis=0)], atol=0.01)
     behind = Box("car", 1, (-14.0, 3.0, -0.9), (4.2, 1.8, 1.5), 0.3, zero, zero, 0.0, zero, 90, 0.3)
     assert label_line(behind) is None
+
+
+def test_kitti_lists_what_has_a_point_in_the_cameras_image():
+    """Two cars whose boxes reach into the image, and the points of one of them."""
+    zero = (0.0, 0.0, 0.0)
+    beside, ahead = (Box("car", k, (x, 3.0, -0.9), (4.2, 1.8, 1.5), 0.0, zero, zero, 0.0, zero, 2, 0.0)
+                     for k, x in ((1, 0.5), (2, 14.0)))  # fmt: skip
+    assert label_line(beside) is not None and label_line(ahead) is not None
+    xyz = np.float32([[0.5, 2.1, -0.9], [-1.0, 2.1, -0.5], [12.0, 2.2, -0.9], [12.0, 3.0, -0.9], [9.0, 0.0, -1.7]])
+    raw = np.array([10 | 1 << 16, 10 | 1 << 16, 10 | 2 << 16, 10 | 2 << 16, 40], np.uint32)
+    frame = Frame(Scan(xyz), raw, [beside, ahead], np.eye(4), 0.0, 0, 0)
+    assert in_view(frame) == {2}
+    files = dict(LAYOUTS["kitti"].files(STREETS, 0, frame))
+    assert files["training/label_2/000000.txt"] == f"{label_line(ahead)}\n".encode()
 
 
 def test_points_of_a_thing_lie_in_its_box_as_openpcdet_reads_it():
@@ -284,6 +300,48 @@ def test_other_settings_and_other_folders_are_refused(tmp_path: Path):
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(ValueError, match="expected an empty folder"):
         list(write_streets(tmp_path / "mine", LabelledStreets(0, 1, SENSOR), "pcd"))
+
+
+def test_what_is_refused_leaves_the_folder_to_the_corrected_command(tmp_path: Path):
+    folder = tmp_path / "long"
+    with pytest.raises(ValueError, match=r"expected a drive of at most 3760 m, found 500 s .* choose fewer frames"):
+        list(write_streets(folder, LabelledStreets(0, 2, SENSOR, Options(frames=5000)), "pcd"))
+    assert not folder.exists()
+    folder, blind = tmp_path / "set", LabelledStreets(0, 1, Sensor("blind", (89.0,), 16))
+    with pytest.raises(ValueError, match="expected a sensor that sees"):
+        list(write_streets(folder, blind, "nuscenes"))
+    line = LabelledStreets(0, 1, Sensor("line", (-10.0,), 32, 1.0, 30.0))
+    written(folder, "pcd", line)
+    with pytest.raises(ValueError, match=r"made with .*'name': 'blind'.*found .*'name': 'line'"):
+        list(write_streets(folder, blind, "pcd"))
+
+
+def test_a_drive_that_is_too_long_is_found_before_the_first_is_made():
+    """Streets have speeds of their own: 370 s are short enough for the first two, not for the third."""
+    LabelledStreets(0, 2, SENSOR, Options(frames=3700)).check_drives()
+    with pytest.raises(ValueError, match=r"expected a drive of at most .* found 370 s at 12\.1 m/s"):
+        LabelledStreets(0, 3, SENSOR, Options(frames=3700)).check_drives()
+    LabelledStreets(0, 3, SENSOR, Options(frames=3700, speed=9.0)).check_drives()
+
+
+def test_the_first_of_very_many_scans_is_there_at_once(tmp_path: Path):
+    line = Sensor("line", (-10.0,), 32, 1.0, 30.0)
+    streets = LabelledStreets(0, 10**8, line)
+    start, writing = time.perf_counter(), write_streets(tmp_path, streets, "pcd")
+    assert [next(writing), next(writing)] == [0, 16]
+    writing.close()
+    assert time.perf_counter() - start < 20
+    (tmp_path / "000003.pcd").unlink()
+    writing = write_streets(tmp_path, streets, "pcd")
+    assert [next(writing), next(writing), next(writing)] == [15, 16, 32]
+    writing.close()
+
+
+def test_runs_of_frames_are_of_one_world_and_leave_out_what_is_there():
+    places, drives = LabelledStreets(0, 40, SENSOR), LabelledStreets(0, 2, SENSOR, Options(frames=20))
+    assert [(run[0], run[-1]) for run in chunks(places, [])] == [(0, 15), (16, 31), (32, 39)]
+    assert [(run[0], run[-1]) for run in chunks(drives, [])] == [(0, 15), (16, 19), (20, 35), (36, 39)]
+    assert list(chunks(drives, [*range(1, 19), *range(20, 40)])) == [[0], [19]]
 
 
 def test_the_verb_writes_says_and_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -261,7 +261,7 @@ def test_weather_takes_far_returns_and_adds_near_ones():
 
 
 def test_wrong_options_are_named():
-    with pytest.raises(ValueError, match="and a rate of 0"):
+    with pytest.raises(ValueError, match=r"a rate of 0\.1 to 100 turns per second, found 0$"):
         Options(rate=0)
     with pytest.raises(ValueError, match=r"\(0.36 to 216 km/h\), found -5.55556 m/s \(-20 km/h\)"):
         Options(frames=2, speed=-20 / 3.6)
@@ -275,6 +275,34 @@ def test_wrong_options_are_named():
             LabelledStreets(0, 4, Sensor("line", (-10.0,), 64, mount=mount))
     with pytest.raises(IndexError, match=r"0\.\.3, got 4"):
         LabelledStreets(0, 4, Sensor("line", (-10.0,), 64))[4]
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ({"count": 1.5}, r"a whole number as count, found 1\.5"),
+        ({"count": 0}, "count of at least 1, found 0"),
+        ({"seed": 0.5}, r"a whole number as seed, found 0\.5"),
+        ({"seed": -1}, "seed of at least 0, found -1"),
+        ({"count": 2**63}, r"at most 2\^62 - 1 scans, found 9223372036854775808"),
+        ({"count": 2**61, "options": Options(frames=2)}, r"at most 2\^62 - 1 scans, found 4611686018427387904"),
+        ({"sensor": "vlp-61"}, "a sensor of .* found 'vlp-61'"),
+    ],
+)
+def test_wrong_numbers_of_streets_are_named(asked: dict, found: str):
+    with pytest.raises(ValueError, match=f"expected {found}"):
+        LabelledStreets(**asked)
+    if "options" not in asked and asked.get("count") != 2**63:
+        with pytest.raises(ValueError, match=f"expected {found}".replace("count", "length")):
+            SyntheticStreets(**{{"count": "length"}.get(name, name): value for name, value in asked.items()})
+
+
+def test_frames_are_whole_and_sensors_may_be_words():
+    with pytest.raises(ValueError, match=r"expected a whole number as frames, found 2\.5"):
+        Options(frames=2.5)  # type: ignore[arg-type]
+    streets = LabelledStreets(np.int64(0), np.int64(2), "vlp-16", Options(frames=np.int64(3)))  # type: ignore[arg-type]
+    assert streets.sensor == SENSORS["vlp-16"] and len(streets) == 6
+    assert [type(number) for number in (streets.seed, streets.count, streets.options.frames)] == [int, int, int]
 
 
 def test_a_perfect_sensor_reports_what_its_beams_meet(still: list[Frame]):

@@ -158,7 +158,7 @@ def test_library_things_stand_on_the_ground():
 
 
 def test_wrong_arguments_are_named():
-    with pytest.raises(ValueError, match="expected seed >= 0"):
+    with pytest.raises(ValueError, match="expected seed of at least 0, found -1"):
         SyntheticStreets(seed=-1)
     with pytest.raises(IndexError, match=r"0\.\.9, got 10"):
         SyntheticStreets(length=10).image(10)

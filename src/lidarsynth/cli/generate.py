@@ -40,7 +40,7 @@ def generate(
     calls = loaded.generation_steps(steps, sampler)
     used = loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": used, "seed": seed}
-    settings |= {"labels": True} if labels else {}
+    settings |= {"model": str(model), "sensor": loaded.sensor.name} | ({"labels": True} if labels else {})
     with only_writer(out, "generation"):
         claim(out, settings)
         runs, size = missing(out, count, endings), loaded.at_once(batch_size)

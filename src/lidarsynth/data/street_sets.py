@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
@@ -32,6 +32,7 @@ from lidarsynth.pictures.figure import panel
 from lidarsynth.streets.areas import MORE
 from lidarsynth.streets.drawing import bev_with_boxes, strips
 from lidarsynth.streets.frame import LabelledStreets, Options
+from lidarsynth.streets.world import POSES
 
 LAYOUTS: dict[str, Layout] = {
     "semantickitti": SEMANTICKITTI,
@@ -53,6 +54,7 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
     Raises ValueError where the folder holds another set or something else, or another process writes to it, OSError of
     one line when the disk is full.
     """
+    streets.check_drives()
     with only_writer(folder, "making of streets"):
         yield from _write(folder, streets, layout, workers)
 
@@ -62,10 +64,10 @@ def _write(folder: Path, streets: LabelledStreets, layout: str, workers: int) ->
     sweep(folder, deep=True)
     streets = with_those_there(folder, streets, layout)
     task = _Task(folder, streets, layout)
-    chunks = task.chunks()
-    done = len(streets) - sum(map(len, chunks))
+    there = task.there()
+    done = len(there)
     yield done
-    written = in_order(task.store, range(len(chunks)), workers)
+    written = in_order(task.store, chunks(streets, there), workers)
     try:
         for count in written:
             done += count
@@ -88,30 +90,33 @@ def with_those_there(folder: Path, streets: LabelledStreets, layout: str) -> Lab
     return streets
 
 
+def chunks(streets: LabelledStreets, there: Iterable[int]) -> Iterator[list[int]]:
+    """The frames that are not `there`, in runs of one world, each told when it is asked for: sets may be huge."""
+    there, world = set(there), streets.options.frames or POSES
+    for first in range(0, len(streets), world):
+        last = min(first + world, len(streets))
+        for start in range(first, last, CHUNK):
+            if run := [index for index in range(start, min(start + CHUNK, last)) if index not in there]:
+                yield run
+
+
 class _Task:
     """What a worker has to know to make any chunk."""
 
     def __init__(self, folder: Path, streets: LabelledStreets, layout: str):
         self.folder, self.streets, self.layout = folder, streets, layout
-        self._runs: list[list[int]] = []
 
-    def chunks(self) -> list[list[int]]:
-        """Frames that are not there, or have a file that is missing or cut off, in runs of one world."""
-        layout, runs = LAYOUTS[self.layout], []
-        for index in range(len(self.streets)):
-            if layout.has(self.folder, self.streets, index):
-                continue
-            group = (self.streets.place(index)[0], index // CHUNK)
-            if not runs or runs[-1][0] != group:
-                runs.append((group, []))
-            runs[-1][1].append(index)
-        self._runs = [run for _, run in runs]
-        return self._runs
+    def there(self) -> list[int]:
+        """Frames that have all their files, none of them cut off."""
+        layout = LAYOUTS[self.layout]
+        told = {layout.index(self.streets, path) for path in self.folder.glob(layout.records)}
+        asked = sorted(index for index in told if 0 <= index < len(self.streets))
+        return [index for index in asked if layout.has(self.folder, self.streets, index)]
 
-    def store(self, chunk: int) -> int:
+    def store(self, chunk: list[int]) -> int:
         """Make the frames of a chunk; returns their number."""
         layout = LAYOUTS[self.layout]
-        for index in self._runs[chunk]:
+        for index in chunk:
             frame = self.streets[index]
             if not len(frame.scan):
                 raise ValueError(f"{self.streets.sensor.name}: expected a sensor that sees something from every place, "
@@ -119,7 +124,7 @@ class _Task:
             for path, content in layout.files(self.streets, index, frame):
                 _put(self.folder / path, content)
             _put(self.folder / layout.record(self.streets, index), json.dumps(frame.record()).encode())
-        return len(self._runs[chunk])
+        return len(chunk)
 
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
@@ -130,29 +135,33 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
             if of[name] == later[name]:
                 del of[name]  # a set of before there was this choice goes on
     asked = {"layout": layout, "seed": streets.seed, "sensor": streets.sensor.to_dict(), "options": options}
-    return asked | {"edition": _edition(streets.options)}
+    return asked | {"edition": _edition(streets.options, layout)}
 
 
-def _edition(options: Options) -> int:
+def _edition(options: Options, layout: str) -> int:
     """EDITION, or one more where 2026-11-25 brought boxes that stand where seen, cyclists who roll off kerbs, or no
-    vehicles in car parks: other sets go on."""
+    vehicles in car parks, and one where label_2 lists what the camera sees alone: other sets go on."""
     drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
-    return EDITION + (drives or options.density.parking == 0)
+    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti")
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Begin a folder, or go on with one that was begun with the same settings; the number of scans may grow."""
+    """Begin a folder, or go on with one that was begun with the same settings; the number of scans may grow.
+
+    What a refused command has begun, and nothing was written to since, is begun anew.
+    """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     settings, path = json.loads(json.dumps(settings)), folder / RECORD
     if path.exists():
         found = read_json(path)
-        if found != settings:
+        if found == settings:
+            return
+        if any(entry.is_file() and not entry.name.startswith(".") for entry in folder.rglob("*") if entry != path):
             asked, was = _differing(settings, found), _differing(found, settings)
             raise ValueError(f"{folder}: expected a folder of streets made with {asked!s:.200}, found {was!s:.200}; "
                              "use another --out")  # fmt: skip
-        return
-    if folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+    elif folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
         raise ValueError(f"{folder}: expected an empty folder, or one with {RECORD}; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
     _put(path, (json.dumps(settings, indent=1) + "\n").encode())

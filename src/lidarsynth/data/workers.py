@@ -8,20 +8,24 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from itertools import chain, islice
 from multiprocessing.connection import wait
-from typing import Any
+from typing import Any, TypeVar
 
 TRIM, MMAP = -1, -3  # of mallopt(3): memory above the one goes back to the system, above the other it comes apart
 LARGEST = 1 << 25  # bytes, of MMAP; what glibc allows at most
+AHEAD = 16  # items of each process that are begun or wait for it: there may be more in all than memory holds
 
-_make: list[Callable[[int], Any]] = []  # of this worker process; sent once, not with every item
+Item = TypeVar("Item")
+_make: list[Callable[[Any], Any]] = []  # of this worker process; sent once, not with every item
 
 
 def in_order(
-    make: Callable[[int], Any], items: Sequence[int], workers: int, abandon: bool = False
+    make: Callable[[Item], Any], items: Iterable[Item], workers: int, abandon: bool = False
 ) -> Generator[Any, None, None]:
     """make(item) of each item, in order, by `workers` processes, or by this one where fewer than two have work.
 
@@ -29,7 +33,9 @@ def in_order(
     workers after their present item, or, with `abandon`, at once, as items that take a minute ask for. Raises OSError
     when a worker is gone.
     """
-    workers = min(workers, len(items))
+    items = iter(items)
+    first = list(islice(items, max(workers, 0)))
+    workers, items = min(workers, len(first)), chain(first, items)
     if workers < 2:
         yield from map(make, items)
         return
@@ -37,7 +43,11 @@ def in_order(
     others, done = set(multiprocessing.active_children()), False
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start, (make,))
     try:
-        yield from pool.map(_work, items)
+        begun = deque(pool.submit(_work, item) for item in islice(items, AHEAD * workers))
+        while begun:
+            future = begun.popleft()
+            yield future.result()
+            begun.extend(pool.submit(_work, item) for item in islice(items, 1))
         done = True
     except BrokenProcessPool:
         raise OSError(f"expected {workers} worker processes to stay, found one gone (out of memory?); the same command "
@@ -48,7 +58,7 @@ def in_order(
         pool.shutdown(cancel_futures=True)
 
 
-def _start(make: Callable[[int], Any]) -> None:
+def _start(make: Callable[[Any], Any]) -> None:
     watch_parent()
     keep_memory()
     _make.append(make)
@@ -76,5 +86,5 @@ def _end_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _work(item: int) -> Any:
+def _work(item: Any) -> Any:
     return _make[0](item)

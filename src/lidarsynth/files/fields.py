@@ -131,7 +131,8 @@ def _coordinates(fields: Fields) -> list[np.ndarray]:
         raise FileError(f"expected fields of one length, found {shapes}")
     columns = [_numbers(fields[name], name) for name in names if name is not None]
     if columns[0].ndim != 1 or not 1 <= len(columns[0]) <= MAX_POINTS:
-        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {columns[0].shape}")
+        found = len(columns[0]) if columns[0].ndim == 1 else f"an array {columns[0].shape}"
+        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {found}")
     return columns
 
 

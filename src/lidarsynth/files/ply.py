@@ -21,6 +21,8 @@ WRITTEN = {
     "f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "u4": "uint", "u8": "uint64",
     "i1": "char", "i2": "short", "i4": "int", "i8": "int64",
 }  # fmt: skip
+NARROWED = {"i8": ("<i4", "<u4", "<f8"), "u8": ("<u4", "<f8")}  # the published format has no whole numbers of 64 bits
+EXACT = 2**53  # up to which float64 tells whole numbers apart
 
 
 class Element(NamedTuple):
@@ -131,11 +133,21 @@ def _ascii(body: bytes, vertex: Element, skipped_lines: int) -> Fields:
         raise FileError(
             f"expected numbers in an ascii PLY, found {str(error).rpartition(':')[2].strip()[:40]}"
         ) from None
-    columns = {}
-    for i, (name, types) in enumerate(zip(vertex.names, vertex.order, strict=True)):
-        whole = TYPES[types[0]][0] in "iu" and np.isfinite(table[:, i]).all() and np.all(np.abs(table[:, i]) < 2**53)
-        columns[name] = table[:, i].astype(np.int64) if whole else table[:, i]
-    return columns
+    typed = [_typed(column, np.dtype(TYPES[types[0]])) for column, types in zip(table.T, vertex.order, strict=True)]
+    return dict(zip(vertex.names, typed, strict=True))
+
+
+def _typed(column: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """The numbers in the type that the header declares, or as they are where it does not tell them apart."""
+    if dtype == np.float64:
+        return column
+    if dtype == np.float32:
+        with np.errstate(over="ignore"):
+            single = column.astype(dtype)
+        return single if len(np.unique(single)) == len(np.unique(column)) else column
+    low, high = max(np.iinfo(dtype).min, -EXACT), min(np.iinfo(dtype).max, EXACT)
+    inside = (low <= column) & (column <= high) & (column == np.floor(column))
+    return column.astype(dtype) if inside.all() else column
 
 
 def _skip(data: bytes, at: int, element: Element, dtypes: dict[tuple[str, ...], tuple[str, ...]]) -> int:
@@ -157,8 +169,12 @@ def _skip(data: bytes, at: int, element: Element, dtypes: dict[tuple[str, ...], 
 
 
 def write_ply(file: BufferedIOBase, scan: Scan) -> None:
-    """The scan as binary PLY: x y z intensity (reflectance 0-1), and ring, timestamp, label where known."""
-    table = scan_table(scan)
+    """The scan as binary PLY: x y z intensity (reflectance 0-1), and ring, timestamp, label where known.
+
+    Whole numbers of 64 bits become int, uint or double; those that none of these holds exactly, such as times in
+    nanoseconds, stay int64 or uint64, which not all readers know.
+    """
+    table = _narrowed(scan_table(scan))
     if other := [n for n in table.dtype.names or () if table.dtype[n].str[1:] not in WRITTEN]:
         raise FileError(f"expected fields of numbers in .ply, found {other[0]} of {table.dtype[other[0]]}")
     properties = [f"property {WRITTEN[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
@@ -171,3 +187,22 @@ def write_ply(file: BufferedIOBase, scan: Scan) -> None:
     ]
     file.write(("\n".join(header) + "\nend_header\n").encode("ascii"))
     file.write(table.tobytes())
+
+
+def _narrowed(table: np.ndarray) -> np.ndarray:
+    """The table with types that every reader of PLY knows in place of whole numbers of 64 bits, where one has them."""
+    return table.astype([(name, _narrow(table[name])) for name in table.dtype.names or ()])
+
+
+def _narrow(column: np.ndarray) -> np.dtype:
+    kinds = map(np.dtype, NARROWED.get(column.dtype.str[1:], ()))
+    return next((kind for kind in kinds if _holds(kind, column)), column.dtype)
+
+
+def _holds(kind: np.dtype, column: np.ndarray) -> bool:
+    """Whether a type has each of these whole numbers exactly."""
+    if kind.kind == "f":
+        double = column.astype(kind)
+        return bool((np.abs(double) < 2.0**63).all()) and bool((double.astype(column.dtype) == column).all())
+    limits = np.iinfo(kind)
+    return bool(((limits.min <= column) & (column <= limits.max)).all())

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
-from lidarsynth.lidar.ground import plane
+from lidarsynth.lidar.ground import lowest_plane
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.recognition import recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
@@ -26,6 +26,7 @@ DENSER, LEAST = 2.0, 30
 SAMPLE = 1500  # points of a ring and scan are enough
 HALVED = 0.5  # of the residual: heights that explain less are bent rings of a moving car
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
+ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
 BLOCKED_SCANS = 5  # what never returned in fewer scans may have looked at the sky
 BLOCKED_RUN = 0.008  # of a turn: shorter runs are chance
 BLOCKED_ROW = 0.5  # a row must return at least this often elsewhere
@@ -43,6 +44,7 @@ class LearnedSensor:
     thin      how many have too few points for a fit: these tell their beams roughly
     merged    how many rings were of another's beam, and are one row with it
     turns     what is to be said of a scan of more than one turn, or None
+    afloat    why mount and tilt are not learned but a sensor's default, in words, or None
     """
 
     sensor: Sensor
@@ -54,6 +56,7 @@ class LearnedSensor:
     thin: int = 0
     merged: int = 0
     turns: str | None = None
+    afloat: str | None = None
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
@@ -61,8 +64,9 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
 
     Beams are fitted over all scans, z = tan(e) rho + h, with h = 0 unless heights halve the residual; a row's height is
     the neighbours' where its own points cannot tell it. Rings of one beam are one row. Columns come from the azimuths'
-    steps, mount and tilt from the ground (medians over the scans), blocked rays from what never returned in five scans
-    or more. Raises ValueError without rings, with too few points, or where most beams are wider than SMEARED.
+    steps, mount and tilt from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what
+    never returned in five scans or more. Raises ValueError without rings, with too few points, or where most beams are
+    wider than SMEARED.
     """
     kept, left = _alike(scans)
     points = _pooled(kept)
@@ -71,7 +75,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         steps.append(_step(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((np.quantile(depth, 0.001), depth.max()))
-        grounds += [found] if (found := plane(scan.xyz)) is not None else []
+        grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
     guessed = _guessed(kept[0][0])
     rings, row_of = _fit_rows(points, FEWEST if guessed else THIN)
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
@@ -83,7 +87,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     order = np.argsort([-ring.elevation for ring in rings])
     rings, returned = [rings[i] for i in order], returned[order]
     heights = tuple(round(ring.height, 3) for ring in rings)
-    ground = np.median(grounds, axis=0) if grounds else np.array([1.73, 0.0, 0.0])
+    mount, tilt, afloat = _standing(grounds, len(kept))
     sensor = Sensor(
         name=name,
         elevations=_falling([round(ring.elevation, 3) for ring in rings]),
@@ -91,12 +95,26 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         min_range=round(max(float(np.floor(min(d[0] for d in depths) * 10) / 10), 0.0), 1),
         max_range=float(np.ceil(max(d[1] for d in depths) / 5) * 5),
         offsets=heights if any(abs(height) > 0.005 for height in heights) else (),
-        mount=round(float(ground[0]), 2),
-        tilt=(round(float(ground[1]), 2), round(float(ground[2]), 2)),
+        mount=mount,
+        tilt=tilt,
         blocked=blocked_runs(returned, len(kept)),
     )
     turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
-    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), missing, thin, merged, turns)
+    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), missing, thin, merged, turns, afloat)
+
+
+def _standing(grounds: list[tuple[float, float, float]], scans: int) -> tuple[float, tuple[float, float], str | None]:
+    """Mount and tilt from (height, pitch, roll) of those scans that show the ground, or a sensor's default and why."""
+    if 2 * len(grounds) < scans:
+        why = f"expected scans that show the ground all around, found {len(grounds)} of {scans}"
+        return Sensor.mount, Sensor.tilt, why
+    height, pitch, roll = np.median(grounds, axis=0).tolist()
+    heights = np.array(grounds)[:, 0]
+    if np.median(np.abs(heights - height)) > ALIKE:
+        low, high = np.quantile(heights, [0.1, 0.9])
+        why = f"expected the ground as far below in most scans, found it {low:.2f} to {high:.2f} m below"
+        return Sensor.mount, Sensor.tilt, why
+    return round(height, 2), (round(pitch, 2), round(roll, 2)), None
 
 
 def _guessed(scan: Scan) -> bool:

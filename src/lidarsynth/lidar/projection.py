@@ -8,6 +8,9 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 PROJECTIONS = ("auto", "spherical", "unfolding")
+# Rows by the order of points are wrong where more than this share of at most so many points lies on other beams, and
+# points lie on beams, within this share of the usual spacing; those of scans put straight for motion do not.
+OTHERS, SOME, ON_BEAM = 0.1, 10_000, 0.08
 
 
 Pixels = tuple[np.ndarray, np.ndarray]  # row and column of each point, as `pixel_of_points` gives them
@@ -20,7 +23,7 @@ def project(
 
     method  `spherical`: row by elevation; `unfolding`: row by ring (Triess et al. 2020), from `scan.ring` or from the
             point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, else spherical;
-            also on an even grid, whose rows are no beam's
+            also on an even grid, whose rows are no beam's, and where points lie on the beams, but not of their rings
     width   columns of the image, if other than the sensor's
     pixels  of the points, where they are known already
 
@@ -101,7 +104,23 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     if scan.ring is not None:
         return np.where(ring < sensor.height, ring, -1)
     # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
-    return np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
+    row = np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
+    return _rows_by_elevation(scan.xyz, sensor) if method == "auto" and _elsewhere(scan.xyz, row, sensor) else row
+
+
+def _elsewhere(xyz: np.ndarray, row: np.ndarray, sensor: Sensor) -> bool:
+    """Whether points (N, 3) lie on the sensor's beams, but many not on that of their row (N,), counted by the order of
+    the file: it began elsewhere in the turn than KITTI's, or its last point is already of the next turn."""
+    part = slice(None, None, max(1, len(row) // SOME))
+    x, y, z = np.ascontiguousarray(xyz[part].T)
+    beam = _rows_by_elevation(xyz[part], sensor)
+    seen = beam >= 0
+    if sensor.height < 2 or not seen.any():
+        return False
+    elevations, lift = np.array(sensor.elevations), np.asarray(sensor.offsets or [0.0] * sensor.height)
+    off = np.abs(np.degrees(np.arctan2(z - lift[beam], _length(x, y))) - elevations[beam])[seen]
+    spacing = np.median(np.abs(np.diff(elevations)))
+    return bool(np.mean((beam != row[part])[seen]) > OTHERS and np.median(off) < ON_BEAM * spacing)
 
 
 def check_from_top(ring: np.ndarray, xyz: np.ndarray) -> None:

@@ -13,6 +13,7 @@ from lidarsynth.lidar.sensor import SENSORS, Sensor
 FAR = 3.0  # metres: nearer points show the beam's origin off the sensor's centre more than its elevation
 UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by this much (HDL-64E units do)
 SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams only; chance gives 0.25
+STRAY = 0.02  # of a usual ring: a first or last one of fewer points is none
 ENOUGH = 256  # points of a ring, evenly from all of it: their median is the ring's to a few thousandths of a degree
 POINTS = 8_000  # of a scan are enough, where each is compared with each beam
 # For scans without rings, the least `_share_on_beams`. Of train scans and streets of seven sensors it is 0.98 and more,
@@ -74,9 +75,17 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
         step = np.diff(angle)
         up, down = step > np.pi, step < -np.pi
         jumps, others = (up, down) if up.sum() > down.sum() else (down, up)
-        if 3 <= jumps.sum() < 256 and others.sum() <= 0.02 * jumps.sum() and (best is None or jumps.sum() < best.sum()):
-            best = jumps
-    return None if best is None else np.concatenate([[0], np.cumsum(best)])
+        if 3 <= jumps.sum() < 256 and others.sum() <= 0.02 * jumps.sum():
+            ring = _without_strays(np.concatenate([[0], np.cumsum(jumps)]))
+            best = ring if best is None or ring[-1] < best[-1] else best
+    return best
+
+
+def _without_strays(ring: np.ndarray) -> np.ndarray:
+    """Rings (N,) counted upwards, without a first or last one of a point or two that noise put beyond the seam."""
+    count = np.bincount(ring)
+    few = count < STRAY * np.median(count)
+    return np.clip(ring, int(few[0]), len(count) - 1 - int(few[-1])) - int(few[0])
 
 
 def _by_rings(

@@ -13,6 +13,7 @@ from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
+from lidarsynth.networks.grid_judge import GridJudge
 
 # How much further from the guide's velocity, and between which log-SNR: at more noise it would make streets alike, at
 # less it would sharpen nothing (Kynkäänniemi et al. 2024).
@@ -31,6 +32,7 @@ class Cascade(nn.Module):
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
     observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
     classes    says of each return what it is of
+    judge      says which of several drawn grids is most like a street's
     """
 
     def __init__(
@@ -44,10 +46,12 @@ class Cascade(nn.Module):
         likeliest: FillUNet | None = None,
         observer: FillUNet | None = None,
         classes: ClassUNet | None = None,
+        judge: GridJudge | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
         self.beams, self.likeliest, self.observer, self.classes = beams, likeliest, observer, classes
+        self.judge = judge
 
     @property
     def surest(self) -> FillUNet:

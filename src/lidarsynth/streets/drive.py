@@ -20,6 +20,7 @@ from lidarsynth.streets.world import REACH, TRAFFIC, WALK, World, draw_ground
 
 MARGIN = 120.0  # m of street behind the start and beyond the end
 LONGEST = 4000.0  # m of street in one world
+SLOWEST, FASTEST = 5.0, 16.0  # m/s that a street has its traffic drive
 OWN_LENGTH = 4.3  # m, of the carrier
 APART = 2.3  # m between the middles of vehicles that pass each other
 RAMP = 1.5  # m in which a kerb falls to the carriageway for those who ride
@@ -114,18 +115,36 @@ def draw_drive(seed: int, number: int, seconds: float, density: Density = TODAY,
     Raises ValueError for a drive longer than LONGEST.
     """
     rng = np.random.default_rng((seed, number, 4))
-    area = density.of(draw_area(rng))
-    usual = float(np.clip(5.5 + 1.3 * area.half[0] + rng.normal(0, 1), 5, 16))
+    area, usual = _street(rng, density)
     wished = speed or usual
-    length = max(2 * REACH[0], wished * seconds + 2 * MARGIN)
-    if length > LONGEST:
-        raise ValueError(f"expected a drive of at most {LONGEST - 2 * MARGIN:.0f} m, found {seconds:.0f} s at "
-                         f"{wished:.1f} m/s; choose fewer frames, or drive slower")  # fmt: skip
-    ground = draw_ground(rng, area, length)
+    ground = draw_ground(rng, area, _length(wished, seconds))
     road = ground.roads[0]
     lane, start = _lane(road), road.start + MARGIN
     world = _furnished(rng, ground, area, lane, start)
     return _set_off(np.random.default_rng((seed, number, 5)), world, lane, start, seconds, usual, wished)
+
+
+def check_drives(seed: int, count: int, seconds: float, density: Density = TODAY, speed: float | None = None) -> None:
+    """Raises ValueError where one of the drives 0 .. count - 1 would be longer than LONGEST, as `draw_drive` does."""
+    if (speed or FASTEST) * seconds + 2 * MARGIN <= LONGEST:
+        return
+    for number in range(count if speed is None else 1):
+        _length(speed or _street(np.random.default_rng((seed, number, 4)), density)[1], seconds)
+
+
+def _street(rng: np.random.Generator, density: Density) -> tuple[Area, float]:
+    """What kind of street it is, and at how many m/s its traffic drives."""
+    area = density.of(draw_area(rng))
+    return area, float(np.clip(5.5 + 1.3 * area.half[0] + rng.normal(0, 1), SLOWEST, FASTEST))
+
+
+def _length(wished: float, seconds: float) -> float:
+    """m of street."""
+    length = max(2 * REACH[0], wished * seconds + 2 * MARGIN)
+    if length > LONGEST:
+        raise ValueError(f"expected a drive of at most {LONGEST - 2 * MARGIN:.0f} m, found {seconds:.0f} s at "
+                         f"{wished:.1f} m/s; choose fewer frames, or drive slower")  # fmt: skip
+    return length
 
 
 def _lane(road: Road) -> float:

@@ -9,15 +9,15 @@ import numpy as np
 
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import RAW
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.streets.actors import KINDS, actors_of, numbers_of
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import Box, boxes_of
-from lidarsynth.streets.drive import Drive, Moment, draw_drive, parked_world
+from lidarsynth.streets.drive import Drive, Moment, check_drives, draw_drive, parked_world
 from lidarsynth.streets.hdl64e import NAME
 from lidarsynth.streets.moving import Bodies, MovingCaster
 from lidarsynth.streets.raycast import Caster
-from lidarsynth.streets.reader import FULL_TURN, Worlds
+from lidarsynth.streets.reader import FULL_TURN, Worlds, whole
 from lidarsynth.streets.sensor_model import OPTICS, Optics
 from lidarsynth.streets.turn import Turn, attitudes, perfect, sensor_pose, shoot
 from lidarsynth.streets.weather import CLEAR, Weather
@@ -48,9 +48,9 @@ class Options:
     optics: Optics = field(default=OPTICS)
 
     def __post_init__(self):
-        if not (self.frames >= 0 and 0.1 <= self.rate <= 100):
-            raise ValueError(f"expected frames >= 0 and a rate of 0.1 to 100 turns per second, found {self.frames} and "
-                             f"{self.rate}")  # fmt: skip
+        object.__setattr__(self, "frames", whole("frames", self.frames, 0))
+        if not 0.1 <= self.rate <= 100:
+            raise ValueError(f"expected a rate of 0.1 to 100 turns per second, found {self.rate}")
         if self.perfect and self.weather != CLEAR:
             raise ValueError("expected clear weather of a perfect sensor, found rain or fog")
         if self.frames == 0 and (self.speed is not None or self.deskewed):
@@ -97,7 +97,7 @@ class LabelledStreets:
     """`len`, and `[i] -> Frame`; frame i of a seed and its options depends on nothing else.
 
     count   how many scans, or drives where `options.frames` is given; `len` is the number of frames
-    sensor  its own columns; for KITTI's, 2083, as it turns
+    sensor  or its word; its own columns; for KITTI's, 2083, as it turns
     Raises IndexError beyond the length, ImportError naming the extra, ValueError for options that make no sense.
     """
 
@@ -105,11 +105,12 @@ class LabelledStreets:
         self,
         seed: int = 0,
         count: int = 1000,
-        sensor: Sensor = SENSORS["hdl-64e-kitti"],
+        sensor: Sensor | str = SENSORS["hdl-64e-kitti"],
         options: Options = Options(),
     ):
-        if seed < 0 or count < 1:
-            raise ValueError(f"expected seed >= 0 and count >= 1, got seed {seed} and count {count}")
+        seed, count, sensor = whole("seed", seed, 0), whole("count", count, 1), get_sensor(sensor)
+        if (frames := count * max(options.frames, 1)) >= 2**62:
+            raise ValueError(f"expected at most 2^62 - 1 scans, found {frames}")
         full = sensor.name == NAME and sensor.width < FULL_TURN
         self.sensor = sensor.resized(width=FULL_TURN) if full else sensor
         self.seed, self.count, self.options = seed, count, options
@@ -131,8 +132,16 @@ class LabelledStreets:
 
     def drive(self, number: int) -> Drive:
         """Drive `number`, which lasts one turn longer than its frames."""
-        seconds = (self.options.frames + 1) / self.options.rate
-        return draw_drive(self.seed, number, seconds, self.options.density, self.options.speed)
+        return draw_drive(self.seed, number, self._seconds, self.options.density, self.options.speed)
+
+    def check_drives(self) -> None:
+        """Raises ValueError where a drive is longer than a street may be: before any is drawn."""
+        if self.options.frames:
+            check_drives(self.seed, self.count, self._seconds, self.options.density, self.options.speed)
+
+    @property
+    def _seconds(self) -> float:
+        return (self.options.frames + 1) / self.options.rate
 
     def _still(self, index: int) -> Frame:
         number, pose = divmod(index, POSES)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import index as index_of
 
 import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.layout import build
 from lidarsynth.streets.raycast import Caster
@@ -17,6 +18,17 @@ from lidarsynth.streets.turn import Turn, perfect, shoot
 from lidarsynth.streets.world import POSES, THING, World, visible
 
 FULL_TURN = 2083  # azimuth steps per turn of KITTI's sensor at 10 Hz
+
+
+def whole(name: str, number: int, least: int) -> int:
+    """The number as Python's own. Raises ValueError for one that is not whole, or below `least`."""
+    try:
+        number = index_of(number)
+    except TypeError:
+        raise ValueError(f"expected a whole number as {name}, found {number!r:.60}") from None
+    if number < least:
+        raise ValueError(f"expected {name} of at least {least}, found {number}")
+    return number
 
 
 class Worlds:
@@ -47,7 +59,7 @@ class SyntheticStreets:
 
     seed    any integer >= 0; streets of different seeds are unrelated
     length  number of scans; scan i does not depend on it
-    sensor  beams, offsets, range limits, columns and mounting height
+    sensor  beams, offsets, range limits, columns and mounting height, or its word
     without words of SemanticKITTI classes, such as `car`: things of these are taken away, all else stays where it is
     optics  how well the sensor sees
     worlds  of this seed, to share with other sensors
@@ -61,14 +73,13 @@ class SyntheticStreets:
         self,
         seed: int = 0,
         length: int = 1000,
-        sensor: Sensor = SENSORS["hdl-64e-kitti"],
+        sensor: Sensor | str = SENSORS["hdl-64e-kitti"],
         without: tuple[str, ...] = (),
         apart: bool = False,
         optics: Optics = OPTICS,
         worlds: Worlds | None = None,
     ):
-        if seed < 0 or length < 1:
-            raise ValueError(f"expected seed >= 0 and length >= 1, got seed {seed} and length {length}")
+        seed, length, sensor = whole("seed", seed, 0), whole("length", length, 1), get_sensor(sensor)
         if unknown := [word for word in without if word not in CLASS_NUMBER]:
             raise ValueError(f"expected classes of {', '.join(CLASS_NUMBER)}, found {unknown[0]!r}")
         self.without = without

@@ -25,6 +25,7 @@ from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 RECORD = "generate.json"
+NAMED = frozenset({"model", "sensor"})  # in words what `weights` says in digits, by which alone folders are compared
 MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
 LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
 
@@ -47,8 +48,9 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     if record.exists():
         found = _recorded(record)
-        if other := [key for key in settings.keys() | found.keys() if settings.get(key) != found.get(key)]:
-            asked, was = ({key: of.get(key) for key in sorted(other)} for of in (settings, found))
+        if other := _differing(settings, found):
+            asked, was = ({key: of.get(key) for key in other if key in of or key not in NAMED}
+                          for of in (settings, found))  # fmt: skip
             raise ValueError(f"{folder}: expected a folder of scans made with {asked}, found {was}; use another --out")
         return
     if taken := sorted(folder.glob("[0-9]" * 6 + ".*")):
@@ -56,6 +58,15 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
                          f"use another --out")  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(record, json.dumps(settings, indent=1) + "\n")
+
+
+def _differing(settings: dict[str, Any], found: dict[str, Any]) -> list[str]:
+    """The settings that are not as found; for other weights their model and sensor, where these have other words."""
+    unequal = {key for key in settings.keys() | found.keys() if settings.get(key) != found.get(key)}
+    if "weights" not in unequal:
+        return sorted(unequal - NAMED)
+    told = found.keys() >= NAMED and unequal & NAMED
+    return sorted(unequal - {"weights"} if told else unequal | NAMED)
 
 
 def _recorded(record: Path) -> dict[str, Any]:

@@ -78,7 +78,9 @@ def summary(learned: LearnedSensor) -> str:
         f"{sensor.name}: {sensor.height} beams from {top:+.2f} to {bottom:+.2f} degrees, {sensor.width} columns, "
         f"{sensor.min_range:g} to {sensor.max_range:g} m",
         f"  points lie {np.median(residuals):.4f} degrees off their beams (median), {residuals.max():.4f} (worst beam)",
-        f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
+        "  how far above the ground is not known"
+        if learned.afloat
+        else f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
         f"  blocked by its carrier: {share:.1%} of the rays" if sensor.blocked else "  nothing seen to be blocked",
         f"  from {learned.scans} scans" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
     ]
@@ -86,8 +88,8 @@ def summary(learned: LearnedSensor) -> str:
 
 
 def doubts(learned: LearnedSensor) -> list[str]:
-    """Why the beams are not to be trusted, a line each: points more than SMEARED degrees off some, rings of few points,
-    beams of several rings, scans of several turns."""
+    """Why beams or mount are not to be trusted, a line each: points more than SMEARED degrees off some, rings of few
+    points, beams of several rings, scans of several turns, no ground."""
     name, known = learned.sensor.name, len(learned.rings)
     smeared = sum(ring.residual > SMEARED for ring in learned.rings)
     found = []
@@ -102,6 +104,9 @@ def doubts(learned: LearnedSensor) -> list[str]:
             f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {few + known - learned.thin} rings, found "
             f"fewer in {few}, which are left out{kept}: give scans of wider places, or more of them"
         )
+    if learned.afloat:
+        found.append(f"{name}: {learned.afloat}: mount and tilt are not learned, {learned.sensor.mount:g} m and level "
+                     "are written: set them in the file")  # fmt: skip
     took = f"{learned.merged} rings are taken as one beam with another"
     if learned.turns:
         found.append(f"{name}: {learned.turns} ({took if learned.merged else 'its columns may be too many'})")

@@ -1,6 +1,7 @@
 """KITTI's object benchmark: training/velodyne, label_2, calib and image_2, ImageSets; all boxes around in boxes/*.json.
 
-label_2 holds what the virtual camera sees, as KITTI has it. The images are dark: OpenPCDet asks for their size.
+label_2 holds what the virtual camera sees, as KITTI has it: things with a point in its image. The images
+are dark: OpenPCDet asks for their size.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ def _files(streets: LabelledStreets, index: int, frame: Frame) -> Content:
     scan = frame.scan
     points = np.column_stack([scan.xyz, scan.reflectance]).astype("<f4").tobytes()
     yield _scan(streets, index), points
-    lines = [line for box in frame.boxes if box.points and (line := label_line(box))]
+    shown = in_view(frame)
+    lines = [line for box in frame.boxes if box.instance in shown and (line := label_line(box))]
     yield f"training/label_2/{index:06d}.txt", "".join(f"{line}\n" for line in lines).encode()
     yield f"training/calib/{index:06d}.txt", object_calibration().encode()
     yield f"training/image_2/{index:06d}.png", _dark_image()
@@ -45,6 +47,15 @@ def _sizes(streets: LabelledStreets, index: int, points: int) -> Sizes:
     yield f"training/label_2/{index:06d}.txt", None
     yield f"training/calib/{index:06d}.txt", len(object_calibration())
     yield f"training/image_2/{index:06d}.png", len(_dark_image())
+
+
+def in_view(frame: Frame) -> set[int]:
+    """The instances that have a point in the camera's image."""
+    x, y, z = AXES[:3, :3] @ frame.scan.xyz.T.astype(np.float64)
+    ahead = z > NEAREST
+    columns, rows, _ = PROJECTION[:, :3] @ np.stack([x, y, z])[:, ahead] / z[ahead]
+    inside = (columns >= 0) & (columns < IMAGE[0]) & (rows >= 0) & (rows < IMAGE[1])
+    return set((frame.raw[ahead][inside] >> 16).tolist()) - {0}
 
 
 def label_line(box: Box) -> str | None:

@@ -15,6 +15,7 @@ from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
+from lidarsynth.networks.grid_judge import GridJudge
 from lidarsynth.networks.tensors import load_weights
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.graph import fill_graph
@@ -41,7 +42,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     between = BetweenColumns(model.between_channels) if model.between_channels else None
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
     classes = ClassUNet(model.class_channels, classes=model.classes) if model.classes else None
-    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes)
+    judge = GridJudge(model.judge_channels) if model.judge_channels else None
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge)
 
 
 def _widths(first: int) -> tuple[int, int, int, int]:
@@ -66,7 +68,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     that is as wide.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes"):
+    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)

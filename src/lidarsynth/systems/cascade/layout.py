@@ -33,6 +33,7 @@ DRAFT, DRAFT_STEPS = 0.53, 8
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion
+CHOICE = 3  # grids of which one is kept, where the network has a judge: docs/training-default.md
 # Rows, columns -> what is told of their rays (B, 8, R, C), and their standing elevations (B, R, C).
 RaysOf = Callable[[np.ndarray, np.ndarray], tuple[Tensor, Tensor]]
 
@@ -54,9 +55,10 @@ def sampling(network: Cascade, steps: int | None, sampler: str | None) -> tuple[
     return sampler, COLUMNS
 
 
-def block(how: tuple[str, int]) -> int:
-    """How many grids to draw at once: half the time of one by one, of columns a tenth."""
-    return 16 if how[0] == BY_COLUMNS else 8
+def block(how: tuple[str, int], judged: bool = False) -> int:
+    """How many scans to draw at once: half the time of one by one, of columns a tenth; those that are chosen are drawn
+    CHOICE times."""
+    return 8 if judged or how[0] != BY_COLUMNS else 16
 
 
 def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
@@ -122,9 +124,7 @@ def grids(
     (told, standing), (sampler, steps) = rays_of(rows, columns), how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
-        after = draft(network, told, standing, rng)
-        with one_thread():
-            grid = draw(network.columns, told, after, rng, on_step)
+        grid = _chosen(network, told, standing, rng, on_step)
         return detailed(network, grid, (rows, columns), rays_of, sensor, unevenness(sensor), rng)
     dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
@@ -133,6 +133,29 @@ def grids(
         on_step()
     metres, shade = network.coarse.decode(network.settled(x_0, told), standing, dim)
     return straightened(metres, rows, sensor), shade, rows, columns
+
+
+def _chosen(
+    network: Cascade, told: Tensor, standing: Tensor, rng: list[torch.Generator], on_step: Callable[[], None]
+) -> Grid:
+    """Grids (B, 16, 128) drawn after drafts, each of CHOICE the one that the network's judge takes for a street."""
+    assert network.columns is not None
+    every = CHOICE if network.judge is not None else 1
+    one_by_one = rng if every == 1 else [each for one in rng for each in _offspring(one, every)]
+    told, standing = (part.repeat_interleave(every, 0) for part in (told, standing))
+    after = draft(network, told, standing, one_by_one)
+    with one_thread():
+        grid = draw(network.columns, told, after, one_by_one, on_step)
+    if network.judge is None:
+        return grid
+    first = torch.arange(len(rng), device=told.device) * every
+    best = first + network.judge(grid, told).view(-1, every).argmax(1)
+    return Grid(*(part[best] for part in grid))
+
+
+def _offspring(rng: torch.Generator, count: int) -> list[torch.Generator]:
+    """Generators of their own for each of the draws among which a scan's is chosen."""
+    return [torch.Generator().manual_seed(int(torch.randint(1 << 31, (), generator=rng))) for _ in range(count)]
 
 
 def detailed(

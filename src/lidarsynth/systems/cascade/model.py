@@ -125,7 +125,7 @@ class CascadeModel(AnySensorModel):
         self, n: int, how: tuple[str, int], seed: int, batch_size: int, first: int, on_step: OnStep
     ) -> Iterator[RangeImage]:
         (rows, columns), tell, size = grid_of(self.sensor), on_step or (lambda: None), self.at_once(batch_size)
-        count = max(size, block(how))
+        count = max(size, block(how, self.network.judge is not None))
         rays_of = partial(self._grid_rays, count=count)
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)

@@ -1,0 +1,69 @@
+"""Rows of files without rings, one ring after the other, wherever in the turn they begin and end."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarsynth as ls
+from lidarsynth.lidar.projection import pixel_of_points, ring_of_points
+from lidarsynth.lidar.recognition import rings_in_order
+
+
+def by_rings(sensor: ls.Sensor, start: float, way: int, noise: float = 0.0) -> tuple[ls.Scan, np.ndarray]:
+    """Ground and a wall, ring by ring from azimuth `start` on, counter-clockwise or, -1, clockwise; and true rings."""
+    turn = start + way * np.linspace(0, 2 * np.pi, 957, endpoint=False)
+    turn = turn + np.random.default_rng(1).normal(0, noise, turn.shape)
+    points = []
+    for elevation, lift in zip(np.radians(sensor.elevations), sensor.offsets or [0.0] * sensor.height, strict=True):
+        away = np.minimum(15 + 5 * np.sin(3 * turn), 1.73 / max(-np.sin(elevation), 1e-3))
+        ray = np.stack([np.cos(elevation) * np.cos(turn), np.cos(elevation) * np.sin(turn)], 1)
+        points.append(np.column_stack([away[:, None] * ray, away * np.sin(elevation) + lift]))
+    xyz = np.concatenate(points).astype(np.float32)
+    return ls.Scan(xyz, np.full(len(xyz), 0.3, np.float32)), np.repeat(np.arange(sensor.height), len(turn))
+
+
+@pytest.mark.parametrize("start", [-np.pi, 0.0, np.pi / 2, 2.2])
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "hdl-64e-kitti"])
+def test_a_ring_is_its_beam_wherever_the_turn_begins(name: str, start: float, way: int):
+    sensor = ls.get_sensor(name)
+    scan, ring = by_rings(sensor, start, way)
+    row, _ = pixel_of_points(scan, sensor)
+    assert np.mean(row != ring) < 0.002
+
+
+def test_a_last_point_of_the_next_turn_shifts_no_ring():
+    sensor = ls.get_sensor("vlp-16")
+    scan, ring = by_rings(sensor, 0.0, 1)
+    azimuth = np.float32(0.002)
+    far = np.hypot(*scan.xyz[-1, :2])
+    scan.xyz[-1, :2] = far * np.cos(azimuth), far * np.sin(azimuth)  # one point of noise over the seam
+    counted, count = ring_of_points(scan)
+    assert count == 16 and np.mean(counted + 1 == ring) > 0.99, (
+        "as published: off by one, and as many as there should be"
+    )
+    row, _ = pixel_of_points(scan, sensor)
+    assert np.array_equal(row, ring)
+    own = rings_in_order(scan.xyz)
+    assert own is not None and own.max() == 15
+
+
+def test_unfolding_by_name_stays_as_published():
+    sensor = ls.get_sensor("vlp-16")
+    scan, ring = by_rings(sensor, -np.pi, 1)
+    row, _ = pixel_of_points(scan, sensor, "unfolding")
+    assert np.mean(row != ring) > 0.2
+
+
+def test_rings_of_scans_put_straight_for_motion_stay_those_of_the_file(shared: Path):
+    """Their points lie on no beams any more: the order of the file is all there is."""
+    sensor = ls.get_sensor("hdl-64e-kitti")
+    scans = [ls.read(path) for path in sorted((shared / "scans" / "test").glob("odometry*.bin"))]
+    assert scans
+    for scan in scans:
+        ring, count = ring_of_points(scan)
+        row, _ = pixel_of_points(scan, sensor)
+        beam, _ = pixel_of_points(scan, sensor, "spherical")
+        assert count == 64 and np.mean(row != beam) > 0.1
+        assert np.array_equal(row, ring)
