@@ -18,4 +18,5 @@ while true; do
   timeout 580 lidarsynth train default --data virtual --out "$out" "${budget[@]}" | tee "$out/last.log"
   grep -q "stopped after step" "$out/last.log" || break
 done
-lidarsynth info "$out"
+python "$(dirname "$0")/../benchmarks/learn_judge.py" "$out" "$out-judged"   # chooses among drawn layouts
+lidarsynth info "$out-judged"

@@ -19,6 +19,10 @@ def generate(
     labels: Annotated[bool, arg(help="the class of each point too: as a field, and SemanticKITTI's .label.")] = False,
     steps: GenerationSteps = None,
     sampler: Sampler = None,
+    layouts: Annotated[
+        int | None,
+        arg(metavar="INT", help="drawn for each scan, of which the likeliest street is kept; default 3, 1 is faster."),
+    ] = None,
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one.")] = 4,
     device: Device = "cpu",
@@ -32,15 +36,16 @@ def generate(
     from lidarsynth.systems.fingerprint import fingerprint
     from lidarsynth.verbs.generation import Drawing, claim, endings_of, generate_into, missing, processes
 
-    at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers})
+    at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
     endings = endings_of(format, labels, picture)
-    source = Drawing(model, device, sensor, labels)
+    source = Drawing(model, device, sensor, labels, layouts)
     loaded = source.of(load_with_bar(model, device))
     calls = loaded.generation_steps(steps, sampler)
     used = loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": used, "seed": seed}
     settings |= {"model": str(model), "sensor": loaded.sensor.name} | ({"labels": True} if labels else {})
+    settings |= {} if layouts is None else {"layouts": layouts}
     with only_writer(out, "generation"):
         claim(out, settings)
         runs, size = missing(out, count, endings), loaded.at_once(batch_size)

@@ -22,6 +22,7 @@ from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep, write_whole
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
+from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 RECORD = "generate.json"
@@ -110,16 +111,22 @@ def cut(runs: list[range], together: int) -> list[range]:
 
 
 class Drawing(NamedTuple):
-    """Which model draws, as `load` takes it, and scans of which sensor, with labels or without."""
+    """Which model draws, as `load` takes it, and scans of which sensor, with labels or without, of how many layouts."""
 
     model: str = "default"
     device: str = "cpu"
     sensor: str | None = None
     labels: bool = False
+    layouts: int | None = None
 
     def of(self, model: ScanModel) -> ScanModel:
         """A loaded model with images of that sensor, with labels or without."""
         model = model.into(self.sensor) if self.sensor else model
+        if self.layouts is not None:
+            if not isinstance(model, CascadeModel):
+                raise ValueError(f"expected a model that chooses among layouts, such as default, found "
+                                 f"{model.experiment.name}")  # fmt: skip
+            model = model.choosing(self.layouts)
         return model.with_labels() if self.labels else model
 
 

@@ -55,10 +55,9 @@ def sampling(network: Cascade, steps: int | None, sampler: str | None) -> tuple[
     return sampler, COLUMNS
 
 
-def block(how: tuple[str, int], judged: bool = False) -> int:
-    """How many scans to draw at once: half the time of one by one, of columns a tenth; those that are chosen are drawn
-    CHOICE times."""
-    return 8 if judged or how[0] != BY_COLUMNS else 16
+def block(how: tuple[str, int], choice: int = 1) -> int:
+    """How many scans to draw at once, each `choice` times: half the time of one by one, of columns a tenth."""
+    return 8 if choice > 1 or how[0] != BY_COLUMNS else 16
 
 
 def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
@@ -115,16 +114,18 @@ def grids(
     rng: list[torch.Generator],
     how: tuple[str, int],
     on_step: Callable[[], None],
+    choice: int = 1,
 ) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
     """Metres, 0 for no return, and reflectance, each (B, R, C), and the rows (R,) and columns (C,) that were drawn:
     those given, and what is between them where the network draws them.
 
-    how  as `sampling` says; on_step  called after each
+    how     as `sampling` says; on_step  called after each
+    choice  of so many drawn column by column the one is kept that the network's judge takes for a street's
     """
     (told, standing), (sampler, steps) = rays_of(rows, columns), how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
-        grid = _chosen(network, told, standing, rng, on_step)
+        grid = _chosen(network, told, standing, rng, on_step, choice if network.judge is not None else 1)
         return detailed(network, grid, (rows, columns), rays_of, sensor, unevenness(sensor), rng)
     dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
@@ -136,20 +137,25 @@ def grids(
 
 
 def _chosen(
-    network: Cascade, told: Tensor, standing: Tensor, rng: list[torch.Generator], on_step: Callable[[], None]
+    network: Cascade,
+    told: Tensor,
+    standing: Tensor,
+    rng: list[torch.Generator],
+    on_step: Callable[[], None],
+    choice: int,
 ) -> Grid:
-    """Grids (B, 16, 128) drawn after drafts, each of CHOICE the one that the network's judge takes for a street."""
+    """Grids (B, 16, 128) drawn after drafts, each the one of `choice` that the judge takes for a street's."""
     assert network.columns is not None
-    every = CHOICE if network.judge is not None else 1
-    one_by_one = rng if every == 1 else [each for one in rng for each in _offspring(one, every)]
-    told, standing = (part.repeat_interleave(every, 0) for part in (told, standing))
+    one_by_one = rng if choice == 1 else [each for one in rng for each in _offspring(one, choice)]
+    told, standing = (part.repeat_interleave(choice, 0) for part in (told, standing))
     after = draft(network, told, standing, one_by_one)
     with one_thread():
         grid = draw(network.columns, told, after, one_by_one, on_step)
-    if network.judge is None:
+    if choice == 1:
         return grid
-    first = torch.arange(len(rng), device=told.device) * every
-    best = first + network.judge(grid, told).view(-1, every).argmax(1)
+    assert network.judge is not None
+    first = torch.arange(len(rng), device=told.device) * choice
+    best = first + network.judge(grid, told).view(-1, choice).argmax(1)
     return Grid(*(part[best] for part in grid))
 
 

@@ -45,7 +45,7 @@ from lidarsynth.systems.cascade.images import (
     with_doubts,
 )
 from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, unanswered
-from lidarsynth.systems.cascade.layout import BY_COLUMNS, block, grids, sampling, times
+from lidarsynth.systems.cascade.layout import BY_COLUMNS, CHOICE, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.request import calls, resolved
@@ -72,6 +72,7 @@ class CascadeModel(AnySensorModel):
     precision        of the fill's matrix products: fp32 | bf16
     response         how the sensor reports what it sees, as found out from the scan at hand
     grain            how much of each kind of noise its samples take
+    layouts          drawn for each generated scan, of which the likeliest street is kept: see `choosing`
     """
 
     network: Cascade
@@ -81,6 +82,7 @@ class CascadeModel(AnySensorModel):
     precision: str = "fp32"
     response: Response = AS_STREETS
     grain: Grain = GENERATED
+    layouts: int = CHOICE
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
     together: ClassVar[int] = 16
@@ -94,6 +96,20 @@ class CascadeModel(AnySensorModel):
         if self.network.classes is None:
             super().with_labels()  # refuses
         return replace(self, labelled=True)
+
+    def choosing(self, layouts: int) -> CascadeModel:
+        """The same model, which draws so many layouts of each generated scan and keeps the one most like a street's:
+        with 1 scans take about half the time, and fewer of them look like streets.
+
+        Raises ValueError for a number below 1, and for a model without a judge of layouts.
+        """
+        if self.network.judge is None:
+            raise ValueError(
+                f"expected a model that chooses among layouts, such as default, found {self.experiment.name}"
+            )
+        if whole("layouts", layouts) < 1:
+            raise ValueError(f"expected at least 1 layout, found {layouts}")
+        return replace(self, layouts=layouts)
 
     def check_realises(self) -> None:
         """Raises ValueError for a cascade without classes: one recipe teaches both."""
@@ -125,11 +141,12 @@ class CascadeModel(AnySensorModel):
         self, n: int, how: tuple[str, int], seed: int, batch_size: int, first: int, on_step: OnStep
     ) -> Iterator[RangeImage]:
         (rows, columns), tell, size = grid_of(self.sensor), on_step or (lambda: None), self.at_once(batch_size)
-        count = max(size, block(how, self.network.judge is not None))
+        choice = self.layouts if self.network.judge is not None else 1
+        count = max(size, block(how, choice))
         rays_of = partial(self._grid_rays, count=count)
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
-            grid = grids(self.network, self.sensor, rows, columns, rays_of, rng, how, times(len(wanted), tell))
+            grid = grids(self.network, self.sensor, rows, columns, rays_of, rng, how, times(len(wanted), tell), choice)
             for part in wanted:
                 yield from self._filled_grids(grid[0][part], grid[1][part], *grid[2:], rng[part])
                 tell()

@@ -1,0 +1,104 @@
+"""The judge of a cascade: it learns to tell the grids that the cascade draws from those of streets, and chooses among
+several drawn ones from then on.
+
+python benchmarks/learn_judge.py MODEL OUT [--grids 3328] [--steps 1300] [--width 40] [--seed 66001]
+
+Draws the grids, of the same virtual sensors as the streets, holds a thirteenth of them out, and writes the folder OUT,
+the model with its judge. Prints the area under the ROC curve of the held-out ones, and of them as chosen among three:
+0.5 if it cannot tell them any more. Range and reflectance get noise, so that what counts is how streets run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from told_apart import area, both
+from torch import Tensor
+from torch.nn import functional as F
+
+from lidarsynth.experiment.record import with_fields
+from lidarsynth.networks.column_neighbours import Grid
+from lidarsynth.networks.grid_judge import GridJudge
+from lidarsynth.systems.cascade.layout import CHOICE
+from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.weights.load import load
+
+BATCH, RATE, DECAY, AVERAGE = 16, 2e-3, 0.05, 0.99
+CODE, SHADE = 0.02, 0.06  # standard deviations of the noise: 5 to 6 % of the range
+
+
+def noisy(grid: Grid) -> Grid:
+    """The grid with noise on its range codes and reflectances."""
+    code = grid.code + CODE * torch.randn_like(grid.code)
+    return Grid(code, grid.shade + SHADE * torch.randn_like(grid.shade), grid.returned)
+
+
+def taken(whole: Grid, chosen: Tensor | slice) -> Grid:
+    """Some of the grids, to learn from."""
+    return Grid(*(part[chosen].clone() for part in whole))
+
+
+def learned(true: Grid, drawn: Grid, rays: Tensor, steps: int, width: int) -> GridJudge:
+    """A judge of these grids (B, 16, 128): the running mean of its weights after so many steps of BATCH of each."""
+    judge, rng = GridJudge(width), torch.Generator().manual_seed(0)
+    mean = GridJudge(width)
+    mean.load_state_dict(judge.state_dict())
+    optimizer = torch.optim.AdamW(judge.parameters(), RATE, weight_decay=DECAY)
+    for step in range(steps):
+        first, second = (torch.randint(len(rays), (BATCH,), generator=rng) for _ in range(2))
+        pairs = zip(taken(true, first), taken(drawn, second), strict=True)
+        odds = judge(noisy(Grid(*map(torch.cat, pairs))), torch.cat([rays[first], rays[second]]))
+        truth = torch.cat([torch.ones(BATCH), torch.zeros(BATCH)])
+        for group in optimizer.param_groups:
+            group["lr"] = RATE * min(1, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
+        optimizer.zero_grad()
+        F.binary_cross_entropy_with_logits(odds, truth).backward()
+        torch.nn.utils.clip_grad_norm_(judge.parameters(), 1.0)
+        optimizer.step()
+        with torch.no_grad():
+            share = 1 - min(AVERAGE, (1 + step) / (10 + step))
+            for slow, fast in zip(mean.parameters(), judge.parameters(), strict=True):
+                slow.lerp_(fast, share)
+    return mean.eval()
+
+
+@torch.inference_mode()
+def areas(judge: GridJudge, true: Grid, drawn: Grid, rays: Tensor) -> tuple[float, float]:
+    """Under the ROC curve: of all drawn grids, and of the best of each CHOICE of them."""
+    truth, odds = judge(true, rays), judge(drawn, rays)
+    best = odds[: len(odds) // CHOICE * CHOICE].view(-1, CHOICE).amax(1)
+    return area(truth, odds), area(truth, best)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--grids", type=int, default=3328)
+    parser.add_argument("--steps", type=int, default=1300)
+    parser.add_argument("--width", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=66001, help="of the streets")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    model = load(args.model)
+    if not isinstance(model, CascadeModel) or model.network.columns is None:
+        parser.error(f"expected a cascade that draws columns, found {args.model}")
+    with torch.inference_mode():
+        pairs = both(model.network, args.grids, args.seed)
+    held = max(args.grids // 13, CHOICE)
+    (true, drawn, rays), rest = pairs, slice(held, None)
+    judge = learned(taken(true, rest), taken(drawn, rest), rays[rest].clone(), args.steps, args.width)
+    of_all, of_best = areas(judge, taken(true, slice(held)), taken(drawn, slice(held)), rays[:held])
+    model.network.judge = judge
+    record = with_fields(model.experiment, {"model.judge_channels": args.width})
+    replace(model, experiment=record).save(args.out)
+    print(f"{args.out}: {args.grids} grids, {args.steps} steps: area {of_all:.3f}, best of {CHOICE} {of_best:.3f}")
+
+
+if __name__ == "__main__":
+    main()
