@@ -125,8 +125,9 @@ def grids(
     (told, standing), (sampler, steps) = rays_of(rows, columns), how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
-        grid = _chosen(network, told, standing, rng, on_step, choice if network.judge is not None else 1)
-        return detailed(network, grid, (rows, columns), rays_of, sensor, unevenness(sensor), rng)
+        with one_thread():
+            grid = _chosen(network, told, standing, rng, on_step, choice if network.judge is not None else 1)
+            return detailed(network, grid, (rows, columns), rays_of, sensor, unevenness(sensor), rng)
     dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
     for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
@@ -149,8 +150,7 @@ def _chosen(
     one_by_one = rng if choice == 1 else [each for one in rng for each in _offspring(one, choice)]
     told, standing = (part.repeat_interleave(choice, 0) for part in (told, standing))
     after = draft(network, told, standing, one_by_one)
-    with one_thread():
-        grid = draw(network.columns, told, after, one_by_one, on_step)
+    grid = draw(network.columns, told, after, one_by_one, on_step)
     if choice == 1:
         return grid
     assert network.judge is not None
