@@ -596,6 +596,23 @@ def test_an_image_set_tells_where_it_comes_from(tmp_path: Path, real: Path):
     assert image_set(real / "3.npz").image(0, SENSOR, "spherical").shape == (64, 64)
 
 
+def test_folders_of_the_same_names_sizes_and_times_are_two(tmp_path: Path):
+    """As unpacked archives are, which keep times: statistics of the one are not the other's."""
+    folders = [saved(tmp_path / name, REAL[:2]) for name in ("a", "b")]
+    first = image_set(folders[0]).stamp
+    for folder in folders:
+        for path in folder.iterdir():
+            os.utime(path, ns=(10**18, 10**18))
+    stamps = [image_set(folder).stamp for folder in folders]
+    assert len({first, *stamps}) == 3
+    path = folders[0] / "0.npz"
+    same, found = path.read_bytes(), path.stat()
+    path.unlink()
+    path.write_bytes(same[::-1])
+    os.utime(path, ns=(found.st_atime_ns, found.st_mtime_ns))
+    assert image_set(folders[0]).stamp != stamps[0], "replaced in place, its time kept"
+
+
 def test_the_verb_prints_a_table_and_writes_json_and_markdown(tmp_path: Path, real: Path, run: Run):
     samples, out = saved(tmp_path / "samples", STREETS), tmp_path / "out/report.json"
     code, text, _ = run("evaluate", samples, "--reference", real, "--protocol", "bev-1", "--out", out, "--seed", 3)

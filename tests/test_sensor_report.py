@@ -94,3 +94,12 @@ def test_errors_say_both_sides():
         BeamCounts(SENSOR).merge(BeamCounts(SENSOR, step=1.0))
     with pytest.raises(ValueError, match="images on both sides, found 0 and 64"):
         compare_beams(BeamCounts(SENSOR), gathered(*[(np.ones((3, 64)), np.ones((3, 64)))]))
+
+
+def test_beams_that_return_on_one_side_only_are_told():
+    distance, mask = images(4)
+    silent = mask.copy()
+    silent[:, 1] = False
+    report = compare_beams(gathered((distance * silent, silent)), gathered((distance, mask)))
+    assert report.range_error == 0.0 and "; 1 of 3 beams return on one side only" in str(report).splitlines()[-1]
+    assert "one side" not in str(compare_beams(gathered((distance, mask)), gathered((distance, mask))))

@@ -94,7 +94,8 @@ def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) 
         return ImageSet(names, cache.__getitem__, str(path), sha256((path / INDEX).read_bytes()).hexdigest())
     files = _files(path)
     stats = [(str(file.relative_to(path)), file.stat()) for file in files] if path.is_dir() else [("", path.stat())]
-    stamp = sha256(repr([(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]).encode()).hexdigest()
+    kept = [(name, s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino) for name, s in stats]  # archives keep times
+    stamp = sha256(repr((str(path.resolve()), kept)).encode()).hexdigest()
     items = [(file, k) for file in files for k in _numbers(file)]
     if not items:
         raise ValueError(f"{path}: expected at least one range image, found {len(files)} files of none")

@@ -114,6 +114,8 @@ class BeamReport:
                          f"({median_real:>5.2f} m){moved:>17.2f} m")  # fmt: skip
         lines.append(f"mean over beams: no return differs by {self.drop_rate_error:.2%}, "
                      f"returns moved by {self.range_error:.2f} m")  # fmt: skip
+        if silent := int(np.isnan(self.range_distance).sum()):
+            lines[-1] += f"; {silent} of {len(self.elevation)} beams return on one side only: no distance counts them"
         return "\n".join(lines)
 
 
