@@ -523,7 +523,7 @@ def test_a_guide_is_led_away_from_and_the_rest_of_noise_is_taken_off(model: Casc
 def test_a_scan_is_the_same_bit_by_bit_whatever_the_count_and_the_start(
     model: CascadeModel, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(cascade_model, "block", lambda how: 2)
+    monkeypatch.setattr(cascade_model, "block", lambda *_: 2)
     told: list[int] = []
     four = model.generate(4, steps=2, seed=5, on_step=lambda: told.append(1))
     assert len(told) == 4 * model.generation_steps(2)

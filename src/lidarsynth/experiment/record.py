@@ -182,7 +182,7 @@ class Training:
     betas: tuple[float, float] = within((0.9, 0.99), 0, 0.999999)
     warmup: int = within(10_000, 0)  # steps of linear warm-up
     decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant | inverse | halving
-    clip_norm: float | None = within(1.0, 0)  # None = gradients as they are
+    clip_norm: float | None = within(1.0, 1e-9)  # None = gradients as they are; 0 would learn nothing
     ema_decay: float = within(0.995, 0, 1)
     ema_every: int = within(10, 1)  # steps
     ema_start: int = within(10_000, 0)  # steps of plain copying
