@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from told_apart import area, both
+from told_apart import area, both, taken
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -35,11 +35,6 @@ def noisy(grid: Grid) -> Grid:
     """The grid with noise on its range codes and reflectances."""
     code = grid.code + CODE * torch.randn_like(grid.code)
     return Grid(code, grid.shade + SHADE * torch.randn_like(grid.shade), grid.returned)
-
-
-def taken(whole: Grid, chosen: Tensor | slice) -> Grid:
-    """Some of the grids, to learn from."""
-    return Grid(*(part[chosen].clone() for part in whole))
 
 
 def learned(true: Grid, drawn: Grid, rays: Tensor, steps: int, width: int) -> GridJudge:
@@ -88,11 +83,10 @@ def main() -> None:
     model = load(args.model)
     if not isinstance(model, CascadeModel) or model.network.columns is None:
         parser.error(f"expected a cascade that draws columns, found {args.model}")
-    with torch.inference_mode():
-        pairs = both(model.network, args.grids, args.seed)
+    true, drawn, rays = both(model.network, args.grids, args.seed)
     held = max(args.grids // 13, CHOICE)
-    (true, drawn, rays), rest = pairs, slice(held, None)
-    judge = learned(taken(true, rest), taken(drawn, rest), rays[rest].clone(), args.steps, args.width)
+    rest = slice(held, None)
+    judge = learned(taken(true, rest), taken(drawn, rest), rays[rest], args.steps, args.width)
     of_all, of_best = areas(judge, taken(true, slice(held)), taken(drawn, slice(held)), rays[:held])
     model.network.judge = judge
     record = with_fields(model.experiment, {"model.judge_channels": args.width})

@@ -22,9 +22,10 @@ from torch.nn import functional as F
 from lidarsynth.diffusion.samplers import generators
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS
-from lidarsynth.networks.column_neighbours import Grid, known_grid, nearness
+from lidarsynth.networks.column_neighbours import Grid, known_grid
 from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.fill_unet import ring
+from lidarsynth.networks.grid_judge import INPUTS, seen
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade.examples import grid
 from lidarsynth.systems.cascade.layout import draft
@@ -39,30 +40,15 @@ class Judge(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(14, WIDTH, 3, padding=(1, 0))
+        self.stem = nn.Conv2d(INPUTS, WIDTH, 3, padding=(1, 0))
         self.blocks = nn.ModuleList(
             nn.Sequential(nn.GroupNorm(8, WIDTH), nn.SiLU(), nn.Conv2d(WIDTH, WIDTH, 3, padding=(1, 0)), nn.SiLU(),
                           nn.Conv2d(WIDTH, WIDTH, 1)) for _ in range(BLOCKS))  # fmt: skip
         self.column = nn.Sequential(nn.Linear(ROWS * WIDTH, 96), nn.SiLU(), nn.Linear(96, 1))
 
     def forward(self, grid: Grid, rays: Tensor) -> Tensor:
-        back = grid.returned.float()
         code = grid.code + CODE * torch.randn_like(grid.code)
-        shade = grid.shade + SHADE * torch.randn_like(code)
-        left, below = code.roll(1, -1), F.pad(code, (0, 0, 0, 1))[:, 1:]
-        beside, beneath = back * back.roll(1, -1), back * F.pad(back, (0, 0, 0, 1))[:, 1:]
-        row = torch.linspace(-1, 1, ROWS)[:, None].expand(code.shape)
-        values = [
-            2 * code * back,
-            (4 * (code - rays[:, 1] / 2)).clamp(-4, 4) * back,
-            2 * shade * back,
-            2 * back - 1,
-            (20 * (code - left)).clamp(-3, 3) * beside,
-            (20 * (code - below)).clamp(-3, 3) * beneath,
-            (4 * nearness(code, back, rays)).clamp(0, 3),
-            row,
-        ]
-        h = self.stem(ring(torch.cat([torch.stack(values, 1), rays[:, :4], rays[:, 6:8]], 1), 1))
+        h = self.stem(ring(seen(Grid(code, grid.shade + SHADE * torch.randn_like(code), grid.returned), rays), 1))
         for block in self.blocks:
             h = h + block(ring(h, 1))
         return self.column(h.flatten(1, 2).transpose(1, 2))[..., 0]

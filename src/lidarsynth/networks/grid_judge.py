@@ -40,7 +40,7 @@ class GridJudge(nn.Module):
         self.out = nn.Sequential(nn.GroupNorm(GROUPS, column), nn.SiLU(), nn.Conv1d(column, 1, 1))
 
     def forward(self, grid: Grid, rays: Tensor) -> Tensor:
-        h = self.stem(ring(_seen(grid, rays), 1))
+        h = self.stem(ring(seen(grid, rays), 1))
         for block in self.blocks:
             h = h + block(ring(h, 1))
         h = self.column(h.flatten(1, 2).transpose(1, 2)).transpose(1, 2)
@@ -65,8 +65,9 @@ class Along(nn.Module):
         return h + self.out(F.silu(self.look(around)))
 
 
-def _seen(grid: Grid, rays: Tensor) -> Tensor:
-    """(B, 14, 16, 128): ranges and reflectances, how they go on along and down, and where each ray goes."""
+def seen(grid: Grid, rays: Tensor) -> Tensor:
+    """(B, 14, 16, 128), each of about unit size, of a grid (B, 16, 128) and its rays (B, 8, 16, 128): ranges and
+    reflectances, how they go on along and down, and where each ray goes."""
     back, code = grid.returned.float(), grid.code
     left, below = code.roll(1, -1), F.pad(code, (0, 0, 0, 1))[:, 1:]
     beside, beneath = back * back.roll(1, -1), back * F.pad(back, (0, 0, 0, 1))[:, 1:]
