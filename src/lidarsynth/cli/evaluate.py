@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from lidarsynth.cli.arguments import Device, Positional, arg
+from lidarsynth.cli.arguments import Device, Intensity, Positional, arg
 from lidarsynth.cli.terminal import at_least, check_device, say
 
 
@@ -20,6 +20,7 @@ def evaluate(
     batch_size: Annotated[int, arg(help="images at once; makes no difference but of rounding.")] = 4,
     seed: Annotated[int, arg(help="of the subsets of the squared MMDs.")] = 0,
     device: Device = "cpu",
+    intensity: Intensity = "auto",
 ) -> None:
     """Judge samples against a reference under a named protocol; killed at any moment, the same command goes on."""
     from lidarsynth.cli.terminal import image_bar
@@ -34,10 +35,12 @@ def evaluate(
         raise ValueError(f"expected --side {side} with --part, found no part")
     with image_bar() as on_images:
         if part is not None:
-            evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, device, on_images, side, reference)
+            more = (device, on_images, side, reference, intensity)
+            evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, *more)
         elif reference is not None:
             evaluation.check_out(out)
-            report = evaluation.evaluate(samples, reference, protocol, sensor, seed, batch_size, device, on_images)
+            more = (device, on_images, intensity)
+            report = evaluation.evaluate(samples, reference, protocol, sensor, seed, batch_size, *more)
             say(str(report))
             evaluation.write_report(report, out)
         else:

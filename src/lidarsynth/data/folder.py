@@ -33,12 +33,17 @@ def scan_files(root: str | Path) -> list[Path]:
     root = Path(root)
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
-    endings = tuple(suffix for suffix in READERS if suffix not in NAMED_ONLY)
-    named = (path for path in root.rglob("*") if path.name.lower().endswith(endings))
-    paths = sorted(path for path in named if not _beside(path.relative_to(root)) and path.is_file())
+    paths = scans_below(root)
     if not paths:
         raise ValueError(f"{root}: expected scans ({', '.join(READERS)}), found none")
     return paths
+
+
+def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
+    """The scan files under a folder as `scan_files`, and files of these further endings; there may be none."""
+    endings = (*(suffix for suffix in READERS if suffix not in NAMED_ONLY), *more)
+    named = (path for path in root.rglob("*") if path.name.lower().endswith(endings))
+    return sorted(path for path in named if not _beside(path.relative_to(root)) and path.is_file())
 
 
 def _beside(path: Path) -> bool:

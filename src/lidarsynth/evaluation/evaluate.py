@@ -50,6 +50,7 @@ def evaluate(
     batch_size: int = 4,
     device: str = "cpu",
     on_images: OnImages = None,
+    intensity: str = "auto",
 ) -> Report:
     """Judge samples against a reference under a named protocol (`evaluation.protocols.PROTOCOLS`).
 
@@ -58,6 +59,7 @@ def evaluate(
     reference  the same. What is gathered of it stays in the cache folder, as a file of statistics to share
     sensor     of samples that are points or tensors, where neither the reference nor the protocol tells
     seed       of the subsets of the squared MMDs
+    intensity  scale of files of points, as `read` takes it; "none" of scans without: rows that need it are N/A
 
     Published networks that a protocol asks for are downloaded once, as `load` downloads releases; rows whose network is
     not to be had are N/A with the reason. Raises ValueError for no samples, mixed resolutions, values that are not
@@ -68,7 +70,9 @@ def evaluate(
     check_device(device)
     record = protocol if isinstance(protocol, EvaluationProtocol) else get_protocol(protocol)
     judge = _judge_pairs if record.pairs else _judge_sets
-    report = judge(_Run(record, sensor, batch_size, device, on_images), _single(samples), _single(reference), seed)
+    report = judge(
+        _Run(record, sensor, batch_size, device, on_images, intensity), _single(samples), _single(reference), seed
+    )
     return replace(report, seconds=time.monotonic() - start)
 
 
@@ -88,6 +92,11 @@ class _Run:
     batch_size: int
     device: str
     on_images: OnImages
+    intensity: str = "auto"
+
+    def images(self, source: Samples) -> ImageSet:
+        """Of samples, or a reference."""
+        return image_set(source, self.intensity)
 
     def fallback(self) -> Sensor:
         """Of points and tensors, where nothing else tells."""
@@ -100,7 +109,7 @@ class _Run:
             return self.fallback()
         if files := _statistics_files(_single(reference)):
             return load_statistics(files[0], self.protocol)[0].sensor
-        return self.sensor_of(image_set(reference), self.fallback())
+        return self.sensor_of(self.images(reference), self.fallback())
 
     def sensor_of(self, images: ImageSet, fallback: Sensor) -> Sensor:
         """Of a set by its first image; lists of points are judged as the protocol's own sensor draws them."""
@@ -189,7 +198,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         real, warnings = merged(real_files, run.protocol)
         told["reference"] = ", ".join(map(str, real_files))
     else:
-        truth = image_set(reference)
+        truth = run.images(reference)
         told["reference"] = truth.source
         warnings = unlike_names(run.protocol, truth.names)
     fallback = real.sensor if real else run.fallback()
@@ -202,7 +211,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         if truth:
             loaded = run.networks(fake.sensor)
     else:
-        judged = image_set(samples)
+        judged = run.images(samples)
         sensor = run.sensor_of(judged, fallback)
         loaded, told["samples"] = run.networks(sensor), judged.source
         fake, _ = run.statistics(judged, sensor, "samples", loaded)
@@ -212,7 +221,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         real_files = [kept] if kept else []
     assert real
     report = report_of(fake, real, loaded.missing, seed, run.on_images)
-    warnings += run.notes(judged, truth, fake.sensor) + one_set(judged, truth)
+    warnings += run.notes(judged, truth, fake.sensor) + one_set(judged, truth, report.hashes)
     if real_files:
         told["reference statistics"] = ", ".join(map(str, real_files))
         hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
@@ -225,7 +234,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
 def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
     if _statistics_files(samples) or _statistics_files(reference):
         raise ValueError(f"{run.protocol.title} compares images one by one: expected images, found statistics")
-    judged, truth = image_set(samples), image_set(reference)
+    judged, truth = run.images(samples), run.images(reference)
     if len(judged) != len(truth):
         raise ValueError(f"{run.protocol.title} compares sample i with reference i: expected as many of both, found "
                          f"{len(judged)} and {len(truth)}")  # fmt: skip
@@ -235,6 +244,7 @@ def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> 
     report = pairs.report(loaded.missing, loaded.weights)
     sources = {"samples": judged.source, "reference": truth.source}
     warnings = report.warnings + run.notes(judged, truth, sensor) + unlike_pairs(judged.names, truth.names)
+    warnings += one_set(judged, truth, report.hashes)
     return replace(report, sources=sources, warnings=warnings, images=_size_of(sensor))
 
 
@@ -253,12 +263,14 @@ def gather_part(
     on_images: OnImages = None,
     side: Literal["samples", "reference"] = "samples",
     reference: Samples | None = None,
+    intensity: str = "auto",
 ) -> str:
     """Write the statistics of part `i/n` of the samples to a `.safetensors` file; returns the SHA-256 of its content.
 
     `evaluate` merges such files, of several machines too; so does this, into one file, given files and the part 1/1.
     side       what the images are: samples to judge, or a reference
     reference  what they will be judged against, if it is here: tells the sensor of points, as in `evaluate`
+    intensity  as in `evaluate`
     Raises ValueError as `evaluate` does.
     """
     _check_numbers({"batch_size": (batch_size, 1)})
@@ -276,7 +288,8 @@ def gather_part(
     if side == "reference" and 0 in (record.real, record.real_bev):
         raise ValueError(f"{record.title} takes as many of the reference as there are samples: expected it to be "
                          "gathered with them, found it alone")  # fmt: skip
-    run, images = _Run(record, sensor, batch_size, device, on_images), image_set(samples)
+    run = _Run(record, sensor, batch_size, device, on_images, intensity)
+    images = run.images(samples)
     if unused := unused_sensor(sensor, images, run.fallback()):
         raise ValueError(f"expected the sensor of the images, or none, found another: {unused[0]}")
     spec = run.sensor_of(images, run.sensor_like(reference))

@@ -15,11 +15,12 @@ import numpy as np
 from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
+from lidarsynth.data.folder import scans_below
 from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.evaluation.sample_tensors import check_points, from_tensor
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
-from lidarsynth.files.fields import MAX_BYTES
-from lidarsynth.files.formats import READERS, holds_image, read, read_image
+from lidarsynth.files.fields import MAX_BYTES, check_metres
+from lidarsynth.files.formats import READERS, holds_image, naming, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -76,8 +77,11 @@ class ImageSet:
         return ValueError(text if text.startswith(self.names[i]) else f"{self.names[i]}: {text}")
 
 
-def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) -> ImageSet:
-    """The images of a cache, a folder at any depth, one file, or a list. Raises ValueError when there is none."""
+def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path], intensity: str = "auto") -> ImageSet:
+    """The images of a cache, a folder at any depth, one file, or a list. Raises ValueError when there is none.
+
+    intensity  scale of files of points, as in `files.formats.read`
+    """
     if not isinstance(source, str | Path):
         images: list = list(source)
         if not images:
@@ -95,19 +99,22 @@ def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path]) 
     files = _files(path)
     stats = [(str(file.relative_to(path)), file.stat()) for file in files] if path.is_dir() else [("", path.stat())]
     kept = [(name, s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino) for name, s in stats]  # archives keep times
-    stamp = sha256(repr((str(path.resolve()), kept)).encode()).hexdigest()
+    stamp = sha256(repr((str(path.resolve()), kept, intensity)).encode()).hexdigest()
     items = [(file, k) for file in files for k in _numbers(file)]
     if not items:
         raise ValueError(f"{path}: expected at least one range image, found {len(files)} files of none")
     names = tuple(str(file) if k is None else f"{file}[{k}]" for file, k in items)
-    return ImageSet(names, lambda i: read_item(*items[i]), str(path), stamp)
+    return ImageSet(names, lambda i: read_item(*items[i], intensity), str(path), stamp)
 
 
 def _files(path: Path) -> list[Path]:
-    """The readable files under a folder, sorted, or the file itself. Hidden files and folders are left out."""
+    """The readable files under a folder, sorted, or the file itself. Hidden files and folders are left out, and what a
+    folder of scans may hold beside them, as the other verbs do."""
     known = (*READERS, *TENSORS)
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path] if path.is_file() else []
-    files = [file for file in files if file.name.lower().endswith(known)]
+    if path.is_dir():
+        files = scans_below(path, TENSORS)
+    else:
+        files = [path] if path.is_file() and path.name.lower().endswith(known) else []
     files = [file for file in files if not any(part[0] == "." for part in file.relative_to(path).parts)]
     if not files:
         found = "none" if path.is_dir() else "another file" if path.is_file() else "no such file or folder"
@@ -140,23 +147,26 @@ def _numbers(path: Path) -> Sequence[int | None]:
     return range(shape[0]) if len(shape) == 3 else [None]
 
 
-def read_item(path: Path, number: int | None = None) -> Item:
+def read_item(path: Path, number: int | None = None, intensity: str = "auto") -> Item:
     """A range image (our `.npz`), points of any readable file, or the tensor of a published sample (`.pth`).
 
-    number  which image of a batch: an `.npz` whose range, reflectance, mask, and label, xyz are (B, ...). Raises
-    ValueError.
+    number     which image of a batch: an `.npz` whose range, reflectance, mask, and label, xyz are (B, ...)
+    intensity  scale of points, as in `files.formats.read`
+    Raises ValueError that begins with the path.
     """
     if number is not None:
         arrays = {name: array if name == "sensor" else array[number] for name, array in _batch(path).items()}
-        return image_of(arrays)
+        with naming(f"{path}[{number}]"):
+            return image_of(arrays)
     if path.suffix.lower() in TENSORS:
         return _read_tensor(path)
-    return read_image(path) if holds_image(path) else read(path)
+    return read_image(path) if holds_image(path) else read(path, intensity)
 
 
 @lru_cache(maxsize=1)  # images of a batch are read one after the other
 def _batch(path: Path) -> dict[str, np.ndarray]:
-    arrays = unzip(path.read_bytes())
+    with naming(path):
+        arrays = unzip(path.read_bytes())
     sizes = {name: array.shape[:1] for name, array in arrays.items() if name != "sensor"}
     if len(set(sizes.values())) != 1:
         raise ValueError(f"{path}: expected a batch of arrays (B, ...), found {sizes}")
@@ -173,10 +183,16 @@ def _read_tensor(path: Path) -> Tensor:
 
 def judged(item: Item) -> Item:
     """What counts of a stored form: an empty pixel holds nothing. Raises ValueError for a tensor whose depth is not
-    that of its points."""
+    that of its points, and for ranges that are no metres."""
     if isinstance(item, Tensor):
         check_points(item)
-    return emptied(item) if isinstance(item, RangeImage) else item
+        if item.ndim == 3 and len(item) == 5:
+            check_metres(item[0].detach().double().numpy())
+        return item
+    if isinstance(item, RangeImage):
+        check_metres(item.range[item.mask])
+        return emptied(item)
+    return item
 
 
 def emptied(image: RangeImage) -> RangeImage:

@@ -244,4 +244,7 @@ def report_of(
         counts |= {"samples in bird's eye view": samples.bev.count, "reference in bird's eye view": real.bev.count}
     hashes = {"samples": samples.digest, "reference": real.digest, **samples.weights}
     warnings = warnings_of(samples, real, results)
+    if beams and beams.one_sided:
+        silent = f"{beams.one_sided} of {len(beams.elevation)} beams"
+        warnings += (f"{silent} return on one side only: no range per beam counts them",)
     return Report(samples.protocol, results, counts, hashes, {"subsets": seed}, warnings, beams=beams)

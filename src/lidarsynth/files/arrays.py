@@ -179,7 +179,7 @@ def _first_line(error: Exception) -> str:
 IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least and greatest value
     "range": ("f", 0, MAX_METRES),
     "reflectance": ("f", 0, 1),
-    "mask": ("b", 0, 1),
+    "mask": ("biu", 0, 1),  # 0 and 1 as numbers, too, as other programs save it
     "label": ("iu", 0, 19),
     "xyz": ("f", -MAX_METRES, MAX_METRES),
     "confidence": ("f", 0, 1),
@@ -193,11 +193,9 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
     """The range image of our own npz: range, reflectance, mask, sensor (JSON text), and what else of IMAGE it has."""
     if missing := NEEDED - arrays.keys():
         raise FileError(f"expected a saved range image, found no {', '.join(sorted(missing))} in {', '.join(arrays)}")
-    for name, (kinds, low, high) in IMAGE.items():
-        if name in arrays and arrays[name].dtype.kind not in kinds:
-            raise FileError(f"expected {name} of the kind {kinds}, found {arrays[name].dtype}")
-        if name in arrays and not np.all((arrays[name] >= low) & (arrays[name] <= high)):
-            raise FileError(f"expected finite {name} of {low:g} to {high:g}, found others")
+    mask = arrays["mask"]
+    mask = _checked("mask", mask, np.ones(mask.shape, bool)).astype(bool)
+    arrays = {name: _checked(name, array, mask) if name in IMAGE else array for name, array in arrays.items()}
     try:
         values = json.loads(str(arrays["sensor"]))
         if not isinstance(values, dict) or "elevations" not in values:
@@ -206,11 +204,32 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
         xyz = arrays["xyz"].astype(np.float32) if "xyz" in arrays else None
         sure = arrays["confidence"].astype(np.float32) if "confidence" in arrays else None
         numbers = arrays["range"].astype(np.float32), arrays["reflectance"].astype(np.float32)
-        return RangeImage(*numbers, arrays["mask"], from_dict(values), label, xyz, confidence=sure)
+        return RangeImage(*numbers, mask, from_dict(values), label, xyz, confidence=sure)
     except FileError:
         raise
     except (ValueError, TypeError, RecursionError) as error:
         raise FileError(f"expected a range image that fits its sensor, found: {_first_line(error)}") from None
+
+
+def _checked(name: str, array: np.ndarray, returned: np.ndarray) -> np.ndarray:
+    """An array of a range image, within its limits where a ray returned; what is not, elsewhere, becomes 0: NaN or -1
+    is what programs put where nothing returned."""
+    kinds, low, high = IMAGE[name]
+    if array.dtype.kind not in kinds:
+        words = {"b": "truth values", "f": "floats", "i": "whole numbers"}
+        raise FileError(f"expected {name} of {words[kinds[0]]}, found {array.dtype}")
+    off = ~((array >= low) & (array <= high))
+    if array.shape[: returned.ndim] == returned.shape:
+        array = np.where(off & ~_like(returned, array), array.dtype.type(0), array) if off.any() else array
+        off &= _like(returned, array)
+    if off.any():
+        found = array[off]
+        raise FileError(f"expected finite {name} of {low:g} to {high:g}, found {len(found)} such as {found[0]}")
+    return array
+
+
+def _like(returned: np.ndarray, array: np.ndarray) -> np.ndarray:
+    return returned.reshape(*returned.shape, *(1,) * (array.ndim - returned.ndim))
 
 
 def scan_fields(scan: Scan) -> Fields:

@@ -83,9 +83,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     if (far := max(float(xyz.max()), -float(xyz.min()))) > MAX_METRES:
         raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}")
     xyz = xyz.astype(np.float32, copy=False)
-    if (half := float(np.median(np.abs(xyz[::16]).max(axis=1)))) > MEDIAN:
-        raise FileError(f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "
-                        "centimetres, or coordinates of a map?")  # fmt: skip
+    check_metres(np.abs(xyz[::16]).max(axis=1))
     values = reflectance_from(values[kept], "unit" if intensity == "none" else intensity)
     ring, time, label = (fields[key][kept] if (key := find(fields, n)) else None for n in ("ring", "time", "label"))
     classes = None if label is None else _training_classes(label)
@@ -103,6 +101,14 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
         label=classes,
         extra={key: column[kept] for key, column in fields.items() if key not in taken and column.dtype.kind in "biuf"},
     ), dropped
+
+
+def check_metres(far: np.ndarray) -> None:
+    """Raises FileError where half of so far away, or farther, is what no turn of a sensor is; 0 = no return."""
+    returns = far[far > 0]
+    if returns.size and (half := float(np.median(returns))) > MEDIAN:
+        raise FileError(f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "
+                        "centimetres, or coordinates of a map?")  # fmt: skip
 
 
 def on_rings(fields: Fields, first: int, last: int) -> Fields:

@@ -84,7 +84,7 @@ def read_with_report(
         raise ValueError(f"expected an intensity of {', '.join(INTENSITIES)}, found {intensity!r}")
     reader = READERS[_suffix(path, READERS, "read")]
     data = _bytes(path)
-    with _naming(path):
+    with naming(path):
         fields = reader(data)
     if labels is not None:
         fields["label"] = read_labels(labels, len(next(iter(fields.values()), ())))
@@ -92,12 +92,12 @@ def read_with_report(
         fields["raw_label"] = read_words(words, len(next(iter(fields.values()), ())))
     if _is_bare(path):
         fields = _marks_beside(Path(path), len(next(iter(fields.values()), ()))) | fields
-    with _naming(path):
+    with naming(path):
         return scan_from_fields(fields, intensity, rings)
 
 
 @contextmanager
-def _naming(path: str | Path) -> Iterator[None]:
+def naming(path: str | Path) -> Iterator[None]:
     """Puts the path before a FileError's message and keeps it on one line, whatever a file's own names hold."""
     try:
         yield
@@ -124,7 +124,7 @@ def read_image(path: str | Path) -> RangeImage:
     """
     _suffix(path, {".npz": None}, "read a range image")
     data = _bytes(path)
-    with _naming(path):
+    with naming(path):
         return arrays.image_of(arrays.unzip(data))
 
 

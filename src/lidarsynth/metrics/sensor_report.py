@@ -83,7 +83,7 @@ class BeamReport:
     drop_rate_real  the same of the reference
     median, median_real  metres
     range_distance  metres: how far the returns would have to move to give the reference's histogram (Wasserstein-1);
-                    NaN where one has no returns
+                    NaN where one side has no returns, 0 where neither has
     """
 
     elevation: np.ndarray
@@ -100,9 +100,16 @@ class BeamReport:
 
     @property
     def range_error(self) -> float:
-        """Mean over beams of `range_distance`, metres, beams without returns left out; NaN if there are no others."""
-        known = self.range_distance[~np.isnan(self.range_distance)]
-        return float(known.mean()) if len(known) else float("nan")
+        """Mean over beams of `range_distance`, metres, those that return on one side only left out; NaN where none
+        returns on both."""
+        if np.isnan(self.median + self.median_real).all():
+            return float("nan")
+        return float(np.nanmean(self.range_distance))
+
+    @property
+    def one_sided(self) -> int:
+        """How many beams return on one side only."""
+        return int(np.isnan(self.range_distance).sum())
 
     def __str__(self) -> str:
         """A table with one line per beam, and the two means below."""
@@ -114,8 +121,9 @@ class BeamReport:
                          f"({median_real:>5.2f} m){moved:>17.2f} m")  # fmt: skip
         lines.append(f"mean over beams: no return differs by {self.drop_rate_error:.2%}, "
                      f"returns moved by {self.range_error:.2f} m")  # fmt: skip
-        if silent := int(np.isnan(self.range_distance).sum()):
-            lines[-1] += f"; {silent} of {len(self.elevation)} beams return on one side only: no distance counts them"
+        if self.one_sided:
+            beams = f"{self.one_sided} of {len(self.elevation)} beams"
+            lines[-1] += f"; {beams} return on one side only: no distance counts them"
         return "\n".join(lines)
 
 
