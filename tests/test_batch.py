@@ -96,6 +96,79 @@ def test_what_is_there_is_skipped(scans: Path, tmp_path: Path, capsys: pytest.Ca
     assert told(tmp_path / "o")["skipped"] == 2
 
 
+def test_what_is_there_of_another_recipe_is_not_gone_on_with(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    words = ["complete", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS, "--model", "bilinear"]
+    main([*words, "--corrupt", "beams:2"])
+    first = told(tmp_path / "o")
+    assert first["settings"]["recipe"]["corrupt"] == "beams:2" and first["settings"]["recipe"]["model"] == "bilinear"
+    for other, said in (
+        ([], "corrupt none for beams:2"),
+        (["--corrupt", "beams:4"], "corrupt beams:4 for beams:2"),
+        (["--corrupt", "beams:2", "--intensity", "byte"], "intensity byte for none"),
+        (["--corrupt", "beams:2", "--seed", "3"], "seed 3 for 0"),
+        (["--corrupt", "beams:2", "--mount", "1.7"], "transform"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, *other, "--skip-existing"])
+        error = capsys.readouterr().err
+        assert said in error and "expected scans made as they are asked for now" in error and error.count("\n") == 1
+    assert told(tmp_path / "o") == first
+    main([*words, "--corrupt", "beams:2", "--skip-existing", "--workers", "2"])
+    assert told(tmp_path / "o")["skipped"] == 2
+    (tmp_path / "o" / "report-of-mine.json").write_text("[1]")
+    main([*words, "--corrupt", "beams:2", "--skip-existing"])
+
+
+def test_a_killed_run_tells_how_its_scans_were_made(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = ["complete", str(scans / "d1"), "--out", str(tmp_path / "o"), *WORDS, "--model", "bilinear"]
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        with pytest.raises(SystemExit, match="130"):
+            main(words)
+    assert told(tmp_path / "o")["unfinished"] and names(tmp_path / "o") == ["000.ply", "report.json"]
+    main(["info", str(tmp_path / "o" / "report.json")])
+    assert "not done" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--sensor", "hdl-32e", "--skip-existing"])
+    assert "sensor hdl-32e for vlp-16" in capsys.readouterr().err
+    main([*words, "--skip-existing"])
+    assert "unfinished" not in told(tmp_path / "o") and told(tmp_path / "o")["skipped"] == 1
+
+
+def killed(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_errors_of_what_was_hidden_stand_in_the_report(scans: Path, tmp_path: Path):
+    words = ["complete", str(scans), *WORDS, "--model", "bilinear", "--corrupt", "beams:2"]
+    main([*words, "--out", str(tmp_path / "o")])
+    report = told(tmp_path / "o")
+    rows = [row["errors"]["bilinear"] for row in report["scans"] if "error" not in row]
+    assert len(rows) == 4 and all(row["pixels"] > 100 and row["range_mae"] > 0 for row in rows)
+    assert report["errors"]["bilinear"]["range_mae"] == pytest.approx(np.mean([row["range_mae"] for row in rows]))
+    for part in ("1/2", "2/2"):
+        main([*words, "--out", str(tmp_path / "parts"), "--shard", part])
+    for method, errors in told(tmp_path / "parts")["errors"].items():
+        assert errors == pytest.approx(report["errors"][method])
+
+
+def test_of_one_file_nothing_that_is_asked_for_is_ignored(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    words = ["project", str(scans / "d1" / "000.pcd"), "--out", str(tmp_path / "a.npz"), *WORDS]
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--shard", "3/2"])
+    assert "a.npz: expected a folder with --shard 3/2" in capsys.readouterr().err
+    main(words)
+    (tmp_path / "a.npz").write_bytes(b"kept")
+    main([*words, "--skip-existing"])
+    assert "a.npz is there already" in capsys.readouterr().out and (tmp_path / "a.npz").read_bytes() == b"kept"
+
+
 def test_a_full_disk_stops_at_once_and_what_a_kill_left_is_swept(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):

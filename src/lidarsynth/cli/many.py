@@ -84,10 +84,14 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     if many.keep_topics:
         raise ValueError(f"{out}: expected a .mcap or .bag to keep topics in, found another kind of output")
     if inputs.single and not any(is_stream(path) for path in paths) and (out.suffix or out.is_file()):
-        if many.format is not None:
-            raise ValueError(f"{out}: expected a folder with --format {many.format}, found the name of a file")
+        for word, given in (("--format", many.format), ("--shard", many.shard)):
+            if given is not None:
+                raise ValueError(f"{out}: expected a folder with {word} {given}, found the name of a file")
+        if many.skip_existing and out.exists():
+            say(f"{out} is there already")
+            return []
         return _one(job, inputs, out)
-    return _into_folder(job, inputs, out, many)
+    return _into_folder(job, inputs, out, many, intensity)
 
 
 def _model(job: Job) -> ScanModel | None:
@@ -122,7 +126,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
     return [result]
 
 
-def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many) -> list[Result]:
+def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str) -> list[Result]:
     from lidarsynth.lidar.whole_file import TOKEN, sweep
     from lidarsynth.verbs.batch import run
     from lidarsynth.verbs.batch_report import merge_shards, parse_shard, report_of, report_path, write_report
@@ -130,6 +134,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many) -> list[Result
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending = many.format or ("npz" if job.verb == "project" else "ply")
+    settings, report = _settings(job, out, many, ending, intensity), report_path(out, shard)
     if shard[1] == 1:  # other machines may be writing there else
         sweep(out, deep=True, token=TOKEN)
     stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside)
@@ -139,19 +144,41 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many) -> list[Result
     results = []
     with scan_bar(job.verb, count) as on_scan:
         for result in run(job, _again(first, stream), many.workers, model):
+            if result.error is None and all(earlier.error is not None for earlier in results):
+                _begin(report, settings)
             results.append(result)
             on_scan()
             _tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
     seconds = time.perf_counter() - begun
-    settings = {"verb": job.verb, "model": job.model, "out": str(out), "format": ending, "workers": many.workers}
-    settings |= {"shard": many.shard} if many.shard else {}
     if all(result.error is not None for result in results) and results:
         _refuse_all(results)
     out.mkdir(parents=True, exist_ok=True)
-    write_report(report_path(out, shard), report_of(results, len(skipped), seconds, settings))
+    write_report(report, report_of(results, len(skipped), seconds, settings))
     merged = merge_shards(out, shard[1])
-    _summary(results, len(skipped), seconds, merged or report_path(out, shard))
+    _summary(results, len(skipped), seconds, merged or report)
     return results
+
+
+def _settings(job: Job, out: Path, many: Many, ending: str, intensity: str) -> dict[str, Any]:
+    """What the report says of the run. Raises ValueError where files that are there already would be gone on with, and
+    were made in another way."""
+    from lidarsynth.verbs.batch_report import check_same
+
+    reading = {"intensity": None if intensity == "auto" else intensity, "rings": many.rings, "topic": many.topic}
+    recipe = job.recipe() | {name: word for name, word in reading.items() if word is not None}
+    if many.skip_existing:
+        check_same(out, recipe)
+    settings = {"verb": job.verb, "model": job.model, "out": str(out), "format": ending, "workers": many.workers}
+    return settings | ({"shard": many.shard} if many.shard else {}) | {"recipe": recipe}
+
+
+def _begin(report: Path, settings: dict[str, Any]) -> None:
+    """Says how the scans of a run are made that may be killed; a report that is there stays until the run is done."""
+    from lidarsynth.verbs.batch_report import unfinished, write_report
+
+    if not report.exists():
+        report.parent.mkdir(parents=True, exist_ok=True)
+        write_report(report, unfinished(settings))
 
 
 def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:

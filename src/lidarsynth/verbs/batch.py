@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,15 @@ class Job:
         """Endings of the files that a .bin or .npy of this job may get beside it, as far as the job tells."""
         marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample") else ()
         return (*marks, LABEL) if self.labels or self.verb == "realise" else marks
+
+    def recipe(self) -> dict[str, Any]:
+        """What decides the results, as plain values; what was not asked for is left out."""
+        names = ["verb", "sensor", "projection", "width"]
+        if self.verb != "project":
+            names = ["verb", "model", "sensor", "corrupt", "into", "times", "least", "labels"]
+        kept = {name: getattr(self, name) for name in names} | (vars(self.how) if self.verb != "project" else {})
+        kept["transform"] = None if self.transform is None else np.asarray(self.transform).tolist()
+        return {name: value for name, value in kept.items() if value is not None and value is not False}
 
 
 @dataclass(frozen=True)

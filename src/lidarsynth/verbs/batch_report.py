@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
+from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.verbs.batch import Result
 
 REPORT = "report.json"
@@ -30,10 +32,30 @@ def report_path(out: Path, shard: Shard) -> Path:
     return out / (REPORT if shard[1] == 1 else f"report-{shard[0]}-of-{shard[1]}.json")
 
 
+def check_same(out: Path, recipe: Mapping[str, Any]) -> None:
+    """Raises ValueError where a report in the folder tells of results of another recipe: they are not to go on with."""
+    for path in sorted(out.glob("report*.json")):
+        try:
+            settings = read_json(path, LARGEST_INDEX)["settings"]
+            found = settings.get("recipe", {name: settings[name] for name in ("verb", "model")})  # until 2026-11-26
+        except (ValueError, LookupError, TypeError, AttributeError):
+            continue  # something else of the user's
+        names = recipe.keys() | found.keys() if "recipe" in settings else recipe.keys() & found.keys()
+        other = [name for name in sorted(names) if recipe.get(name) != found.get(name)]
+        if other:
+            told = ", ".join(f"{name} {_word(recipe.get(name))} for {_word(found.get(name))}" for name in other)
+            raise ValueError(f"{path}: expected scans made as they are asked for now, found other settings: {told}; "
+                             "another --out, or without --skip-existing all are made anew")  # fmt: skip
+
+
+def _word(value: Any) -> str:
+    return "none" if value is None else str(value)[:60]
+
+
 def report_of(results: Sequence[Result], skipped: int, seconds: float, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values: settings, totals, rate, and a row per scan."""
+    """Plain values: settings, totals, rate, mean errors where a corruption was asked for, and a row per scan."""
     failed = [result for result in results if result.error is not None]
-    done = len(results) - len(failed)
+    done, rows = len(results) - len(failed), [_row(result) for result in results]
     return {
         "settings": dict(settings),
         "done": done,
@@ -41,8 +63,22 @@ def report_of(results: Sequence[Result], skipped: int, seconds: float, settings:
         "failed": len(failed),
         "seconds": round(seconds, 3),
         "scans_per_second": round(done / seconds, 3) if seconds > 0 else None,
-        "scans": [_row(result) for result in results],
+        **_means(rows),
+        "scans": rows,
     }
+
+
+def unfinished(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The report of a run that goes on, or was killed: how the scans that are there were made."""
+    return {"unfinished": True} | report_of([], 0, 0.0, settings)
+
+
+def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The mean over scans of each method's errors, or nothing."""
+    tables = [row["errors"] for row in rows if "errors" in row]
+    methods = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
+    means = {name: mean_errors([Errors(**table[name]) for table in tables]) for name in methods}
+    return {"errors": {name: asdict(mean) for name, mean in means.items()}} if means else {}
 
 
 def _row(result: Result) -> dict[str, Any]:
@@ -51,6 +87,7 @@ def _row(result: Result) -> dict[str, Any]:
     if result.error is not None:
         return row | {"error": result.error}
     row |= {"points": result.points[0], "points_after": result.points[1], "dropped": result.dropped}
+    row |= {"errors": {name: asdict(errors) for name, errors in result.errors.items()}} if result.errors else {}
     return row | ({"warning": result.warning} if result.warning else {})
 
 
@@ -65,10 +102,13 @@ def merge_shards(out: Path, parts: int) -> Path | None:
     if parts == 1 or not all(path.is_file() for path in paths):
         return None
     reports = [read_json(path, LARGEST_INDEX) for path in paths]
+    if any("unfinished" in report for report in reports):
+        return None
     total: dict[str, Any] = {key: sum(r[key] for r in reports) for key in ("done", "skipped", "failed")}
     longest = max(r["seconds"] for r in reports)
     merged = {"settings": reports[0]["settings"] | {"shards": parts}, **total, "seconds": longest}
     merged |= {"scans_per_second": round(total["done"] / longest, 3) if longest else None}
-    merged |= {"scans": sorted((row for r in reports for row in r["scans"]), key=lambda row: row["name"])}
+    rows = sorted((row for r in reports for row in r["scans"]), key=lambda row: row["name"])
+    merged |= {**_means(rows), "scans": rows}
     write_report(out / REPORT, merged)
     return out / REPORT

@@ -38,6 +38,8 @@ def _many(values: Mapping[str, Any]) -> Lines:
     lines = {"kind": "report of many scans"} | {k: str(values[k]) for k in ("done", "skipped", "failed", "seconds")}
     if (rate := values.get("scans_per_second")) is not None:
         lines["rate"] = f"{rate} scans a second"
+    if values.get("unfinished"):
+        lines["kind"] += ", which is not done: stopped, or still running"
     wrong = [row for row in values["scans"] if "error" in row]
     return lines | ({"first failure": str(wrong[0]["error"])[:200]} if wrong else {})
 
