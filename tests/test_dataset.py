@@ -210,7 +210,34 @@ def test_broken_scans_are_skipped_named_and_counted(tmp_path: Path, capsys: pyte
     assert verify(folder) == 68
     before = state(folder)
     main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical"])
-    assert state(folder) == before
+    assert state(folder) == before and "nothing is new: 68 images" in capsys.readouterr().out
+
+
+def test_scans_that_changed_are_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scans(tmp_path, 130)
+    velodyne, folder = tmp_path / "sequences" / "00" / "velodyne", tmp_path / "cache"
+    words = ["data", "files", str(velodyne), str(folder), "--sensor", "hdl-64e-kitti", "--width", "64"]
+    main(words)
+    first = state(folder)
+    (velodyne / "000100.bin").write_bytes((velodyne / "000101.bin").read_bytes())
+    main(words)
+    assert capsys.readouterr().out.count("wrote 130 images") == 2
+    now = state(folder)
+    assert {name for name in first if first[name] != now[name]} == {"0000064.npy", "index.json"}
+    assert (CachedImages(folder)[100].range == CachedImages(folder)[101].range).all()
+    for more, told in (
+        (["--split", "val"], "files: expected a split of all, found 'val'"),
+        (["--sensor", "hdl-32e"], "expected a cache of sensor {elevations "),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, *more])
+        error = capsys.readouterr().err
+        assert told in error and len(error) < 700
+        assert "name hdl-32e" in error or "split" in error
+    for more in (["--split", "train"], ["--projection", "unfolding"]):
+        with pytest.raises(SystemExit, match="2"):
+            main(["data", "synthetic", str(tmp_path / "streets"), "-n", "2", *more])
+        assert f"expected {more[0]} with a data set, found it with synthetic" in capsys.readouterr().err
 
 
 def test_a_wrong_projection_stops_at_once(tmp_path: Path):
@@ -274,11 +301,9 @@ def test_damage_is_found_and_mended(tmp_path: Path):
 
 def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
     list(write_cache(tmp_path, image, 10, SENSOR, WHAT, name))
-    with pytest.raises(
-        ValueError, match=r"expected a cache of source {'name': 'other'}, found one of {'name': 'test'}"
-    ):
+    with pytest.raises(ValueError, match=r"expected a cache of source \{name other\}, found one of \{name test\}"):
         list(write_cache(tmp_path, image, 10, SENSOR, {"name": "other"}, name))
-    with pytest.raises(ValueError, match=r"expected a cache of sensor {'width': 64}, found one of {'width': 32}"):
+    with pytest.raises(ValueError, match=r"expected a cache of sensor \{width 64\}, found one of \{width 32\}"):
         list(write_cache(tmp_path, image, 10, SENSOR.resized(width=64), WHAT, name))
     with pytest.raises(ValueError, match=r"expected the scans .*'000007'.*found .*'000000'.*name another folder"):
         list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: name(i + 7)))

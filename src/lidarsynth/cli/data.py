@@ -44,13 +44,14 @@ def data(
         intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
         apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
     """
-    from lidarsynth.data.sources import prepare, summary
+    from lidarsynth.data.sources import prepare, shards, summary
 
     at_least(1, {"count": count})
     at_least(0, {"seed": seed, "workers": workers})
     if count is not None and count > MOST:
         raise ValueError(f"expected --count of at most {MOST:,} synthetic scans, found {count:,}")
     more = (workers, count, check, seed, intensity, apart)
+    there = shards(cache or root)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass
-    say(f"wrote {summary(cache or root)}")
+    say(f"{'nothing is new:' if shards(cache or root) == there else 'wrote'} {summary(cache or root)}")

@@ -24,6 +24,7 @@ SHARD = 64  # images per shard
 INDEX_EVERY = 2.0  # seconds between two writings of the index: what a kill can cost
 
 Namer = Callable[[int], Sequence[str]]  # image number -> (..., sequence, frame)
+Stamp = Callable[[int], str]  # image number -> what changes when the files do that it is made of
 
 
 def record_type(sensor: Sensor) -> np.dtype:
@@ -61,6 +62,7 @@ def write_cache(
     name: Namer | None = None,
     workers: int = 0,
     check: bool = False,
+    stamp: Stamp | None = None,
 ) -> Iterator[int]:
     """Store images 0..count-1 and yield how many are done so far, shard by shard; skipped scans count as done.
 
@@ -69,13 +71,14 @@ def write_cache(
     name     image number -> (..., sequence, frame), kept in the index
     workers  processes; two or more need a picklable `image` and `name`, with fewer this one works itself
     check    compare the checksums of the shards that are there, and make anew those that differ
+    stamp    image number -> a text that changes when its files do; shards of changed files are made anew
     Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
     when the folder holds something else, another process writes to it or no scan can be read, OSError of one line when
     the disk is full.
     """
     folder = Path(folder)
     with only_writer(folder, "preparation of a cache"):
-        yield from _write(folder, image, count, sensor, source, name, workers, check)
+        yield from _write(folder, image, count, sensor, source, name, workers, check, stamp)
 
 
 def _write(
@@ -87,9 +90,10 @@ def _write(
     name: Namer | None,
     workers: int,
     check: bool,
+    stamp: Stamp | None,
 ) -> Iterator[int]:
     index = open_index(folder, sensor, source, count, range_step(sensor))
-    task = _Task(folder, image, name, count, stored_step(index))
+    task = _Task(folder, image, name, count, stored_step(index), stamp)
     firsts = range(0, count, SHARD)
     todo = [first for first in firsts if not _is_stored(index, task, record_type(sensor), first, check)]
     done = count - sum(len(task.numbers(first)) for first in todo)
@@ -119,6 +123,7 @@ class _Task:
     name: Namer | None
     count: int
     step: float
+    stamp: Stamp | None
 
     def numbers(self, first: int) -> range:
         return range(first, min(first + SHARD, self.count))
@@ -127,9 +132,15 @@ class _Task:
         """[sequence, frame] of image i."""
         return [*self.name(i)][-2:] if self.name else ["", str(i)]
 
+    def files(self, first: int) -> str | None:
+        """A hash that changes when any file of a shard does, None where its images are of no files."""
+        if self.stamp is None:
+            return None
+        return hashlib.sha256("\n".join(self.stamp(i) for i in self.numbers(first)).encode()).hexdigest()[:16]
+
     def store(self, first: int) -> dict[str, Any]:
         """Make the shard whose first image is `first`, and say what its entry in the index is."""
-        records, frames, skipped = [], [], []
+        records, frames, skipped, files = [], [], [], self.files(first)
         for i in self.numbers(first):
             try:
                 records.append(pack(self.image(i), self.step))
@@ -141,6 +152,8 @@ class _Task:
             entry["sha256"] = _store(self.folder / _shard(first), np.stack(records))
         if self.name:
             entry["frames"] = frames
+        if files is not None:
+            entry["files"] = files
         return entry | ({"skipped": skipped} if skipped else {})
 
 
@@ -159,6 +172,8 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
         if now != entry["frames"][: len(now)]:
             raise ValueError(f"{task.folder}: expected the scans {now[:1]}... from image {first} on, found "
                              f"{entry['frames'][:1]}...; name another folder")  # fmt: skip
+    if "files" in entry and task.files(first) not in (None, entry["files"]):
+        return False
     if entry["count"] == 0:
         return True
     size = len(npy_header(kind, entry["count"])) + entry["count"] * kind.itemsize

@@ -45,6 +45,13 @@ class Frame(NamedTuple):
     labels: str | None = None
 
 
+def stamped(frames: Sequence[Frame], index: int) -> str:
+    """Sizes and times of the files of scan `index`: they change when the scan does."""
+    frame = frames[index]
+    found = [os.stat(path) for path in (frame.path, frame.labels) if path is not None and os.path.exists(path)]
+    return repr([(stat.st_size, stat.st_mtime_ns) for stat in found])
+
+
 @dataclass(frozen=True)
 class Frames:
     """A reader over scan files, in the order given.

@@ -79,13 +79,18 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
         expected, found = ({k: v for k, v in table[key].items() if k not in PLACE} for table in (head, index))
         if expected != found and any(entry["count"] for entry in index["shards"].values()):
             differ = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
-            both = [{k: t.get(k) for k in differ} for t in (expected, found)]
-            raise ValueError(f"{folder}: expected a cache of {key} {both[0]!s:.200}, found one of {both[1]!s:.200}; "
+            both = [", ".join(f"{k} {_short(t.get(k))}" for k in differ) for t in (expected, found)]
+            raise ValueError(f"{folder}: expected a cache of {key} {{{both[0]}}}, found one of {{{both[1]}}}; "
                              "name another folder")  # fmt: skip
         if expected != found:  # nothing of the other kind is stored: no scan could be read
             return head
     sweep(folder)
     return index | {"source": head["source"], "count": max(count, index["count"])}
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 40 else f"{text[:30]} ... {text[-6:]}"
 
 
 def _begun(path: Path) -> bool:

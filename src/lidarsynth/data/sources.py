@@ -6,16 +6,18 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from lidarsynth.data.cache import write_cache
 from lidarsynth.data.folder import folder as scan_folder
 from lidarsynth.data.folder import scan_files
-from lidarsynth.data.frames import Reader
-from lidarsynth.data.index import REPORT, read_index, report
+from lidarsynth.data.frames import Frames, Reader, choose, stamped
+from lidarsynth.data.index import INDEX, REPORT, read_index, report
 from lidarsynth.data.kitti import kitti
 from lidarsynth.data.kitti360 import kitti360
-from lidarsynth.data.nuscenes import nuscenes
+from lidarsynth.data.nuscenes import NuScenes, nuscenes
 from lidarsynth.lidar.projection import PROJECTIONS, project, thin
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage
@@ -43,7 +45,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "kitti": Source(kitti, "train", "hdl-64e-kitti", "unfolding", 512),
     "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
     "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
-    "files": Source(lambda root, split: scan_folder(root), "all", None, "auto", 1024),
+    "files": Source(lambda root, split: _files(root, split), "all", None, "auto", 1024),
 }
 
 LOOKED_AT = 16  # scans from everywhere, whether all are of one sensor
@@ -89,6 +91,9 @@ def prepare(
     count  of synthetic scans alone; None = 1000
     """
     if name == "synthetic":
+        for word, given in (("--split", split), ("--projection", projection)):
+            if given is not None:
+                raise ValueError(f"expected {word} with a data set, found it with synthetic, whose scans are cast")
         spec = SYNTHETIC if sensor is None else sensor
         wide, many = _width(width, spec, 1024), 1000 if count is None else count
         return cache_synthetic(folder or root, many, spec, wide, seed, workers, check, apart)
@@ -134,7 +139,8 @@ def cache_source(
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
     source |= {} if intensity == "auto" else {"intensity": intensity}
     source |= {"root": str(Path(root).resolve()), "missing": list(reader.missing)}
-    for done in write_cache(folder, image, len(reader), spec, source, reader.name, _processes(workers), check):
+    stamp = partial(stamped, reader.frames) if isinstance(reader, Frames | NuScenes) else None
+    for done in write_cache(folder, image, len(reader), spec, source, reader.name, _processes(workers), check, stamp):
         yield done, len(reader)
 
 
@@ -168,12 +174,17 @@ def _width(given: int | None, sensor: str | None, source: int) -> int:
     return source if sensor is None or sensor in SENSORS else get_sensor(sensor).width
 
 
+def _files(root: Path, split: str, intensity: str = "auto") -> Frames:
+    choose("files", split, ("all",))
+    return scan_folder(root, intensity)
+
+
 def _reader(name: str, root: Path, split: str, intensity: str) -> Reader:
     if intensity == "auto":
         return SOURCES[name].reader(root, split)
     if name != "files":
         raise ValueError(f"expected --intensity with files, whose scale is not known, found it with {name}")
-    return scan_folder(root, intensity)
+    return _files(root, split, intensity)
 
 
 def _recognised(reader: Reader) -> str:
@@ -210,6 +221,11 @@ def _processes(workers: int | None) -> int:
     if workers is not None and workers < 0:
         raise ValueError(f"expected --workers of at least 0, found {workers}")
     return (os.cpu_count() or 1) if workers is None else workers
+
+
+def shards(folder: str | Path) -> dict[str, Any]:
+    """What the shards of a cache hold, by its index; {} where it is not begun."""
+    return read_index(folder)["shards"] if (Path(folder) / INDEX).is_file() else {}
 
 
 def summary(folder: str | Path) -> str:
