@@ -4,6 +4,8 @@ import csv
 import random
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import torch
 from forked import Forked, pair
 from safetensors.torch import load_file
 
+from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import write_cache
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Experiment, with_fields
@@ -325,3 +328,45 @@ def test_the_licence_is_the_user_s_else_that_of_the_weights(cache: Path, tmp_pat
         experiment = tiny(1, **{"card.licence": chosen})
         list(run(experiment, cache, tmp_path / expected, str(tmp_path / "first"), options=QUIET))
         assert load(tmp_path / expected)[0].card.licence == expected
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["training.decay=linear", "diffusion.schedule=cos", "diffusion.kind=noise", "diffusion.loss=l3", "data.codec=cm",
+     "data.projection=flat", "model.network=unet", "training.steps=0", "training.learning_rate=1e38"],
+)  # fmt: skip
+def test_words_that_no_table_has_are_refused_before_anything_is_done(change: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "tiny", "--set", change, "--dry-run"])
+    error = capsys.readouterr().err
+    assert f"{change.partition('=')[0]}: expected " in error and error.count("\n") == 1
+
+
+def test_a_run_that_ends_before_its_average_goes_on_says_so(cache: Path, tmp_path: Path):
+    notes = {}
+    for steps in (3, 12):
+        experiment = tiny(steps, **{"training.ema_every": 10})
+        progress = list(run(experiment, cache, tmp_path / str(steps), options=Options(sample_every=0, workers=0)))
+        notes[steps] = progress[0].note
+    assert notes[3] == "the weights that are kept are those after step 1: 3 steps end before their average goes on"
+    assert notes[12] == ""
+
+
+DIES = """
+import sys
+from lidarsynth.training import loop
+from lidarsynth.training.options import Options
+from lidarsynth.verbs.training import resolve, run
+
+def fault(training, step):
+    raise RuntimeError("a fault of ours")
+
+loop.learning_rate = fault
+list(run(resolve("tiny"), sys.argv[1], sys.argv[2], options=Options(workers=2)))
+"""
+
+
+def test_a_fault_ends_the_processes_that_read_ahead(cache: Path, tmp_path: Path):
+    """They ignore SIGTERM, by which Python would end them as it leaves: it waited for them for ever."""
+    ended = subprocess.run([sys.executable, "-c", DIES, cache, tmp_path / "run"], capture_output=True, timeout=120)
+    assert ended.returncode == 1 and b"a fault of ours" in ended.stderr

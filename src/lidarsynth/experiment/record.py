@@ -178,7 +178,7 @@ class Training:
 
     steps: int = within(300_000, 0)
     batch_size: int = within(8, 1, 1_048_576)
-    learning_rate: float = within(1e-4, 0)
+    learning_rate: float = within(1e-4, 0, 1e30)
     betas: tuple[float, float] = within((0.9, 0.99), 0, 0.999999)
     warmup: int = within(10_000, 0)  # steps of linear warm-up
     decay: str = "cosine"  # of the rate after that: cosine (half of one, to 0) | constant | inverse | halving

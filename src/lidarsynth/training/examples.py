@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import signal
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Generator
+from functools import lru_cache, partial
 from itertools import product
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -142,12 +145,15 @@ class Examples(Dataset):
         return self.draw(self.experiment, self.images, [indices[p] for p in positions], step, positions)
 
 
-def load_batches(examples: Examples, first: int, parts: range, workers: int = 0, pinned: bool = False) -> Iterator[Any]:
+def load_batches(
+    examples: Examples, first: int, parts: range, workers: int = 0, pinned: bool = False
+) -> Generator[Any, None, None]:
     """The batches of the steps from `first` to the last, for each step those of `parts` in turn.
 
-    The order does not depend on `workers`, the number of processes that read ahead.
+    The order does not depend on `workers`, the number of processes that read ahead; they end when it is closed.
     """
-    return iter(
+    others = set(active_children())
+    batches = iter(
         DataLoader(
             examples,
             batch_size=None,
@@ -159,6 +165,19 @@ def load_batches(examples: Examples, first: int, parts: range, workers: int = 0,
             generator=torch.Generator(),  # leaves the global one alone
         )
     )
+    end = partial(_end, set(active_children()) - others)
+    atexit.register(end)  # whatever the caller dies of: they ignore the signal by which Python ends its processes
+    try:
+        yield from batches
+    finally:
+        del batches
+        atexit.unregister(end)
+
+
+def _end(processes: set[BaseProcess]) -> None:
+    for process in processes:
+        if process.is_alive():
+            process.kill()
 
 
 def _ignore_signals(worker: int) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -134,21 +135,22 @@ def train(
         # the U-Net only: interpolation of the known pixels has loops that depend on the data
         (run.product.unet if isinstance(run.product, ConditionalUNet) else run.product).compile()
     phases = _prepare(accelerator, task.phases(experiment, run.network), run.optimizers)
-    while run.step < training.steps:
-        began = time.perf_counter()
-        passes, waited = _fetch(accelerator, batches)
-        rate = learning_rate(training, run.step)
-        losses, norm = _step(run.step, phases, passes, rate, training, accelerator, examples)
-        run.step += 1
-        task.after(experiment, run.network, run.step, accelerator)
-        if (decay := task.average(training, run.step)) is not None:
-            update_ema(run.ema, run.product, decay, task.buffers)
-        yield Progress(run.step, losses, norm, rate, time.perf_counter() - began, waited)
+    with closing(batches):
+        while run.step < training.steps:
+            began = time.perf_counter()
+            passes, waited = _fetch(accelerator, batches)
+            rate = learning_rate(training, run.step)
+            losses, norm = _step(run.step, phases, passes, rate, training, accelerator, examples)
+            run.step += 1
+            task.after(experiment, run.network, run.step, accelerator)
+            if (decay := task.average(training, run.step)) is not None:
+                update_ema(run.ema, run.product, decay, task.buffers)
+            yield Progress(run.step, losses, norm, rate, time.perf_counter() - began, waited)
 
 
 def _batches(
     experiment: Experiment, images: TrainingImages, run: Run, options: Options, accelerator: Accelerator
-) -> tuple[Iterator[Any], Examples]:
+) -> tuple[Generator[Any, None, None], Examples]:
     """This process's batches from the run's step on, one per pass, and what makes them."""
     parts = accelerator.num_processes * accelerator.gradient_accumulation_steps
     examples = Examples(experiment, images, parts, run.task.draw)

@@ -11,17 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from lidarsynth.diffusion.denoiser import KINDS, LOSSES
+from lidarsynth.diffusion.schedule import SCHEDULES
 from lidarsynth.experiment.folder import read_experiment
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Card, Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.files.lock import only_writer
+from lidarsynth.lidar.depth import CODECS
+from lidarsynth.lidar.projection import PROJECTIONS
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.systems.table import build_network, task_of, transfer
+from lidarsynth.systems.table import SYSTEMS, build_network, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
 from lidarsynth.training.examples import VARIED, VIRTUAL, TrainingImages, open_images
 from lidarsynth.training.journal import Journal
-from lidarsynth.training.loop import Progress, Run, start, train
+from lidarsynth.training.loop import DECAYS, Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
 from lidarsynth.training.monitor import Monitor
 from lidarsynth.training.options import Options
@@ -47,7 +51,24 @@ def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str |
         except json.JSONDecodeError:
             chosen[path] = text
     experiment = with_fields(preset(name), chosen)
+    check_words(experiment)
     return experiment if data is None else _for_images(experiment, data, set(chosen))
+
+
+def check_words(experiment: Experiment) -> None:
+    """Raises ValueError by name for a word that its table does not have, and for no steps."""
+    tables = {
+        "data": {"codec": CODECS, "projection": PROJECTIONS},
+        "model": {"network": SYSTEMS},
+        "diffusion": {"schedule": SCHEDULES, "kind": KINDS, "loss": LOSSES},
+        "training": {"decay": DECAYS},
+    }
+    for group, words in tables.items():
+        for name, table in words.items():
+            if (word := getattr(getattr(experiment, group), name)) not in table:
+                raise ValueError(f"{group}.{name}: expected one of {', '.join(table)}, found {word!r}")
+    if experiment.training.steps < 1:
+        raise ValueError("training.steps: expected at least 1, found 0")
 
 
 def _for_images(experiment: Experiment, data: str | Path, chosen: set[str]) -> Experiment:
@@ -173,7 +194,16 @@ def _begin(
         if not saved:
             write_start(out, begun)
     accelerator.wait_for_everyone()
-    return replace(experiment, card=card), state, note
+    notes = note, "" if saved else _never_averaged(experiment, state)
+    return replace(experiment, card=card), state, "; ".join(filter(None, notes))
+
+
+def _never_averaged(experiment: Experiment, state: Run) -> str:
+    """A note where the run ends before its average, which is what is kept, has seen more than the first step."""
+    training = experiment.training
+    if any(state.task.average(training, step) is not None for step in range(2, training.steps + 1)):
+        return ""
+    return f"the weights that are kept are those after step 1: {training.steps} steps end before their average goes on"
 
 
 def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
