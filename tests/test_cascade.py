@@ -326,8 +326,12 @@ def test_grids_come_column_by_column_but_where_steps_are_asked_for(model: Cascad
     (diffused,) = both.generate(1, steps=2, seed=5)
     np.testing.assert_array_equal(diffused.range, model.generate(1, steps=2, seed=5)[0].range)
     assert both.generation_steps(sampler="ddim") == model.generation_steps() == 17
-    assert [both.sampler_used(*how) for how in ((None, None), (128, None), (8, "ddim"))] == ["columns", None, "ddim"]
-    assert model.sampler_used() is None
+    assert [both.sampler_used(*how) for how in ((None, None), (128, None), (8, "ddim"))] == [
+        "columns",
+        "dpmpp-2m",
+        "ddim",
+    ]
+    assert model.sampler_used() == "dpmpp-2m"
     for call, message in (
         (lambda: both.generation_steps(2, "columns"), "expected no steps with the sampler columns"),
         (lambda: model.generation_steps(sampler="columns"), "a sampler of ddpm, .*, found 'columns'"),

@@ -222,3 +222,16 @@ def test_jensen_shannon_distance_equals_scipy():
 def test_errors_say_both_sides(call: Callable, message: str):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "u4", "u8", ">u2", ">i4", ">f4", ">f8", "i8", "f4"])
+def test_counts_of_any_type_are_counts(kind: str):
+    rng = np.random.default_rng(0)
+    x, y = (rng.integers(1, 200, (6, 5, 5)) for _ in range(2))
+    expected = gaussian_mmd(x.astype("f8"), y.astype("f8"))
+    assert gaussian_mmd(x.astype(kind), y.astype(kind)) == pytest.approx(expected, rel=1e-5)
+    frozen = x.astype(kind)
+    frozen.setflags(write=False)
+    assert gaussian_mmd(frozen, frozen) == pytest.approx(0, abs=1e-7)
+    features = moments(x.reshape(6, -1).astype(kind))
+    assert torch.allclose(features.mean, moments(x.reshape(6, -1).astype("f4")).mean)

@@ -42,7 +42,10 @@ Sampler = Annotated[
 ]
 GenerationSteps = Annotated[
     int | None,
-    arg(metavar="INT", help="of a diffusion's sampler, per scan; default 16 of a cascade, 32, or 1161 of langevin."),
+    arg(
+        metavar="INT",
+        help="of a diffusion's sampler, per scan; default 32, 1161 of langevin, 16 of default's where not by columns.",
+    ),
 ]
 Steps = Annotated[
     int | None,

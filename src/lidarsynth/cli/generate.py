@@ -47,7 +47,7 @@ def generate(
     settings |= {"model": str(model), "sensor": loaded.sensor.name} | ({"labels": True} if labels else {})
     settings |= {} if layouts is None else {"layouts": layouts}
     with only_writer(out, "generation"):
-        claim(out, settings)
+        claim(out, settings, loaded.sampler_used(steps))
         runs, size = missing(out, count, endings), loaded.at_once(batch_size)
         workers = processes(loaded, runs, workers)
         make = partial(generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)

@@ -22,11 +22,20 @@ def as_tensor(values: Array) -> Tensor:
 
     Read-only arrays (memory maps) are copied. Raises ValueError for NaN or infinity.
     """
-    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.require(values, requirements=["C", "W"]))
+    tensor = _tensor(values)
     tensor = tensor if tensor.dtype == torch.float64 else tensor.float()
     if not torch.isfinite(tensor.sum(dtype=torch.float64)):  # a fifth of the time of looking at each
         raise ValueError(f"expected finite values, found NaN or infinity among {tuple(tensor.shape)}")
     return tensor
+
+
+def _tensor(values: Array) -> Tensor:
+    """The values where they are, but for types that torch cannot sum: unsigned of many bytes, other byte orders."""
+    if isinstance(values, Tensor):
+        return values
+    if values.dtype.kind == "u" and values.dtype.itemsize > 1:
+        values = values.astype(np.int32 if values.dtype.itemsize == 2 else np.int64)
+    return torch.from_numpy(np.require(values, values.dtype.newbyteorder("="), requirements=["C", "W"]))
 
 
 class Moments:
@@ -184,8 +193,7 @@ def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> f
 
 
 def _rows(values: Array) -> Tensor:
-    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.require(values, requirements=["C", "W"]))
-    return tensor.flatten(1)
+    return _tensor(values).flatten(1)
 
 
 class _Blocks:

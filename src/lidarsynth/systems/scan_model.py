@@ -367,7 +367,7 @@ class ScanModel(ABC):
         raise self._generates_nothing()
 
     def sampler_used(self, steps: int | None = None, sampler: str | None = None) -> str | None:
-        """What a folder of generated scans records as its sampler: the word that was given, None for the default."""
+        """What a folder of generated scans records as its sampler: the word, None where there is none."""
         return sampler
 
     def evaluations(

@@ -39,9 +39,10 @@ def endings_of(format: str, labels: bool, picture: bool) -> tuple[str, ...]:
     return (f".{format}", *([LABEL] if labels else []), *([".png"] if picture else []))
 
 
-def claim(folder: Path, settings: dict[str, Any]) -> None:
+def claim(folder: Path, settings: dict[str, Any], sampler: str | None = None) -> None:
     """Begin a folder of generated scans, or go on with one that was begun with the same settings.
 
+    sampler  the default one, which records of before 2026-11-26 do not name
     Raises ValueError, and leaves the folder as it is, where its scans were made otherwise or by someone else.
     """
     record = folder / RECORD
@@ -49,6 +50,7 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     if record.exists():
         found = _recorded(record)
+        found |= {"sampler": sampler} if found.get("sampler") is None else {}
         if other := _differing(settings, found):
             asked, was = ({key: of.get(key) for key in other if key in of or key not in NAMED}
                           for of in (settings, found))  # fmt: skip

@@ -45,7 +45,7 @@ from lidarsynth.systems.cascade.images import (
     with_doubts,
 )
 from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, unanswered
-from lidarsynth.systems.cascade.layout import BY_COLUMNS, CHOICE, block, grids, sampling, times
+from lidarsynth.systems.cascade.layout import CHOICE, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.request import calls, resolved
@@ -261,8 +261,7 @@ class CascadeModel(AnySensorModel):
 
     def sampler_used(self, steps: int | None = None, sampler: str | None = None) -> str | None:
         """`columns` where they draw, by default too: 128 steps of diffusion are as many calls."""
-        word = sampling(self.network, steps, sampler)[0]
-        return word if word == BY_COLUMNS else sampler
+        return sampling(self.network, steps, sampler)[0]
 
     def _grid_rays(self, rows: np.ndarray, columns: np.ndarray, count: int) -> tuple[Tensor, Tensor]:
         told, standing = (part.to(self._device) for part in grid_rays(self.sensor, self._blocked, rows, columns))

@@ -142,6 +142,10 @@ class LidarModel(ScanModel):
             return 32 if steps is None else steps
         return self._langevin_calls(steps)
 
+    def sampler_used(self, steps: int | None = None, sampler: str | None = None) -> str | None:
+        """The sampler of `generate`. Raises ValueError for an unknown word."""
+        return self._sampler(sampler)
+
     def _method(self, method: str) -> str:
         if method not in METHODS:
             raise ValueError(f"expected a method of {', '.join(METHODS)}, found {method!r}")
