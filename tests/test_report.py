@@ -1,6 +1,8 @@
 """The texts of `info` and the tables of errors hold the numbers they should."""
 
 import gzip
+import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.systems.table import build_network
+from lidarsynth.verbs.batch import Result
+from lidarsynth.verbs.batch_report import report_of
 from lidarsynth.verbs.description import describe, describe_sensor, errors_table, mean_table
 from lidarsynth.viewer.packing import Shown
 from lidarsynth.viewer.page import Entry, write_page
@@ -148,3 +152,13 @@ def test_tables_of_errors():
     assert mean[0].startswith("mean of 2 scans: errors of the 1,200 hidden")
     assert mean[2].split() == ["lidarsynth", "1.500", "m", "0.2000"]
     assert mean[3].split() == ["nearest", "2.250", "m", "0.2000"]
+
+
+def test_what_knows_no_reflectance_has_no_error_of_it():
+    errors = {"lidarsynth": Errors(1.0, math.nan, 2.0, math.nan, 10), "bilinear": Errors(1.5, 0.1, 2.0, 0.2, 10)}
+    lines = errors_table("a.bin", errors).splitlines()
+    assert lines[2].split() == ["lidarsynth", "1.000", "m", "none"] and lines[3].split()[-1] == "0.1000"
+    result = Result("a", Path("a.bin"), None, 0.1, errors=errors)
+    report = json.loads(json.dumps(report_of([result, result], 0, 1.0, {}), allow_nan=False))
+    assert report["errors"]["lidarsynth"]["reflectance_mae"] is None
+    assert report["errors"]["bilinear"]["pixels"] == 20 and report["scans"][0]["errors"]["bilinear"]["range_mae"] == 1.5

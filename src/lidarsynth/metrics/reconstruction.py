@@ -16,7 +16,7 @@ class Errors:
     """Errors over the judged pixels, empty ones included as 0 m and reflectance 0 (as LiDARGen and R2DM judge)."""
 
     range_mae: float  # metres
-    reflectance_mae: float  # in [0, 1]
+    reflectance_mae: float  # in [0, 1]; NaN of what knows no reflectance
     range_rmse: float  # metres
     reflectance_rmse: float
     pixels: int

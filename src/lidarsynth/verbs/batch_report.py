@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -77,8 +78,17 @@ def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The mean over scans of each method's errors, or nothing."""
     tables = [row["errors"] for row in rows if "errors" in row]
     methods = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
-    means = {name: mean_errors([Errors(**table[name]) for table in tables]) for name in methods}
-    return {"errors": {name: asdict(mean) for name, mean in means.items()}} if means else {}
+    means = {name: mean_errors([_errors(table[name]) for table in tables]) for name in methods}
+    return {"errors": {name: _plain(mean) for name, mean in means.items()}} if means else {}
+
+
+def _plain(errors: Errors) -> dict[str, float | None]:
+    """JSON has no NaN."""
+    return {name: None if math.isnan(value) else value for name, value in asdict(errors).items()}
+
+
+def _errors(row: Mapping[str, Any]) -> Errors:
+    return Errors(**{name: math.nan if value is None else value for name, value in row.items()})
 
 
 def _row(result: Result) -> dict[str, Any]:
@@ -87,7 +97,7 @@ def _row(result: Result) -> dict[str, Any]:
     if result.error is not None:
         return row | {"error": result.error}
     row |= {"points": result.points[0], "points_after": result.points[1], "dropped": result.dropped}
-    row |= {"errors": {name: asdict(errors) for name, errors in result.errors.items()}} if result.errors else {}
+    row |= {"errors": {name: _plain(errors) for name, errors in result.errors.items()}} if result.errors else {}
     return row | ({"warning": result.warning} if result.warning else {})
 
 

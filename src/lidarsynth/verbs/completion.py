@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -91,6 +92,8 @@ def complete_scan(
     filled = _sure(whole, least)
     shown = {f"input, {recipe}": before, "completed": filled, "truth": truth}
     errors = judged(whole, before, known, truth, judge)  # of the whole: what is left out would count as 0 m
+    if not model.experiment.data.reflectance:
+        errors["lidarsynth"] = replace(errors["lidarsynth"], reflectance_mae=math.nan, reflectance_rmse=math.nan)
     return Filled(filled, lambda: shown, errors)
 
 

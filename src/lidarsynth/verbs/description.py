@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -78,7 +79,10 @@ def errors_table(title: str, errors: Mapping[str, Errors]) -> str:
     pixels = next(iter(errors.values())).pixels
     lines = [f"{title}: errors of the {pixels:,} hidden pixels, an empty pixel counts as 0 m"]
     lines.append(f"  {'method':<12}{'range MAE':>11}{'reflectance MAE':>18}")
-    lines += [f"  {name:<12}{e.range_mae:>9.3f} m{e.reflectance_mae:>18.4f}" for name, e in errors.items()]
+    shades = ("none" if math.isnan(e.reflectance_mae) else f"{e.reflectance_mae:.4f}" for e in errors.values())
+    lines += [
+        f"  {n:<12}{e.range_mae:>9.3f} m{shade:>18}" for (n, e), shade in zip(errors.items(), shades, strict=True)
+    ]
     return "\n".join(lines)
 
 
