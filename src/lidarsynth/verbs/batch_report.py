@@ -88,7 +88,8 @@ def _plain(errors: Errors) -> dict[str, float | None]:
 
 
 def _errors(row: Mapping[str, Any]) -> Errors:
-    return Errors(**{name: math.nan if value is None else value for name, value in row.items()})
+    values: dict[str, Any] = {name: math.nan if value is None else value for name, value in row.items()}
+    return Errors(**values)
 
 
 def _row(result: Result) -> dict[str, Any]:
