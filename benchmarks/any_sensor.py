@@ -145,7 +145,7 @@ def responses(count: int = 8) -> Iterator[str]:
         cells: list[list[np.ndarray]] = []
         for image in images:
             seen = replace(image, reflectance=(report(image).clip(0, 1) * 255).round().astype(np.float32) / 255)
-            plain = replace(seen, sensor=replace(seen.sensor, dimness=(0.0,) * seen.sensor.height))
+            plain = replace(seen, sensor=replace(seen.sensor, name="plain", dimness=(0.0,) * seen.sensor.height))
             rows = [(every(image, step), seen, plain) for step in (2, 4)]
             cells.append([
                 mean_errors(completed(word, one, known), seen, ~known & seen.mask)[1:]

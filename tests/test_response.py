@@ -115,6 +115,44 @@ def test_the_share_of_the_mean_is_what_suits_the_scan(street: RangeImage, offset
     assert tried(AS_STREETS, fill, dark, told, shades, rays) == AS_STREETS  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("offset", "straight"), [(0.3, 1.0), (0.0, 0.0)])
+def test_the_line_between_returns_is_taken_where_it_errs_less(street: RangeImage, offset: float, straight: float):
+    """Of a scan that brightens from beam to beam, which the line says exactly, and a network that errs, or does not."""
+    height, width = street.shape
+    ramp = np.broadcast_to(np.linspace(0.1, 0.9, height, dtype=np.float32)[:, None], street.shape)
+    whole = replace(street, mask=np.ones(street.shape, bool), range=np.full(street.shape, 9.0), reflectance=ramp.copy())
+    known = every(whole, 2)
+    size, response = padded(whole.sensor), Response(1.0, 1.000001)
+    truth = torch.zeros(8, 1, size[0], 64)
+    truth[:, :, :height] = torch.from_numpy(ramp[:, :64].copy())
+
+    class Fill(torch.nn.Linear):
+        def forward(self, known, rays, noise):
+            return SimpleNamespace(reflectance=truth + offset, plain=truth + offset + 0.1)
+
+    rays = rays_of(whole.sensor, whole.sensor.blocked_rays())
+    found = tried(response, Fill(1, 1), whole, known, response.even(ramp), rays)  # type: ignore[arg-type]
+    assert found.straight == straight
+    between = Response(straight=1.0).straightened(np.zeros_like(ramp), whole, known)
+    inner = slice(0, height - 1)  # beyond the last known beam it goes on as that is
+    np.testing.assert_allclose(between[inner], ramp[inner], atol=1e-5)
+    assert Response().straightened(ramp, whole, known) is ramp
+    assert (whole.keep(known).reflectance[known] == ramp[known]).all() and width == 512
+
+
+def test_an_hdl_64e_that_reports_otherwise_is_not_kittis_unit():
+    streets = SyntheticStreets(4, 16)
+    image = streets.image(1)
+    known = every(image, 4)
+    assert response_of(image, known) == AS_STREETS
+    dark = reported_as(image, (0.2 * image.reflectance * 255).round() / 255)
+    assert response_of(dark, known).scale > 2
+    filled, told = ls.load("default").complete(dark.keep(known), known), ls.load("bilinear").complete(dark, known)
+    hidden = ~known & dark.mask
+    errors = [np.abs(one.reflectance - dark.reflectance)[hidden].mean() for one in (filled, told)]
+    assert errors[0] < 0.9 * errors[1], "1.7 times as much, where it is taken for KITTI's unit"
+
+
 def test_known_reflectances_are_calm_on_their_own_surface():
     """A near wall and one behind it, each of one reflectance but for its speckle; a sign alone; rays without return."""
     rng, shape = np.random.default_rng(3), (4, 64)

@@ -186,7 +186,8 @@ class CascadeModel(AnySensorModel):
             own = replace(own, response=response)
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = straight_in_gaps(filled, told) if noise is None else filled
-        filled = replace(filled, reflectance=own.response.reported(filled.reflectance))
+        shade = own.response.straightened(own.response.reported(filled.reflectance), image, known)
+        filled = replace(filled, reflectance=shade * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), image, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
         return own._named([filled])[0]

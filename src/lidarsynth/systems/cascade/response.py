@@ -16,6 +16,7 @@ from torch import Tensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known
+from lidarsynth.networks.interpolation import interpolate
 from lidarsynth.networks.rays import Rays, padded
 from lidarsynth.streets import hdl64e
 from lidarsynth.systems.cascade.known import known_of
@@ -23,6 +24,7 @@ from lidarsynth.systems.cascade.known import known_of
 STREETS = (0.200, 0.290, 0.349)  # quartiles of what streets reflect, zeros aside, as `hdl-64e-kitti` reports it
 GAMMAS = (0.4, 2.5)
 LEAST, NARROWEST = 0.002, 0.05  # reflectance; natural logarithm between the quartiles
+UNIT = 0.69  # natural logarithm of how far a scan's median may be off KITTI's; 111 of its own are within 0.19
 ENOUGH = 50  # returns
 SECTORS, FEW = 12, 12  # of a turn, in which beams are compared; returns of both beams in one
 SHARES = tuple(k / 10 for k in range(11))  # of the mean of what is known around
@@ -38,13 +40,14 @@ class Response(NamedTuple):
 
     scale, gamma  positive; dimness (H,), in reflectance, or () for what the sensor itself says; the defaults change
     nothing. plain: share of 0 to 1 that the mean of what is known around, calm, has in the most likely reflectance,
-    beside the network's.
+    beside the network's. straight: then, in what is reported, the share of the line between the nearest known returns.
     """
 
     scale: float = 1.0
     gamma: float = 1.0
     dimness: tuple[float, ...] = ()
     plain: float = 0.0
+    straight: float = 0.0
 
     def even(self, reported: np.ndarray) -> np.ndarray:
         """Reflectance in [0, 1] of any shape as the streets' sensor would report it, but for the beams' dimness."""
@@ -65,6 +68,12 @@ class Response(NamedTuple):
         assert filled.plain is not None
         return torch.lerp(filled.reflectance, filled.plain, self.plain)
 
+    def straightened(self, reported: np.ndarray, image: RangeImage, known: np.ndarray) -> np.ndarray:
+        """(H, W) the most likely reflectance, as reported, with its share of the line between known returns."""
+        if not self.straight:
+            return reported
+        return (1 - np.float32(self.straight)) * reported + np.float32(self.straight) * line(image, known)
+
     def told(self, rays: Rays) -> Rays:
         """The rays (B, 1, H', W'), with the beams' dimness."""
         if not self.dimness:
@@ -84,12 +93,16 @@ AS_STREETS = Response()
 def response_of(image: RangeImage, known: np.ndarray) -> Response:
     """By the known returns of an image, known (H, W) bool.
 
-    `AS_STREETS`, which changes nothing, for a sensor whose beams are measured, and for fewer than 50 returns.
+    `AS_STREETS`, which changes nothing, for a sensor whose beams are measured, and for fewer than 50 returns. A scan of
+    `hdl-64e-kitti` that reports twice or half of what KITTI's does is taken for another unit's, of unknown beams.
     """
     lit = known & image.mask & (image.reflectance > 0)
-    if hdl64e.dimness(image.sensor) or lit.sum() < ENOUGH:
+    if lit.sum() < ENOUGH:
         return AS_STREETS
     low, middle, high = np.log(np.maximum(np.quantile(image.reflectance[lit], (0.25, 0.5, 0.75)), LEAST))
+    of_kitti = abs(middle - np.log(STREETS[1])) < UNIT
+    if image.sensor.dimness or (hdl64e.dimness(image.sensor) and of_kitti):
+        return AS_STREETS
     gamma = float(np.clip(np.log(STREETS[2] / STREETS[0]) / max(high - low, NARROWEST), *GAMMAS))
     response = Response(float(STREETS[1] / np.exp(gamma * middle)), gamma)
     dim = dimness_of(response.even(image.reflectance), image.range, known & image.mask)
@@ -105,8 +118,8 @@ def tried(
     rays: Rays,
     tuned: bool = False,
 ) -> Response:
-    """The response with the share of the mean that suits the scan: every second known beam of some parts of the turn is
-    hidden and filled, and the share taken that errs least.
+    """The response with the shares of the mean, and of the line between returns, that suit the scan: every second known
+    beam of some parts of the turn is hidden and filled, and those taken that err least.
 
     told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. Of a sensor whose
     beams are measured, and where fewer than four beams return enough, the usual share; where no reflectance is known,
@@ -122,7 +135,7 @@ def tried(
     inside = slice(SEAM, -SEAM if columns.shape[1] > 2 * SEAM else None)
     of_image = columns[:, inside] % told.shape[1]
     judged, truth = (part[:, of_image].transpose(1, 0, 2) for part in (returned & hidden, image.reflectance))
-    if hdl64e.dimness(image.sensor) or len(rows) < 4 or judged.sum() < ENOUGH:
+    if response == AS_STREETS or len(rows) < 4 or judged.sum() < ENOUGH:
         return response._replace(plain=USUAL)
     known = known_of(image.range[None], reflectance[None], (told & ~hidden)[None], True, size)
     device = next(fill.parameters()).device
@@ -131,11 +144,23 @@ def tried(
     with torch.inference_mode():
         filled = fill(known, rays, known.metres.new_zeros(len(columns), NOISES, size[0], columns.shape[1]))
 
-    def error(share: float) -> float:
-        mixed = response._replace(plain=share).mixed(filled)[:, 0, : truth.shape[1], inside].clamp(0, 1)
-        return float(np.abs(response.reported(mixed.float().cpu().numpy()[judged]) - truth[judged]).mean())
+    assert filled.plain is not None
+    parts = (part[:, 0, : truth.shape[1], inside] for part in (filled.reflectance, filled.plain))
+    answer, mean = (part.float().cpu().numpy()[judged] for part in parts)
+    between = line(image, told & ~hidden)[:, of_image].transpose(1, 0, 2)[judged]
+    errors = {}
+    for share in SHARES:
+        mixed = response.reported((answer + share * (mean - answer)).clip(0, 1))
+        for straight in SHARES:
+            errors[share, straight] = np.abs(mixed + straight * (between - mixed) - truth[judged]).mean()
+    share, straight = min(errors, key=errors.__getitem__)
+    return response._replace(plain=share, straight=straight)
 
-    return response._replace(plain=min(SHARES, key=error))
+
+def line(image: RangeImage, known: np.ndarray) -> np.ndarray:
+    """(H, W) reflectance as reported, between the nearest known returns above, below and beside, known (H, W) bool."""
+    returned = torch.from_numpy(known & image.mask)[None, None]
+    return interpolate(torch.from_numpy(image.reflectance)[None, None], returned)[0, 0].numpy().clip(0, 1)
 
 
 def _columns(turn: int) -> np.ndarray:
