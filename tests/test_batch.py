@@ -137,6 +137,17 @@ def test_a_killed_run_tells_how_its_scans_were_made(
     assert "sensor hdl-32e for vlp-16" in capsys.readouterr().err
     main([*words, "--skip-existing"])
     assert "unfinished" not in told(tmp_path / "o") and told(tmp_path / "o")["skipped"] == 1
+    capsys.readouterr()
+    with monkeypatch.context() as patch:  # another recipe, killed after its first scan: two recipes are in the folder
+        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        with pytest.raises(SystemExit, match="130"):
+            main([*words, "--seed", "1"])
+    for seed, said in (("0", "seed 0 for 1"), ("1", "scans of two settings")):
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, "--seed", seed, "--skip-existing"])
+        assert said in capsys.readouterr().err
+    main([*words, "--seed", "1"])
+    assert not {"mixed", "unfinished"} & told(tmp_path / "o").keys()
 
 
 def killed(*_: object) -> None:
@@ -268,7 +279,7 @@ def test_processes_answer_in_order():
 
 def test_workers_in_the_midst_of_long_items_are_left_at_once():
     begun = time.monotonic()
-    made = in_order(time.sleep, [0, 60, 60], 2, abandon=True)
+    made = in_order(time.sleep, [0, 60, 60], 2)
     next(made)
     made.close()
     assert time.monotonic() - begun < 30 and not multiprocessing.active_children()

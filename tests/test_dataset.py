@@ -225,6 +225,15 @@ def test_scans_that_changed_are_made_anew(tmp_path: Path, capsys: pytest.Capture
     now = state(folder)
     assert {name for name in first if first[name] != now[name]} == {"0000064.npy", "index.json"}
     assert (CachedImages(folder)[100].range == CachedImages(folder)[101].range).all()
+    shutil.copytree(velodyne, tmp_path / "copy")
+    words[2] = str(tmp_path / "copy")
+    main(words)
+    main(words)
+    assert capsys.readouterr().out.count("nothing is new: 130 images") == 2
+    assert {name for name in now if name != "index.json" and now[name] != state(folder)[name]} == set()
+    (tmp_path / "copy" / "000003.bin").write_bytes((velodyne / "000004.bin").read_bytes())
+    main(words)
+    assert (CachedImages(folder)[3].range == CachedImages(folder)[4].range).all()
     for more, told in (
         (["--split", "val"], "files: expected a split of all, found 'val'"),
         (["--sensor", "hdl-32e"], "expected a cache of sensor {elevations "),

@@ -106,7 +106,7 @@ def _model(job: Job) -> ScanModel | None:
         return model
     if job.verb == "label":
         return model.with_labels()
-    model.check(job.how)
+    (model.into(job.into) if job.into else model).check(job.how)
     check_confident(model, job.how, job.least)
     return model.with_labels() if job.labels else model
 
@@ -173,12 +173,13 @@ def _settings(job: Job, out: Path, many: Many, ending: str, intensity: str) -> d
 
 
 def _begin(report: Path, settings: dict[str, Any]) -> None:
-    """Says how the scans of a run are made that may be killed; a report that is there stays until the run is done."""
-    from lidarsynth.verbs.batch_report import unfinished, write_report
+    """Says how the scans of a run are made that may be killed; the report of such scans stays until the run is done."""
+    from lidarsynth.verbs.batch_report import same, unfinished, write_report
 
-    if not report.exists():
-        report.parent.mkdir(parents=True, exist_ok=True)
-        write_report(report, unfinished(settings))
+    if same(report, settings["recipe"]):
+        return
+    report.parent.mkdir(parents=True, exist_ok=True)
+    write_report(report, unfinished(settings, mixed=report.exists()))
 
 
 def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.index import RANGE_STEP, close_index, open_index, resumable_file, stored_step, write_index
+from lidarsynth.data.index import MOVED, RANGE_STEP, close_index, open_index, resumable_file, stored_step, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.scan import RangeImage
@@ -24,7 +24,7 @@ SHARD = 64  # images per shard
 INDEX_EVERY = 2.0  # seconds between two writings of the index: what a kill can cost
 
 Namer = Callable[[int], Sequence[str]]  # image number -> (..., sequence, frame)
-Stamp = Callable[[int], str]  # image number -> what changes when the files do that it is made of
+Stamp = Callable[[int], tuple[str, str]]  # image number -> what changes when its files do, and also when they move
 
 
 def record_type(sensor: Sensor) -> np.dtype:
@@ -71,7 +71,8 @@ def write_cache(
     name     image number -> (..., sequence, frame), kept in the index
     workers  processes; two or more need a picklable `image` and `name`, with fewer this one works itself
     check    compare the checksums of the shards that are there, and make anew those that differ
-    stamp    image number -> a text that changes when its files do; shards of changed files are made anew
+    stamp    image number -> a text that changes when its files do, and one that also does where they were copied
+             elsewhere; shards of changed files are made anew
     Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
     when the folder holds something else, another process writes to it or no scan can be read, OSError of one line when
     the disk is full.
@@ -95,6 +96,9 @@ def _write(
     index = open_index(folder, sensor, source, count, range_step(sensor))
     task = _Task(folder, image, name, count, stored_step(index), stamp)
     firsts = range(0, count, SHARD)
+    for first in firsts if index.pop(MOVED, False) else ():  # a copy has other times
+        if (entry := index["shards"].get(_shard(first))) and entry.get("files", [None])[0] == task.files(first)[0]:
+            entry["files"] = task.files(first)
     todo = [first for first in firsts if not _is_stored(index, task, record_type(sensor), first, check)]
     done = count - sum(len(task.numbers(first)) for first in todo)
     if done:
@@ -132,11 +136,12 @@ class _Task:
         """[sequence, frame] of image i."""
         return [*self.name(i)][-2:] if self.name else ["", str(i)]
 
-    def files(self, first: int) -> str | None:
-        """A hash that changes when any file of a shard does, None where its images are of no files."""
+    def files(self, first: int) -> list[str]:
+        """Hashes that change when any file of a shard does, the second also where they are copies; [""] of no files."""
         if self.stamp is None:
-            return None
-        return hashlib.sha256("\n".join(self.stamp(i) for i in self.numbers(first)).encode()).hexdigest()[:16]
+            return [""]
+        parts = zip(*(self.stamp(i) for i in self.numbers(first)), strict=True)
+        return [hashlib.sha256("\n".join(part).encode()).hexdigest()[:16] for part in parts]
 
     def store(self, first: int) -> dict[str, Any]:
         """Make the shard whose first image is `first`, and say what its entry in the index is."""
@@ -152,7 +157,7 @@ class _Task:
             entry["sha256"] = _store(self.folder / _shard(first), np.stack(records))
         if self.name:
             entry["frames"] = frames
-        if files is not None:
+        if self.stamp is not None:
             entry["files"] = files
         return entry | ({"skipped": skipped} if skipped else {})
 
@@ -172,7 +177,7 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
         if now != entry["frames"][: len(now)]:
             raise ValueError(f"{task.folder}: expected the scans {now[:1]}... from image {first} on, found "
                              f"{entry['frames'][:1]}...; name another folder")  # fmt: skip
-    if "files" in entry and task.files(first) not in (None, entry["files"]):
+    if "files" in entry and task.stamp is not None and task.files(first) != entry["files"]:
         return False
     if entry["count"] == 0:
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -65,10 +66,19 @@ class CachedImages:
         return shard, int(i - self._starts[shard])
 
     def record(self, i: int) -> np.ndarray:
-        """The stored record of image i, read-only: the fields range, reflectance, label, each (H, W)."""
+        """The stored record of image i, read-only: the fields range, reflectance, label, each (H, W).
+
+        Raises ValueError where its shard is no longer whole.
+        """
         shard, row = self._place(i)
         offset = self._offsets[shard] + row * self._type.itemsize
-        return np.memmap(self._paths[shard], self._type, "r", offset, (1,))[0]
+        try:
+            return np.memmap(self._paths[shard], self._type, "r", offset, (1,))[0]
+        except (OSError, ValueError) as error:
+            found = error.strerror if isinstance(error, OSError) else f"{os.path.getsize(self._paths[shard])} bytes"
+            least = offset + self._type.itemsize
+            raise ValueError(f"{self._paths[shard]}: expected a shard of the cache of {least} bytes and more, found "
+                             f"{found}; data ... --check makes it anew") from None  # fmt: skip
 
     def name(self, i: int) -> Name:
         """Source, sequence and frame of image i; sequence "" and frame = its number in a cache without names."""

@@ -45,11 +45,11 @@ class Frame(NamedTuple):
     labels: str | None = None
 
 
-def stamped(frames: Sequence[Frame], index: int) -> str:
-    """Sizes and times of the files of scan `index`: they change when the scan does."""
+def stamped(frames: Sequence[Frame], index: int) -> tuple[str, str]:
+    """Sizes and times of the files of scan `index`: they change when the scan does; of a copy, the times alone."""
     frame = frames[index]
     found = [os.stat(path) for path in (frame.path, frame.labels) if path is not None and os.path.exists(path)]
-    return repr([(stat.st_size, stat.st_mtime_ns) for stat in found])
+    return repr([stat.st_size for stat in found]), repr([stat.st_mtime_ns for stat in found])
 
 
 @dataclass(frozen=True)

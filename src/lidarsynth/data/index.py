@@ -16,6 +16,7 @@ from lidarsynth.lidar.whole_file import sweep, whole_file
 RANGE_STEP = 0.002  # metres per unit of the stored uint16, 0 = nothing returned; of sensors that see beyond 131 m more
 INDEX, REPORT = "index.json", "report.json"
 PLACE = ("root", "missing")  # of a source: where it lies on this disk, not what it is
+MOVED = "moved"  # of an opened index: that the source lies elsewhere than when it was written
 
 
 def read_index(folder: str | Path) -> dict[str, Any]:
@@ -85,7 +86,8 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
         if expected != found:  # nothing of the other kind is stored: no scan could be read
             return head
     sweep(folder)
-    return index | {"source": head["source"], "count": max(count, index["count"])}
+    moved = index["source"].get("root") != head["source"].get("root")
+    return index | {"source": head["source"], "count": max(count, index["count"]), MOVED: moved}
 
 
 def _short(value: Any) -> str:

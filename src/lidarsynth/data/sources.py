@@ -224,8 +224,9 @@ def _processes(workers: int | None) -> int:
 
 
 def shards(folder: str | Path) -> dict[str, Any]:
-    """What the shards of a cache hold, by its index; {} where it is not begun."""
-    return read_index(folder)["shards"] if (Path(folder) / INDEX).is_file() else {}
+    """Checksums of the shards of a cache, by its index; {} where it is not begun."""
+    index = read_index(folder) if (Path(folder) / INDEX).is_file() else {"shards": {}}
+    return {name: entry.get("sha256") for name, entry in index["shards"].items()}
 
 
 def summary(folder: str | Path) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
-from lidarsynth.data.workers import keep_memory, watch_parent
+from lidarsynth.data.workers import keep_memory, pool_of, watch_parent
 
 _work: list[Callable[[Any], Any]] = []  # of this worker process
 
@@ -26,27 +25,27 @@ def in_window(
         work = make()
         yield from map(work, items)
         return
-    # Not fork: threads of torch in this process would be copied in whatever state they are.
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start, (make,))
     waiting: deque[Future] = deque()
-    try:
+    with pool_of(workers, _start, make, "the same command with --skip-existing goes on") as submit:
         for item in items:
-            waiting.append(pool.submit(_do, item))
+            waiting.append(submit(_do, item))
             if len(waiting) > 2 * workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
-    except BrokenProcessPool:
-        raise OSError(f"expected {workers} worker processes to stay, found one gone (out of memory?); the same command "
-                      "with --skip-existing goes on") from None  # fmt: skip
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _start(make: Callable[[], Callable[[Any], Any]]) -> None:
     watch_parent()
     keep_memory()
-    _work.append(make())
+    try:
+        _work.append(make())
+    except Exception as error:  # what an initialiser raises is lost, and the pool with it
+        _work.append(partial(_refuse, error))
+
+
+def _refuse(error: Exception, item: Any) -> Any:
+    raise error
 
 
 def _do(item: Any) -> Any:

@@ -9,9 +9,10 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from itertools import chain, islice
 from multiprocessing.connection import wait
 from typing import Any, TypeVar
@@ -24,14 +25,11 @@ Item = TypeVar("Item")
 _make: list[Callable[[Any], Any]] = []  # of this worker process; sent once, not with every item
 
 
-def in_order(
-    make: Callable[[Item], Any], items: Iterable[Item], workers: int, abandon: bool = False
-) -> Generator[Any, None, None]:
+def in_order(make: Callable[[Item], Any], items: Iterable[Item], workers: int) -> Generator[Any, None, None]:
     """make(item) of each item, in order, by `workers` processes, or by this one where fewer than two have work.
 
     `make` must be picklable where there are workers. What it raises is raised here. Closing the generator ends the
-    workers after their present item, or, with `abandon`, at once, as items that take a minute ask for. Raises OSError
-    when a worker is gone.
+    workers at once. Raises OSError when one is gone.
     """
     items = iter(items)
     first = list(islice(items, max(workers, 0)))
@@ -39,23 +37,60 @@ def in_order(
     if workers < 2:
         yield from map(make, items)
         return
+    with pool_of(workers, _start, make, "the same command goes on, and --workers 1 needs the least") as submit:
+        begun = deque(submit(_work, item) for item in islice(items, AHEAD * workers))
+        while begun:
+            yield begun.popleft().result()
+            begun.extend(submit(_work, item) for item in islice(items, 1))
+
+
+@contextmanager
+def pool_of(
+    workers: int, start: Callable[[Any], None], make: Any, goes_on: str
+) -> Generator[Callable[..., Future], None, None]:
+    """`submit(call, item)` to so many processes, each begun by `start(make)`; whatever leaves early ends them at once.
+
+    goes_on  what to do where one is gone, in words
+    Raises OSError when one is gone.
+    """
     # Not fork: threads of torch in this process would be copied in whatever state they are.
     others, done = set(multiprocessing.active_children()), False
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start, (make,))
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start, (make,))
+
+    def submit(call: Callable[[Any], Any], item: Any) -> Future:
+        with _uninterrupted():
+            return pool.submit(call, item)
+
     try:
-        begun = deque(pool.submit(_work, item) for item in islice(items, AHEAD * workers))
-        while begun:
-            future = begun.popleft()
-            yield future.result()
-            begun.extend(pool.submit(_work, item) for item in islice(items, 1))
+        yield submit
         done = True
     except BrokenProcessPool:
-        raise OSError(f"expected {workers} worker processes to stay, found one gone (out of memory?); the same command "
-                      "goes on, and --workers 1 needs the least") from None  # fmt: skip
+        raise OSError(f"expected {workers} worker processes to stay, found one gone (out of memory?); {goes_on}"
+                      ) from None  # fmt: skip
     finally:
-        for worker in set(multiprocessing.active_children()) - others if abandon and not done else ():
+        for worker in set(multiprocessing.active_children()) - others if not done else ():
             worker.terminate()
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits, and processes that begin meanwhile never see it: it is the parent's to handle."""
+    handler = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or not callable(handler) or not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    came: list[tuple[int, Any]] = []
+    signal.signal(signal.SIGINT, lambda *call: came.append(call))  # another thread may be the one that gets it
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which processes inherit, and handlers not
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if came:
+        handler(*came[0])
 
 
 def _start(make: Callable[[Any], Any]) -> None:

@@ -45,9 +45,16 @@ def only_writer(folder: Path, work: str) -> Iterator[None]:
                 if error.errno not in UNKNOWN:
                     raise
             # who held it before may have taken the file away after we opened it: then it is another one now
-            held = path.exists() and path.stat().st_ino == os.fstat(file.fileno()).st_ino
+            held = _inode(path) == os.fstat(file.fileno()).st_ino
             if held:
                 try:
                     yield
                 finally:
                     path.unlink(missing_ok=True)
+
+
+def _inode(path: Path) -> int | None:
+    try:
+        return path.stat().st_ino
+    except FileNotFoundError:
+        return None

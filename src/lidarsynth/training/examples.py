@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import signal
+import sys
 from collections.abc import Generator
 from functools import lru_cache, partial
 from itertools import product
@@ -25,6 +27,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.training.task import Draw
 
+PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
 VIRTUAL = "virtual"  # the same, by virtual sensors that are drawn too
 VARIED = "varied"  # by virtual sensors too, in worlds of many densities
@@ -170,6 +173,8 @@ def load_batches(
     try:
         yield from batches
     finally:
+        if workers:
+            batches._shutdown_workers()  # type: ignore[attr-defined]  # a traceback may hold it, and so would keep them
         del batches
         atexit.unregister(end)
 
@@ -184,3 +189,5 @@ def _ignore_signals(worker: int) -> None:
     # a stop is for the main process, which saves first and then ends its workers
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
+    if sys.platform == "linux":  # they hold the run's lock, and would for seconds where the main process is killed
+        ctypes.CDLL(None).prctl(PARENT_DEATH, signal.SIGKILL)

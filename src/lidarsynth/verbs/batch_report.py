@@ -36,17 +36,38 @@ def report_path(out: Path, shard: Shard) -> Path:
 def check_same(out: Path, recipe: Mapping[str, Any]) -> None:
     """Raises ValueError where a report in the folder tells of results of another recipe: they are not to go on with."""
     for path in sorted(out.glob("report*.json")):
-        try:
-            settings = read_json(path, LARGEST_INDEX)["settings"]
-            found = settings.get("recipe", {name: settings[name] for name in ("verb", "model")})  # until 2026-11-26
-        except (ValueError, LookupError, TypeError, AttributeError):
+        if (report := _read(path)) is None:
             continue  # something else of the user's
-        names = recipe.keys() | found.keys() if "recipe" in settings else recipe.keys() & found.keys()
-        other = [name for name in sorted(names) if recipe.get(name) != found.get(name)]
+        other = ", ".join(f"{name} {now} for {was}" for name, (now, was) in _unlike(report, recipe).items())
+        other = other or ("scans of two settings" if "mixed" in report else "")
         if other:
-            told = ", ".join(f"{name} {_word(recipe.get(name))} for {_word(found.get(name))}" for name in other)
-            raise ValueError(f"{path}: expected scans made as they are asked for now, found other settings: {told}; "
+            raise ValueError(f"{path}: expected scans made as they are asked for now, found other settings: {other}; "
                              "another --out, or without --skip-existing all are made anew")  # fmt: skip
+
+
+def same(path: Path, recipe: Mapping[str, Any]) -> bool:
+    """Whether there is a report of scans of this recipe, and of no other."""
+    report = _read(path) if path.is_file() else None
+    return (
+        report is not None and "recipe" in report["settings"] and "mixed" not in report and not _unlike(report, recipe)
+    )
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """A report of many scans, or None."""
+    try:
+        report = read_json(path, LARGEST_INDEX)
+        return report if {"verb", "model"} <= report["settings"].keys() else None
+    except (ValueError, LookupError, TypeError, AttributeError):
+        return None
+
+
+def _unlike(report: Mapping[str, Any], recipe: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """What differs from a report's recipe, now and as it was; until 2026-11-26 they had verb and model alone."""
+    found = report["settings"].get("recipe", {name: report["settings"][name] for name in ("verb", "model")})
+    names = recipe.keys() | found.keys() if "recipe" in report["settings"] else recipe.keys() & found.keys()
+    pairs = {name: (recipe.get(name), found.get(name)) for name in sorted(names)}
+    return {name: (_word(now), _word(was)) for name, (now, was) in pairs.items() if now != was}
 
 
 def _word(value: Any) -> str:
@@ -69,9 +90,12 @@ def report_of(results: Sequence[Result], skipped: int, seconds: float, settings:
     }
 
 
-def unfinished(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The report of a run that goes on, or was killed: how the scans that are there were made."""
-    return {"unfinished": True} | report_of([], 0, 0.0, settings)
+def unfinished(settings: Mapping[str, Any], mixed: bool = False) -> dict[str, Any]:
+    """The report of a run that goes on, or was killed: how the scans that are there were made.
+
+    mixed  some of them may be of another recipe, which the run replaces
+    """
+    return {"unfinished": True} | ({"mixed": True} if mixed else {}) | report_of([], 0, 0.0, settings)
 
 
 def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

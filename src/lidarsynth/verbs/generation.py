@@ -158,9 +158,7 @@ def generate_into(
         return
     pieces = cut(runs, model.together)
     threads = max(1, (os.cpu_count() or 1) // workers)
-    with closing(
-        in_order(partial(_piece, make, source, pieces, threads), range(len(pieces)), workers, abandon=True)
-    ) as made:
+    with closing(in_order(partial(_piece, make, source, pieces, threads), range(len(pieces)), workers)) as made:
         for path in chain.from_iterable(made):
             yield path
             (on_step or (lambda: None))()

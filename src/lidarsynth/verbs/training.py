@@ -239,9 +239,19 @@ def _due(step: int, every: int, experiment: Experiment) -> bool:
 
 
 def _named(steps: Iterator[Progress], out: Path) -> Iterator[Progress]:
-    """The same steps; a loss that is not finite also names the last good checkpoint."""
+    """The same steps; a loss that is not finite also names the last good checkpoint. Raises what a process that reads
+    ahead raised, and OSError where one is gone."""
     try:
         yield from steps
+    except (ValueError, OSError) as error:
+        if "in DataLoader worker process" not in str(error):
+            raise
+        raise type(error)(str(error).strip().splitlines()[-1].partition(": ")[2]) from None  # without its traceback
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader worker"):
+            raise
+        raise OSError("expected the processes that read ahead to stay, found one gone (out of memory?); the same "
+                      "command goes on, and --workers 0 needs the least") from None  # fmt: skip
     except FloatingPointError as error:
         raise FloatingPointError(f"{error}; last good checkpoint: {(checkpoints(out) or ['none'])[-1]}") from None
 
