@@ -197,6 +197,9 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     if many.shard or many.skip_existing or len(paths) != 1 or not is_bag(paths[0]):
         raise ValueError(f"{out}: expected one bag to make another of, without --shard and --skip-existing; a folder "
                          "takes anything")  # fmt: skip
+    if job.verb == "project" or job.corrupt:
+        word = "range images" if job.verb == "project" else f"--corrupt {job.corrupt}"
+        raise ValueError(f"{out}: expected a file or folder for {word}, found a bag, which holds points")
     if out.exists() and out.samefile(paths[0]):
         raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
     model, begun, results = _model(job), time.perf_counter(), []
@@ -210,6 +213,8 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
             results.append(replace(result, cloud=None))
             on_scan()
             _tell_of_many(result, False, False, len(results))
+        if results and all(result.error is not None for result in results):
+            _refuse_all(results)  # before the bag is in its place
     _summary(results, 0, time.perf_counter() - begun, out)
     return results
 

@@ -132,13 +132,17 @@ def _npy_header(text: bytes) -> tuple[tuple[int, ...], np.dtype, bool]:
 
 def read_npz(data: bytes) -> Fields:
     """Our own scan (xyz, reflectance, ring, time, label), our own range image (`image_of`), columns under the usual
-    names, or a single array of points under any name (`read_npy`). Arrays (H, W, 3) and (H, W) are flattened."""
+    names, or a single array of points under any name (`read_npy`) and what else there is of each of them. Arrays
+    (H, W, 3) and (H, W) are flattened."""
     arrays = unzip(data)
     if "sensor" in arrays and "mask" in arrays:
         return scan_fields(image_of(arrays).to_scan())
     if "xyz" not in arrays:
         tables = [array for array in arrays.values() if array.ndim == 2 or array.dtype.names]
-        return fields_of(tables[0]) if len(tables) == 1 else dict(arrays)
+        if len(tables) != 1:
+            return dict(arrays)
+        points = fields_of(tables[0])
+        return points | {name: array for name, array in arrays.items() if array.shape == tables[0].shape[:1]}
     xyz = arrays.pop("xyz")
     if xyz.ndim < 2 or xyz.shape[-1] != 3:
         raise FileError(f"expected xyz of (N, 3) or (H, W, 3), found {xyz.shape}")

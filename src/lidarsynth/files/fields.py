@@ -15,6 +15,7 @@ MAX_POINTS = 10_000_000  # one turn of the largest sensor is under a million poi
 MAX_BYTES = 1 << 28  # of one file, and of one array packed in a file
 MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coordinates, or coordinates of a map
 MAX_RINGS = 1024
+LONGEST = 10.0  # seconds that a turn may last
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
 PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
@@ -124,7 +125,8 @@ def on_rings(fields: Fields, first: int, last: int) -> Fields:
     if not kept.any():
         found = f"rings {ring.min():.6g}-{ring.max():.6g}" if len(ring) else "no points"
         raise FileError(f"expected rings {first}-{last}, found {found}")
-    return {key: column[kept] for key, column in fields.items()} | {name: ring[kept] - first}
+    chosen = {key: column[kept] for key, column in fields.items()}
+    return chosen | {name: ring[kept] - first} | ({f"file_{name}": ring[kept]} if first else {})
 
 
 def _coordinates(fields: Fields) -> list[np.ndarray]:
@@ -218,20 +220,26 @@ def _beams(found: int) -> int:
 
 
 def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
-    """(N,) float64 seconds. Floats are seconds already, or, beyond 1e15, nanoseconds since 1970 (Livox); integers are
-    the unit of 1, 1e-3, 1e-6 or 1e-9 s that brings the span nearest to 0.1 s (`nanoseconds`: 1e-9). All but seconds are
-    counted from the first instant so that no digit is lost.
+    """(N,) float64 seconds. Integers are the unit of 1, 1e-3, 1e-6 or 1e-9 s that brings the span nearest to 0.1 s
+    (`nanoseconds`: 1e-9), and so are floats that span more than a turn can last or are beyond 1e15, as of Livox; other
+    floats are seconds already. All but seconds are counted from the first instant so that no digit is lost.
     """
-    if _numbers(time, "time").dtype.kind == "f" and np.nanmax(time, initial=0) > 1e15:
-        with np.errstate(invalid="ignore"):
-            return (time.astype(np.float64) - np.nanmin(time)) * 1e-9
-    if time.dtype.kind == "f":
+    if _numbers(time, "time").dtype.kind == "f":
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-            return time.astype(np.float64) * (1e-9 if nanoseconds else 1.0)
+            exact = time.astype(np.float64)
+            known = exact[np.isfinite(exact)]
+            first, last = (known.min(), known.max()) if len(known) else (0.0, 0.0)
+            if nanoseconds or (last <= 1e15 and last - first <= LONGEST):
+                return exact * (1e-9 if nanoseconds else 1.0)
+            return (exact - first) / 10.0 ** _power(max(float(last - first), 1.0))
     first = time.min()
     span = max(int(time.max()) - int(first), 1)
-    power = 9 if nanoseconds else min((0, 3, 6, 9), key=lambda p: abs(np.log10(span) - p + 1))
-    return (time - first).astype(np.float64) / 10.0**power
+    return (time - first).astype(np.float64) / 10.0 ** (9 if nanoseconds else _power(span))
+
+
+def _power(span: float) -> int:
+    """Of ten, units of a second that bring a turn's span nearest to 0.1 s."""
+    return min((0, 3, 6, 9), key=lambda p: abs(np.log10(span) - p + 1))
 
 
 def rings_of_grid(fields: Fields, shape: tuple[int, int]) -> np.ndarray | None:

@@ -63,9 +63,12 @@ def _sure(scan: Scan) -> np.ndarray:
 
 
 def _kept(scan: Scan, row: np.ndarray) -> dict[str, np.ndarray]:
-    """The further fields of a scan, and its rings where they are not the rows and no field has them as they were."""
+    """The further fields of a scan, and its rings where they are not the rows and no field has them as they were. A
+    confidence that is not of filled points is something else of the file's."""
     said = scan.ring is not None and not {"ring", "file_ring"} & set(scan.extra) and (scan.ring != row).any()
-    return {**scan.extra, **({"ring": scan.ring} if said else {})}  # type: ignore[dict-item]
+    theirs = {"confidence"} if "new" not in scan.extra else set()
+    kept = {f"file_{name}" if name in theirs else name: values for name, values in scan.extra.items()}
+    return {**kept, **({"ring": scan.ring} if said else {})}  # type: ignore[dict-item]
 
 
 def _time_towards(xyz: np.ndarray, scan: Scan) -> np.ndarray:

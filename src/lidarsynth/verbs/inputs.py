@@ -15,7 +15,7 @@ from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.turns import capture_turns
-from lidarsynth.files.fields import PLACE, Fields, FileError, find, scan_from_fields
+from lidarsynth.files.fields import PLACE, Fields, FileError, find, rings_from_top, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
@@ -172,6 +172,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     files = [FileInput(name, path, reading) for name, path in _names(expanded, paths)]
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)
+    folders = dict(zip(streams, _unlike([path.stem for path in streams], streams), strict=True))
     for path in streams:
         more = _stream_count(path, reading)
         count = None if more is None or count is None else count + more
@@ -180,11 +181,12 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
         yield from files
         for path in streams:
             try:
-                yield from _bag_inputs(path, reading) if is_bag(path) else _capture_inputs(path, reading)
+                inputs = _bag_inputs if is_bag(path) else _capture_inputs
+                yield from inputs(path, reading, folders[path])
             except FileError as error:
                 if len(expanded) == 1:
                     raise
-                yield BrokenInput(path.stem, path, str(error))  # the others go on
+                yield BrokenInput(folders[path], path, str(error))  # the others go on
 
     return Inputs(single, count, stream, bool(streams))
 
@@ -224,15 +226,20 @@ def has_scans(folder: Path) -> bool:
 def _names(expanded: list[Path], given: Sequence[Path]) -> Iterator[tuple[str, Path]]:
     """(name, path) of each scan file: its stem, with the folders above it as far as names repeat without them."""
     files = [path for path in expanded if not is_stream(path)]
-    stems = [stem(path) for path in files]
+    return iter(zip(_unlike([stem(path) for path in files], files), files, strict=True))
+
+
+def _unlike(stems: list[str], files: list[Path]) -> list[str]:
+    """The stems, or, where any is there twice, all with the folders above their files. Raises ValueError where these
+    do not tell them apart."""
     if len(set(stems)) == len(stems):
-        return iter(zip(stems, files, strict=True))
+        return stems
     root = Path(os.path.commonpath([path.absolute().parent for path in files]))
-    names = [str(path.absolute().parent.relative_to(root) / stem(path)) for path in files]
+    names = [str(path.absolute().parent.relative_to(root) / one) for path, one in zip(files, stems, strict=True)]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         one, other = [path for name, path in zip(names, files, strict=True) if name == twice[0]][:2]
         raise ValueError(f"expected scans of different names, found two named {twice[0]}: {one} and {other}")
-    return iter(zip(names, files, strict=True))
+    return names
 
 
 def stem(path: Path) -> str:
@@ -249,16 +256,16 @@ def _stream_count(path: Path, reading: Reading) -> int | None:
         return sum(topic.count for topic in bag.topics if topic.name == name) or None
 
 
-def _bag_inputs(path: Path, reading: Reading) -> Iterator[Input]:
+def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
         for number, message in enumerate(bag.messages(frozenset([topic]))):
-            yield MessageInput(f"{path.stem}/{number:06d}", path, reading, message)
+            yield MessageInput(f"{folder}/{number:06d}", path, reading, message)
 
 
-def _capture_inputs(path: Path, reading: Reading) -> Iterator[Input]:
+def _capture_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
     for number, fields in enumerate(capture_turns(path, reading.metadata, reading.topic)):
-        yield TurnInput(f"{path.stem}/{number:06d}", path, reading, fields)
+        yield TurnInput(f"{folder}/{number:06d}", path, reading, fields)
 
 
 def parse_rings(text: str | None) -> tuple[int, int] | None:
@@ -312,7 +319,12 @@ def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
     if reading.transform is None:
         return Loaded(scan, given, dropped)
     extra = {PLACE: np.arange(1, len(scan) + 1), **scan.extra}  # that of a message stays
-    return Loaded(replace(scan, xyz=transformed(scan.xyz, reading.transform), extra=extra), given, dropped)
+    xyz, ring = transformed(scan.xyz, reading.transform), scan.ring
+    if ring is not None:  # where up is elsewhere now, they count from the other end
+        ring = rings_from_top(ring, xyz)
+        if (ring != scan.ring).any() and find(dict(scan.extra), "ring") is None:
+            extra["ring"] = scan.ring
+    return Loaded(replace(scan, xyz=xyz, ring=ring, extra=extra), given, dropped)
 
 
 def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) -> Scan:
@@ -358,5 +370,7 @@ def message_fields(filled: Scan, given: Fields) -> Fields:
         order = np.flatnonzero(old)[np.argsort(azimuth[old])]
         nearest = np.searchsorted(azimuth[order], azimuth[new]).clip(0, len(order) - 1)
         fields[name][new] = fields[name][order[nearest]]
-    sure = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
-    return fields | {"new": filled.extra["new"]} | sure
+    more = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
+    if filled.label is not None and "label" not in fields:
+        more["label"] = filled.label.astype(np.uint8)
+    return fields | {"new": filled.extra["new"]} | more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -50,7 +51,7 @@ def write_toml(path: Path, text: str) -> None:
 
 def sensor_toml(sensor: Sensor, comments: Sequence[str] = ()) -> str:
     """A sensor file as `read_sensor` reads it."""
-    lines = [f"# {comment}" for comment in comments] + [f'name = "{sensor.name}"']
+    lines = [f"# {comment}" for comment in comments] + [f"name = {json.dumps(sensor.name, ensure_ascii=False)}"]
     numbers = sensor.to_dict()
     for key in ("width", "min_range", "max_range", "mount"):
         lines.append(f"{key} = {numbers[key]}")

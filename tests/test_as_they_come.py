@@ -1,0 +1,145 @@
+"""Files as users have them: other axes with rings, bags of one name, fields named like ours, times in odd units."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_recognise import turn
+
+import lidarsynth as ls
+from lidarsynth.cli.main import main
+from lidarsynth.data.bag_writer import write_bag
+from lidarsynth.data.bags import Cloud
+from lidarsynth.files.fields import scan_from_fields, seconds_from
+from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.verbs.learned_sensor import sensor_toml
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def scan() -> Scan:
+    return turn(SENSORS["hdl-32e"])
+
+
+def ringed(scan: Scan) -> Scan:
+    """With the ring of each point from the top."""
+    elevation = np.degrees(np.arctan2(scan.xyz[:, 2], np.hypot(scan.xyz[:, 0], scan.xyz[:, 1])))
+    beams = np.array(SENSORS["hdl-32e"].elevations)
+    return replace(scan, ring=np.abs(elevation[:, None] - beams).argmin(1).astype(np.int32))
+
+
+def bag(path: Path, scan: Scan, count: int = 2) -> Path:
+    fields = dict(zip("xyz", scan.xyz.T, strict=True)) | {"intensity": scan.reflectance}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with write_bag(path) as writer:
+        for number in range(count):
+            writer.write_cloud("/points", Cloud(number * 10**8, "lidar", number * 10**8, fields))
+    return path
+
+
+@pytest.mark.parametrize("rings", ["from the top", "from the bottom"])
+def test_rings_are_counted_anew_where_axes_are_turned(scan: Scan, rings: str, tmp_path: Path):
+    upright = ringed(scan)
+    assert upright.ring is not None
+    ring = upright.ring if rings == "from the top" else 31 - upright.ring
+    turned = replace(upright, xyz=upright.xyz * np.float32([1, -1, -1]), ring=ring)
+    write(tmp_path / "frd.pcd", turned)
+    words = ["complete", str(tmp_path / "frd.pcd"), "--model", "bilinear", "--no-picture", "--corrupt", "beams:2"]
+    main([*words[:-2], "--axes", "frd", "--out", str(tmp_path / "o.pcd")])
+    filled = read(tmp_path / "o.pcd")
+    old = filled.extra["new"] == 0
+    same = filled.xyz[old][np.lexsort(filled.xyz[old].T)], turned.xyz[np.lexsort(turned.xyz.T)]
+    np.testing.assert_array_equal(*same)
+    main([*words[:-2], "--transform", "0:0:0:180:0:0", "--out", str(tmp_path / "p.pcd")])
+    assert (read(tmp_path / "p.pcd").extra["new"] == 1).sum() == (~old).sum()
+
+
+def test_bags_of_one_name_keep_their_folders(scan: Scan, tmp_path: Path, capsys: Capture):
+    bags = [str(bag(tmp_path / folder / "drive.bag", scan)) for folder in ("d1", "d2")]
+    main(
+        ["complete", *bags, "--model", "bilinear", "--no-picture", "--sensor", "hdl-32e", "--out", str(tmp_path / "o")]
+    )
+    assert "4 scans in" in capsys.readouterr().out
+    made = sorted(path.relative_to(tmp_path / "o").as_posix() for path in (tmp_path / "o").rglob("*.ply"))
+    assert made == [f"{folder}/drive/{number:06d}.ply" for folder in ("d1", "d2") for number in (0, 1)]
+
+
+def test_a_bag_is_not_lost_to_a_run_that_fails(scan: Scan, tmp_path: Path, capsys: Capture):
+    wrong = bag(tmp_path / "mm.bag", replace(scan, xyz=scan.xyz * 1000))
+    kept = bag(tmp_path / "kept.bag", scan)
+    before = kept.read_bytes()
+    for words in (["complete", "--model", "bilinear"], ["project"], ["complete", "--corrupt", "beams:2"]):
+        source = wrong if "--corrupt" not in words and words[0] == "complete" else bag(tmp_path / "good.bag", scan)
+        with pytest.raises(SystemExit, match="2"):
+            main([words[0], str(source), *words[1:], "--sensor", "hdl-32e", "--out", str(kept)])
+        error = capsys.readouterr().err
+        assert "expected" in error and kept.read_bytes() == before
+    with pytest.raises(SystemExit, match="2"):
+        main(["project", str(tmp_path / "good.bag"), "--sensor", "hdl-32e", "--out", str(tmp_path / "new.bag")])
+    assert "found a bag, which holds points" in capsys.readouterr().err and not (tmp_path / "new.bag").exists()
+
+
+def test_labels_go_into_bags_too(scan: Scan, tmp_path: Path):
+    source = bag(tmp_path / "a.bag", scan, 1)
+    words = ["--sensor", "hdl-32e", "--labels"]
+    main(["complete", str(source), "--out", str(tmp_path / "b.bag"), *words])
+    main(["complete", str(source), "--out", str(tmp_path / "o"), "--no-picture", *words])
+    main(["project", str(tmp_path / "b.bag"), "--sensor", "hdl-32e", "--out", str(tmp_path / "p")])
+    from lidarsynth.data.bags import cloud_of, open_bag
+
+    with open_bag(tmp_path / "b.bag") as opened:
+        (message,) = opened.messages(frozenset(["/points"]))
+        fields = cloud_of(message).fields
+    expected = next((tmp_path / "o").rglob("*.ply"))
+    assert sorted(fields["label"]) == sorted(np.asarray(read(expected).label)) and fields["label"].any()
+
+
+def test_a_files_own_confidence_stays(scan: Scan, tmp_path: Path):
+    own = np.arange(len(scan)).astype(np.uint16)
+    write(tmp_path / "a.pcd", replace(scan, extra={"confidence": own}))
+    words = ["--model", "default", "--sensor", "hdl-32e", "--no-picture"]
+    main(["complete", str(tmp_path / "a.pcd"), "--out", str(tmp_path / "b.pcd"), *words])
+    filled = read(tmp_path / "b.pcd")
+    old = filled.extra["new"] == 0
+    assert sorted(filled.extra["file_confidence"][old]) == sorted(own) and (filled.extra["confidence"][old] == 1).all()
+
+
+def test_arrays_beside_a_table_are_its_points_too(scan: Scan, tmp_path: Path):
+    ring = np.asarray(ringed(scan).ring, np.uint8)
+    np.savez(tmp_path / "a.npz", points=scan.xyz, intensity=scan.reflectance, ring=ring, beam_id=ring * 2)
+    found = read(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.reflectance, scan.reflectance)
+    np.testing.assert_array_equal(found.ring, ring)
+    np.testing.assert_array_equal(found.extra["beam_id"], ring * 2)
+
+
+def test_chosen_rings_keep_the_files_numbers(scan: Scan, tmp_path: Path):
+    write(tmp_path / "a.pcd", ringed(scan))
+    found = read(tmp_path / "a.pcd", rings=(8, 31))
+    assert found.ring is not None and found.ring.min() == 0
+    np.testing.assert_array_equal(found.extra["file_ring"], found.ring + 8)
+
+
+@pytest.mark.parametrize(
+    ("unit", "start", "kind"),
+    [(1e6, 0, "f4"), (1e6, 1.7e15, "f8"), (1e9, 0, "f8"), (1e9, 1.7e18, "f8"), (1e3, 0, "f4"), (1, 0, "f4"),
+     (1, 1.7e9, "f8")],
+)  # fmt: skip
+def test_times_of_floats_become_seconds(unit: float, start: float, kind: str):
+    true = np.linspace(0, 0.1, 1000)
+    found = seconds_from((start + true * unit).astype(kind))
+    np.testing.assert_allclose(found - found[0], true, atol=2e-6)
+    fields = dict.fromkeys(("x", "y", "z", "intensity"), np.linspace(0.1, 0.9, 1000))
+    scan, _ = scan_from_fields({**fields, "time": (start + true * unit).astype(kind)})
+    assert ("time" in scan.extra) == (unit != 1), "what is no seconds stays beside"
+
+
+def test_a_sensors_name_is_quoted(tmp_path: Path):
+    for name in ('my "odd" lidar', "a\\qb", "länge"):
+        (tmp_path / "s.toml").write_text(sensor_toml(Sensor(name, (1.0, 0.0, -1.0), 64)), "utf-8")
+        assert get_sensor(str(tmp_path / "s.toml")).name == name
+    assert ls.SENSORS["vlp-16"].name == "vlp-16"
