@@ -143,3 +143,41 @@ def test_a_sensors_name_is_quoted(tmp_path: Path):
         (tmp_path / "s.toml").write_text(sensor_toml(Sensor(name, (1.0, 0.0, -1.0), 64)), "utf-8")
         assert get_sensor(str(tmp_path / "s.toml")).name == name
     assert ls.SENSORS["vlp-16"].name == "vlp-16"
+
+
+@pytest.mark.parametrize(
+    "header", ["x [m],y [m],z [m],intensity,range [m]", "X(m);Y(m);Z(m);Intensity;Range", "# x y z intensity range"]
+)
+def test_names_of_columns_may_have_units(header: str, tmp_path: Path):
+    separator = next(s for s in (",", ";", " ") if s in header.lstrip("# ").replace(" [", "["))
+    rows = [separator.join(map(str, (i, 2, 0.5, 0.25, 7 + i))) for i in range(1, 20)]
+    (tmp_path / "a.csv").write_text("\n".join([header, *rows]))
+    found = read(tmp_path / "a.csv")
+    np.testing.assert_array_equal(found.xyz[:, 0], np.arange(1, 20))
+    (name,) = found.extra
+    assert name.lower() == "range" and found.extra[name][0] == 8 and (found.reflectance == 0.25).all()
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path: Path):
+    (tmp_path / "a.csv").write_text("x,y,z,intensity,range,range\n1,2,3,0.5,6,7\n")
+    with pytest.raises(ValueError, match=r"a.csv: expected columns of different names, found 2 named range"):
+        read(tmp_path / "a.csv")
+
+
+def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):
+    (tmp_path / "in").mkdir()
+    write(tmp_path / "in" / "a.pcd", scan)
+    bag(tmp_path / "in" / "drive.bag", scan, 1)
+    words = [str(tmp_path / "in"), "--sensor", "hdl-32e", "--no-picture", "--out", str(tmp_path / "o")]
+    main(["project", *words])
+    said = capsys.readouterr()
+    assert "1 bags or captures beside scan files were passed over: drive.bag" in said.err and "1 scans" in said.out
+    write(tmp_path / "in" / "c.pcd", ringed(scan))
+    (tmp_path / "in" / "b.pcd").write_bytes(b"no points")
+    main(["sensor", str(tmp_path / "in"), "--out", str(tmp_path / "s.toml"), "--no-picture"])
+    assert "1 that could not be read were left out, the first: " in capsys.readouterr().err
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "a.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")
+    with pytest.raises(SystemExit, match="2"):
+        main(["project", str(tmp_path / "text"), "--out", str(tmp_path / "p")])
+    assert ".csv and .txt by name), found none" in capsys.readouterr().err

@@ -74,6 +74,11 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     transform = read_transform(many.transform, many.mount, many.axes)
     rings = parse_rings(many.rings)
     inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings))
+    if inputs.passed:
+        named = ", ".join(path.name for path in inputs.passed[:NAMED])
+        warn(
+            f"{len(inputs.passed)} bags or captures beside scan files were passed over: {named}; name them to read them"
+        )
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)

@@ -40,7 +40,10 @@ def sensor(
         write_toml(out, sensor_toml(known, [f"from the metadata {told.name}"]))
         say(f"wrote {out}: {known.height} beams, {known.width} columns")
         return
-    learned = learn(inputs_of(scans, Reading(intensity, topic, metadata, rings=parse_rings(rings))), out.stem)
+    broken: list[str] = []
+    learned = learn(inputs_of(scans, Reading(intensity, topic, metadata, rings=parse_rings(rings))), out.stem, broken)
+    if broken:
+        warn(f"{len(broken)} that could not be read were left out, the first: {broken[0]}")
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))
     say(summary(learned))
     for line in doubts(learned):

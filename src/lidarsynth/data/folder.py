@@ -35,7 +35,8 @@ def scan_files(root: str | Path) -> list[Path]:
         raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
     paths = scans_below(root)
     if not paths:
-        raise ValueError(f"{root}: expected scans ({', '.join(READERS)}), found none")
+        listed = ", ".join(suffix for suffix in READERS if suffix not in NAMED_ONLY)
+        raise ValueError(f"{root}: expected scans ({listed}; {' and '.join(NAMED_ONLY)} by name), found none")
     return paths
 
 

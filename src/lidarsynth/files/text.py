@@ -29,7 +29,7 @@ def read_text(data: bytes) -> Fields:
         if _numeric(words) and len(words) >= 3 and not line.startswith(COMMENT):
             break
         if {"x", "y", "z"} <= {_ours(word) for word in words}:
-            names = words
+            names = [_without_unit(word) or word for word in words]
         elif not (line.startswith(COMMENT) or (len(words) == 1 and words[0].isdecimal())) or start >= HEADER_LINES:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
     else:
@@ -37,6 +37,8 @@ def read_text(data: bytes) -> Fields:
     table = _table(lines[start:], separator)
     if names is not None and len(names) != table.shape[1]:
         raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")
+    if names is not None and (twice := [name for name in names if names.count(name) > 1]):
+        raise FileError(f"expected columns of different names, found {names.count(twice[0])} named {twice[0]}")
     return dict(zip(names, table.T, strict=True)) if names else guessed(table)
 
 
@@ -80,8 +82,13 @@ def _words(line: str, separator: str | None) -> list[str]:
 
 def _ours(word: str) -> str:
     """x, y or z for a name that means it."""
-    name = re.sub(r"[\[(].*", "", word.strip().lower()).strip()
+    name = _without_unit(word).lower()
     return next((axis for axis in "xyz" if name in NAMES[axis]), name)
+
+
+def _without_unit(word: str) -> str:
+    """A name such as `x [m]` or `X(m)` without what is in brackets."""
+    return re.sub(r"[\[(].*", "", word).strip()
 
 
 def _numeric(words: list[str]) -> bool:

@@ -151,12 +151,14 @@ class Inputs:
     count    how many there are, or None where only reading tells (captures)
     stream   gives them; from the start each time
     streams  whether bags or captures are among them
+    passed   bags and captures that lie in a folder beside its scan files, which alone are read
     """
 
     single: bool
     count: int | None
     stream: Callable[[], Iterator[Input]]
     streams: bool
+    passed: tuple[Path, ...] = ()
 
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
@@ -188,7 +190,9 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
                     raise
                 yield BrokenInput(folders[path], path, str(error))  # the others go on
 
-    return Inputs(single, count, stream, bool(streams))
+    folders_given = [path for path in paths if path.is_dir() and not is_bag(path) and not _is_scan(path)]
+    inside = [p for folder in folders_given for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams]
+    return Inputs(single, count, stream, bool(streams), tuple(inside))
 
 
 def is_stream(path: Path) -> bool:

@@ -19,10 +19,11 @@ from lidarsynth.verbs.inputs import Input, Inputs
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
-def learn(inputs: Inputs, name: str) -> LearnedSensor:
-    """The sensor of at most ENOUGH of the inputs, evenly chosen. Broken ones are left out; else ValueError."""
+def learn(inputs: Inputs, name: str, broken: list[str] | None = None) -> LearnedSensor:
+    """The sensor of at most ENOUGH of the inputs, evenly chosen. Those that cannot be read are left out, and why is
+    added to `broken`; where none can be, ValueError."""
     every = max(-(-(inputs.count or ENOUGH) // ENOUGH), 1)
-    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every)), name)
+    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every), [] if broken is None else broken), name)
 
 
 def from_metadata(path: Path, name: str) -> Sensor | None:
@@ -30,17 +31,16 @@ def from_metadata(path: Path, name: str) -> Sensor | None:
     return sensor_of(read_metadata(path), name) if is_metadata(path) else None
 
 
-def _readable(inputs: Iterable[Input]) -> Iterator[Scan]:
-    failed: list[ValueError] = []
+def _readable(inputs: Iterable[Input], broken: list[str]) -> Iterator[Scan]:
     read = 0
     for item in inputs:
         try:
             yield item.read().scan
             read += 1
         except ValueError as error:
-            failed.append(error)
-    if failed and not read:
-        raise failed[0]
+            broken.append(str(error))
+    if broken and not read:
+        raise ValueError(broken[0])
 
 
 def write_toml(path: Path, text: str) -> None:
