@@ -78,7 +78,7 @@ def _uninterrupted() -> Iterator[None]:
     """Ctrl-C waits, and processes that begin meanwhile never see it: it is the parent's to handle."""
     handler = signal.getsignal(signal.SIGINT)
     main = threading.current_thread() is threading.main_thread()
-    if not main or not callable(handler) or not hasattr(signal, "pthread_sigmask"):  # Windows
+    if not main or not callable(handler) or sys.platform == "win32":
         yield
         return
     came: list[tuple[int, Any]] = []

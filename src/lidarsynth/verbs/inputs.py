@@ -174,7 +174,8 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     files = [FileInput(name, path, reading) for name, path in _names(expanded, paths)]
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)
-    folders = dict(zip(streams, _unlike([path.stem for path in streams], streams), strict=True))
+    each = list(dict.fromkeys(streams))
+    folders = dict(zip(each, _unlike([path.stem for path in each], each), strict=True))
     for path in streams:
         more = _stream_count(path, reading)
         count = None if more is None or count is None else count + more
