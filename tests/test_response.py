@@ -118,7 +118,7 @@ def test_the_share_of_the_mean_is_what_suits_the_scan(street: RangeImage, offset
 @pytest.mark.parametrize(("offset", "straight"), [(0.3, 1.0), (0.0, 0.0)])
 def test_the_line_between_returns_is_taken_where_it_errs_less(street: RangeImage, offset: float, straight: float):
     """Of a scan that brightens from beam to beam, which the line says exactly, and a network that errs, or does not."""
-    height, width = street.shape
+    height = street.shape[0]
     ramp = np.broadcast_to(np.linspace(0.1, 0.9, height, dtype=np.float32)[:, None], street.shape)
     whole = replace(street, mask=np.ones(street.shape, bool), range=np.full(street.shape, 9.0), reflectance=ramp.copy())
     known = every(whole, 2)
@@ -137,7 +137,7 @@ def test_the_line_between_returns_is_taken_where_it_errs_less(street: RangeImage
     inner = slice(0, height - 1)  # beyond the last known beam it goes on as that is
     np.testing.assert_allclose(between[inner], ramp[inner], atol=1e-5)
     assert Response().straightened(ramp, whole, known) is ramp
-    assert (whole.keep(known).reflectance[known] == ramp[known]).all() and width == 512
+    np.testing.assert_array_equal(between[known], ramp[known])
 
 
 def test_an_hdl_64e_that_reports_otherwise_is_not_kittis_unit():

@@ -171,7 +171,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     streams = [path for path in expanded if is_stream(path)]
     if reading.topic is not None and not streams:
         raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
-    files = [FileInput(name, path, reading) for name, path in _names(expanded, paths)]
+    files = [FileInput(name, path, reading) for name, path in _names(expanded)]
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)
     each = list(dict.fromkeys(streams))
@@ -228,7 +228,7 @@ def has_scans(folder: Path) -> bool:
         return False
 
 
-def _names(expanded: list[Path], given: Sequence[Path]) -> Iterator[tuple[str, Path]]:
+def _names(expanded: list[Path]) -> Iterator[tuple[str, Path]]:
     """(name, path) of each scan file: its stem, with the folders above it as far as names repeat without them."""
     files = [path for path in expanded if not is_stream(path)]
     return iter(zip(_unlike([stem(path) for path in files], files), files, strict=True))
