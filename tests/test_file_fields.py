@@ -156,3 +156,28 @@ def test_files_without_points_are_said_to_have_none(tmp_path: Path):
 def test_every_usual_name_is_lower_case_and_unique():
     names = [usual for usuals in NAMES.values() for usual in usuals]
     assert len(names) == len(set(names)) and all(name == name.lower() for name in names)
+
+
+@pytest.mark.parametrize("form", ["pcd", "ply", "csv"])
+@pytest.mark.parametrize("first", [1_689_000_000_123_456_789, 2**64 - 8, -(2**62) - 1])
+def test_whole_numbers_of_64_bits_in_text_keep_every_digit(form: str, first: int, tmp_path: Path):
+    """A float64 does not tell nanoseconds since 1970 apart."""
+    stamps = [first + i for i in range(5)]
+    lines = [f"{i + 1} 0 0 0.5 {stamp}" for i, stamp in enumerate(stamps)]
+    kind = "int64" if first < 0 else "uint64"
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    heads = {
+        "pcd": "FIELDS x y z intensity stamp\nSIZE 4 4 4 4 8\nTYPE F F F F "
+        f"{'I' if first < 0 else 'U'}\nWIDTH 5\nHEIGHT 1\nPOINTS 5\nDATA ascii\n",
+        "ply": f"ply\nformat ascii 1.0\nelement vertex 5\n{properties}property {kind} stamp\nend_header\n",
+        "csv": "x y z intensity stamp\n",
+    }
+    path = tmp_path / f"a.{form}"
+    path.write_text(heads[form] + "\n".join(lines) + "\n", "ascii")
+    assert [int(stamp) for stamp in read(path).extra["stamp"]] == stamps
+
+
+def test_a_column_of_fractions_beyond_53_bits_stays_as_it_is(tmp_path: Path):
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z,intensity,stamp\n1,0,0,0.5,1e17\n2,0,0,0.5,1.5\n", "ascii")
+    np.testing.assert_array_equal(read(path).extra["stamp"], [1e17, 1.5])

@@ -398,6 +398,28 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert old.read_text() == "old"
 
 
+def test_broken_scans_are_left_out_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A file of the whole ones; from the server their words; nothing at all only where all are broken."""
+    folder, page = tmp_path / "scans", tmp_path / "view.html"
+    folder.mkdir()
+    for name in "ac":
+        (folder / f"{name}.npy").write_bytes(b"nothing")
+    for name in "bd":
+        write(folder / f"{name}.npy", turn())
+    main(["view", str(folder), "--out", str(page)])
+    assert "2 that could not be read were left out, the first: " in (said := capsys.readouterr().err)
+    assert "a.npy: expected" in said
+    assert page.read_text().count('id="scan-') == 2 and re.findall(r'"name": "(\w)', page.read_text()) == ["b", "d"]
+    with serve(Show("scans", compared([folder], None, Reading()))) as server:
+        assert server.server_address[1] > 0, "the page's colours are the first whole scan's"
+    for name in "bd":
+        (folder / f"{name}.npy").write_bytes(b"nothing")
+    assert "expected scans, found all 4 broken; the first: " in refused(capsys, str(folder), "--out", str(page))
+    with pytest.raises(ValueError, match=r"a\.npy: expected"):
+        serve(Show("scans", compared([folder], None, Reading())))
+    assert page.read_text().count('id="scan-') == 2, "the former page stays"
+
+
 def test_a_topic_is_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
     write(tmp_path / "a.pcd", turn())
@@ -406,6 +428,10 @@ def test_a_topic_is_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         with pytest.raises(SystemExit, match="2"):
             main([verb, str(tmp_path / "a.pcd"), "--topic", "/points", *more])
         assert "expected a bag or a capture for --topic /points, found none" in capsys.readouterr().err
+        with pytest.raises(SystemExit, match="2"):
+            main([verb, str(tmp_path / "a.pcd"), "--metadata", str(tmp_path / "o.json"), *more])
+        said = capsys.readouterr().err
+        assert "o.json" in said and (verb == "sensor" or "expected a capture for --metadata" in said)
     for one, other in (("a.pcd", "a.mcap"), ("a.mcap", "a.pcd")):
         series = compared([tmp_path / one], tmp_path / other, Reading(topic="/points"))
         assert [scans[0].scan.xyz.shape[1] for scans in series.values()] == [3, 3]

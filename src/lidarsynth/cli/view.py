@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from lidarsynth.cli.arguments import Intensity, NoSeed, Positional, arg
-from lidarsynth.cli.terminal import at_least, say
+from lidarsynth.cli.terminal import at_least, say, warn
 
 if TYPE_CHECKING:
     from lidarsynth.viewer.server import Show
@@ -53,7 +53,10 @@ def view(
     title = next(iter(series))
     if out is None:
         return _serve(Show(title, series), port, browser)
-    size = write_page(out, title, entries(series))
+    broken: list[str] = []
+    size = write_page(out, title, entries(series, broken))
+    if broken:
+        warn(f"{len(broken)} that could not be read were left out, the first: {broken[0]}")
     say(f"wrote {out}, {size / 1e6:.1f} MB: open it in any browser, without a network")
 
 

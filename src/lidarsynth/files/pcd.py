@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarsynth.files.fields import MAX_BYTES, MAX_POINTS, Fields, FileError, rings_of_grid, scan_table
 from lidarsynth.files.lzf import decompress
+from lidarsynth.files.whole_numbers import exact
 from lidarsynth.lidar.scan import Scan
 
 MAX_HEADER = 1 << 16
@@ -137,7 +138,8 @@ def _ascii(body: bytes, header: Header) -> list[np.ndarray]:
         raise FileError(f"expected numbers in an ascii PCD, found {_tail(error)}") from None
     starts = np.cumsum([0, *header.counts[:-1]])
     # An integer column is given its own type back: the intensity scale is recognised from it.
-    columns = [table[:, start] for start in starts]
+    columns = [table[:, at] if t.kind == "f" else exact(table[:, at], words[at::width])
+               for at, t in zip(starts, header.types, strict=True)]  # fmt: skip
     return [_typed(column, dtype) for column, dtype in zip(columns, header.types, strict=True)]
 
 

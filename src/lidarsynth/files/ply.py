@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, scan_table
+from lidarsynth.files.whole_numbers import EXACT, exact
 from lidarsynth.lidar.scan import Scan
 
 MAX_HEADER = 1 << 16
@@ -22,7 +23,6 @@ WRITTEN = {
     "i1": "char", "i2": "short", "i4": "int", "i8": "int64",
 }  # fmt: skip
 NARROWED = {"i8": ("<i4", "<u4", "<f8"), "u8": ("<u4", "<f8")}  # the published format has no whole numbers of 64 bits
-EXACT = 2**53  # up to which float64 tells whole numbers apart
 
 
 class Element(NamedTuple):
@@ -133,11 +133,12 @@ def _ascii(body: bytes, vertex: Element, skipped_lines: int) -> Fields:
         raise FileError(
             f"expected numbers in an ascii PLY, found {str(error).rpartition(':')[2].strip()[:40]}"
         ) from None
-    typed = [_typed(column, np.dtype(TYPES[types[0]])) for column, types in zip(table.T, vertex.order, strict=True)]
+    dtypes = [np.dtype(TYPES[types[0]]) for types in vertex.order]
+    typed = [_typed(column, words[i::width], t) for i, (column, t) in enumerate(zip(table.T, dtypes, strict=True))]
     return dict(zip(vertex.names, typed, strict=True))
 
 
-def _typed(column: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _typed(column: np.ndarray, words: list[bytes], dtype: np.dtype) -> np.ndarray:
     """The numbers in the type that the header declares, or as they are where it does not tell them apart."""
     if dtype == np.float64:
         return column
@@ -145,7 +146,10 @@ def _typed(column: np.ndarray, dtype: np.dtype) -> np.ndarray:
         with np.errstate(over="ignore"):
             single = column.astype(dtype)
         return single if len(np.unique(single)) == len(np.unique(column)) else column
-    low, high = max(np.iinfo(dtype).min, -EXACT), min(np.iinfo(dtype).max, EXACT)
+    whole, limits = exact(column, words), np.iinfo(dtype)
+    if whole.dtype.kind != "f":
+        return whole.astype(dtype) if limits.min <= int(whole.min()) <= int(whole.max()) <= limits.max else whole
+    low, high = max(limits.min, -EXACT), min(limits.max, EXACT)
     inside = (low <= column) & (column <= high) & (column == np.floor(column))
     return column.astype(dtype) if inside.all() else column
 

@@ -7,6 +7,7 @@ import re
 import numpy as np
 
 from lidarsynth.files.fields import MAX_POINTS, NAMES, Fields, FileError
+from lidarsynth.files.whole_numbers import exact
 
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
@@ -34,12 +35,14 @@ def read_text(data: bytes) -> Fields:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
     else:
         raise FileError(f"expected lines of x y z and more numbers, found none in {len(lines)} lines")
-    table = _table(lines[start:], separator)
+    table, words = _table(lines[start:], separator)
     if names is not None and len(names) != table.shape[1]:
         raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")
     if names is not None and (twice := [name for name in names if names.count(name) > 1]):
         raise FileError(f"expected columns of different names, found {names.count(twice[0])} named {twice[0]}")
-    return dict(zip(names, table.T, strict=True)) if names else guessed(table)
+    if names is None:
+        return guessed(table)
+    return {name: exact(table[:, i], [row[i] for row in words]) for i, name in enumerate(names)}
 
 
 def guessed(table: np.ndarray) -> Fields:
@@ -98,13 +101,14 @@ def _numeric(words: list[str]) -> bool:
         return False
 
 
-def _table(lines: list[str], separator: str | None) -> np.ndarray:
-    """(N, columns) float64; an empty cell is NaN."""
+def _table(lines: list[str], separator: str | None) -> tuple[np.ndarray, list[list[str]]]:
+    """(N, columns) float64, and the words that it was read from; an empty cell is NaN."""
     width = len(_words(lines[0], separator))
     rows = [line.split(separator) for line in lines if not line.startswith(COMMENT)]
     if uneven := next((row for row in rows if len(row) != width), None):
         raise FileError(f"expected {width} numbers a line, found {len(uneven)}: {' '.join(uneven)[:40]!r}")
+    words = [[word.strip("\"' ") or "nan" for word in row] for row in rows]
     try:
-        return np.array([[word.strip("\"' ") or "nan" for word in row] for row in rows], dtype=np.float64)
+        return np.array(words, dtype=np.float64), words
     except ValueError as error:
         raise FileError(f"expected numbers, found {str(error).rpartition(':')[2].strip()[:40]}") from None

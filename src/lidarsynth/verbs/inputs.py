@@ -162,8 +162,8 @@ class Inputs:
 
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
-    """The scans of files, folders, globs, bags and captures. Raises ValueError where there is nothing to read, or no
-    bag or capture that a topic could be of."""
+    """The scans of files, folders, globs, bags and captures. Raises ValueError where there is nothing to read, or
+    nothing that a topic or metadata could be of."""
     reading = reading or Reading()
     if not paths:
         raise ValueError("expected one scan or more, found none")
@@ -171,6 +171,8 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     streams = [path for path in expanded if is_stream(path)]
     if reading.topic is not None and not streams:
         raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
+    if reading.metadata is not None and not any(map(is_capture, streams)):
+        raise ValueError(f"expected a capture for --metadata {reading.metadata}, found none")
     files = [FileInput(name, path, reading) for name, path in _names(expanded)]
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)

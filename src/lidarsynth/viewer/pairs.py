@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lidarsynth.data.capture import is_capture
 from lidarsynth.verbs.inputs import Reading, is_stream
 from lidarsynth.viewer.page import Entry
 from lidarsynth.viewer.series import Files, Series, series_of
@@ -20,9 +21,8 @@ def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dic
     """
     if other is None:
         return {_caption(paths): series_of(paths, reading)}
-    plain = replace(reading, topic=None)  # a topic is of whichever is a bag or a capture
-    scans = series_of(paths, plain if is_stream(other) and not any(map(is_stream, paths)) else reading)
-    partners = series_of([other], reading if is_stream(other) else plain)
+    scans = series_of(paths, _own(paths, [other], reading))
+    partners = series_of([other], _own([other], paths, reading))
     if isinstance(scans, Files) and isinstance(partners, Files):
         partners = _by_name(scans, partners)
     if None not in (scans.count, partners.count) and scans.count != partners.count:
@@ -31,6 +31,13 @@ def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dic
         )
     first, second = _caption(paths), _caption([other])
     return {first: scans, second if second != first else str(other): partners}
+
+
+def _own(paths: Sequence[Path], others: Sequence[Path], reading: Reading) -> Reading:
+    """The reading without a topic or metadata where these are of the others: bags or captures, and captures."""
+    topic = any(map(is_stream, paths)) or not any(map(is_stream, others))
+    metadata = any(map(is_capture, paths)) or not any(map(is_capture, others))
+    return replace(reading, topic=reading.topic if topic else None, metadata=reading.metadata if metadata else None)
 
 
 def _caption(paths: Sequence[Path]) -> str:
@@ -46,19 +53,29 @@ def _by_name(scans: Files, partners: Files) -> Files:
     return Files(scans.names, [partners.paths[i] for i in order], partners.reading)
 
 
-def entries(series: Mapping[str, Series]) -> Iterator[Entry]:
-    """Every stop with its scans. Raises ValueError beyond MOST scans, and what reading one does."""
+def entries(series: Mapping[str, Series], broken: list[str]) -> Iterator[Entry]:
+    """Every stop with its scans; those of which one cannot be read are left out, and what is wrong with it put on
+    `broken`. Raises ValueError beyond MOST scans, and where all are broken."""
     first = next(iter(series.values()))
     if (first.count or 0) * len(series) > MOST:
         raise ValueError(f"expected at most {MOST} scans for one file, found {(first.count or 0) * len(series)}; name "
                          "fewer, or leave out --out")  # fmt: skip
-    number = 0
+    number = shown = 0
     while first.count is None or number < first.count:
-        try:
-            versions = {caption: scans[number] for caption, scans in series.items()}
-        except IndexError:
-            return
         number += 1
-        if number * len(series) > MOST:
+        try:
+            versions = {caption: scans[number - 1] for caption, scans in series.items()}
+        except IndexError:
+            break
+        except (ValueError, OSError) as error:
+            if any(len(scans.names) < number for scans in series.values()):
+                raise  # not this scan is broken, but what it is read from: there is no next one
+            broken.append(str(error))
+            continue
+        shown += 1
+        if shown * len(series) > MOST:
             raise ValueError(f"expected at most {MOST} scans for one file, found more; name fewer, or leave out --out")
         yield Entry(first.names[number - 1], versions)
+    if broken and not shown:
+        raise ValueError(broken[0] if len(broken) == 1 else f"expected scans, found all {len(broken)} broken; the "
+                         f"first: {broken[0]}")  # fmt: skip

@@ -14,7 +14,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from lidarsynth.viewer.packing import packed
+from lidarsynth.viewer.packing import Shown, packed
 from lidarsynth.viewer.page import LIVE, page, settings_of
 from lidarsynth.viewer.series import Series
 
@@ -42,7 +42,7 @@ class Show:
 def serve(show: Show, port: int = 0) -> ThreadingHTTPServer:
     """A server on 127.0.0.1 and a free port (or `port`), bound and not yet running; `address` is where the page is.
 
-    Raises ValueError where the first scan cannot be read, or the port cannot be had.
+    Raises ValueError where no scan can be read, or the port cannot be had.
     """
     nonce = secrets.token_urlsafe(12)
     text = page(_settings(show), nonce).encode()
@@ -61,12 +61,24 @@ def address(server: ThreadingHTTPServer, show: Show) -> str:
 
 def _settings(show: Show) -> dict[str, Any]:
     first = next(iter(show.series.values()))
-    try:
-        shown = first[0]
-    except IndexError:
-        raise ValueError(f"{show.title}: expected a scan, found none") from None
+    shown = _first_whole(first, show.title)
     names = {"names": list(first.names), "count": first.count, "captions": list(show.series)}
     return settings_of(shown, show.title) | names
+
+
+def _first_whole(series: Series, title: str) -> Shown:
+    """The first scan that can be read. Raises ValueError where none can, of the first of them."""
+    wrong: Exception | None = None
+    number = 0
+    while True:
+        try:
+            return series[number]
+        except IndexError:
+            raise wrong or ValueError(f"{title}: expected a scan, found none") from None
+        except (ValueError, OSError) as error:
+            wrong, number = wrong or error, number + 1
+            if len(series.names) < number:
+                raise wrong from None  # what the scans are read from is broken: there is no next one
 
 
 class _Handler(BaseHTTPRequestHandler):
