@@ -3,6 +3,7 @@
 python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of real scans, against the best interpolation
     --returned: hidden pixels where the truth returned alone, empty ones in the result counting as 0 m
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
+python benchmarks/any_sensor.py floating SCAN...    new points where no surface is, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
 python benchmarks/any_sensor.py dense [--sensor vlp-16]   held-out streets in four times as many beams
 python benchmarks/any_sensor.py responses           reflectance of held-out streets, reported in ways never trained on
@@ -18,6 +19,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 import lidarsynth as ls
 from lidarsynth.lidar.scan import RangeImage
@@ -27,6 +29,7 @@ from lidarsynth.streets.virtual import SHARING, VirtualStreets
 
 RIVALS = ("nearest", "bilinear", "bicubic")
 NEAR, FREE = 5.0, 1.25  # metres; a truth so many times as far, or none, proves a near point wrong
+FLOATING = (0.5, 0.03)  # metres, and share of its range, by which a point is off all that was measured
 ON_GROUND = 0.25  # metres above flat ground under the sensor, at most, of what lies on it
 HELD_OUT = 777_001  # a seed that nothing was trained on
 loaded = cache(ls.load)
@@ -92,6 +95,25 @@ def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
     for word, found in counts.items():
         nothing, ground, far = np.mean(found, 0)
         yield f"| {word} | {nothing:.0f} | {ground:.0f} | {far:.0f} | {np.median(np.array(found)[:, ::2].sum(1)):.0f} |"
+
+
+def floating(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+    """New points farther than 0.5 m, and 3 % of their range, from every point of the whole scan; and how far new points
+    are from the nearest one on average."""
+    rows: dict[str, list[tuple[float, float, float]]] = {word: [] for word in (*RIVALS, *models)}
+    for image in map(own_image, paths):
+        known, measured = every(image, 4), KDTree(image.sensor.points(image.range)[image.mask])
+        for word, found in rows.items():
+            filled = completed(word, image, known)
+            new = filled.mask & ~known
+            off, _ = measured.query(image.sensor.points(filled.range)[new])
+            least, share = FLOATING
+            found.append((int((off > np.maximum(least, share * filled.range[new])).sum()), len(off), float(off.mean())))
+    yield "| model | floating | of new points | metres from the nearest measured one |"
+    yield "|---|---|---|---|"
+    for word, found in rows.items():
+        count, total, off = np.mean(found, 0)
+        yield f"| {word} | {count:.0f} | {100 * count / total:.1f} % | {off:.3f} |"
 
 
 def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
@@ -165,6 +187,7 @@ def _firsts(count: int) -> range:
 REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str]], Iterator[str]]] = {
     "errors": errors,
     "phantoms": phantoms,
+    "floating": floating,
     "shadow": shadow,
 }
 

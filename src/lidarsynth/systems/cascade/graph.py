@@ -11,6 +11,7 @@ from lidarsynth.networks.fill_unet import NOISES, Known
 from lidarsynth.networks.rays import COLUMNS, Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
 from lidarsynth.systems.cascade.confidence import confidence
+from lidarsynth.systems.cascade.floating import onto_surfaces
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.response import AS_STREETS, USUAL
 from lidarsynth.systems.cascade.speckle import calmed
@@ -62,7 +63,7 @@ class FillGraph(nn.Module):
         shade = AS_STREETS._replace(plain=0.0 if self.model.tuned else USUAL).mixed(filled)
         shade = shade[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
         answers = returned | (answers & ~told)
-        full = torch.where(answers, torch.where(returned, range, metres), 0.0)
+        full = onto_surfaces(torch.where(answers, torch.where(returned, range, metres), 0.0), told)
         light = torch.where(answers, torch.where(returned, reflectance, shade), 0.0)
         if weights is None:
             return full, light

@@ -27,6 +27,7 @@ from lidarsynth.streets.hdl64e import hidden, written_out
 from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.cascade.floating import settled
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
 from lidarsynth.systems.cascade.holes import Told, with_holes_drawn
 from lidarsynth.systems.cascade.images import (
@@ -185,7 +186,7 @@ class CascadeModel(AnySensorModel):
                 response = tried(own.response, fill, image, known, reflectance, rays, self.tuned)
             own = replace(own, response=response)
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
-        filled = straight_in_gaps(filled, told) if noise is None else filled
+        filled = straight_in_gaps(settled(filled, image, told), told) if noise is None else filled
         shade = own.response.straightened(own.response.reported(filled.reflectance), image, known)
         filled = replace(filled, reflectance=shade * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), image, known, keep_reflectance=lit)
