@@ -1,9 +1,6 @@
 """Networks in the place of trained ones."""
 
-import math
-
 import torch
-from torch import Tensor
 
 from lidarsynth.experiment.record import Data, Experiment, Model
 from lidarsynth.lidar.sensor import Sensor
@@ -28,21 +25,3 @@ def tiny_cascade(sensor: Sensor) -> CascadeModel:
     data = Data(sensor=sensor.to_dict(), height=sensor.height, width=sensor.width)
     experiment = Experiment("tiny", data, shape)
     return CascadeModel(trained(experiment), sensor, experiment)  # type: ignore[arg-type]
-
-
-def angle_queries(elevation: Tensor, azimuth: Tensor, size: tuple[int, int], min_v: float, max_v: float) -> Tensor:
-    """Queries (h w, 2), row by row, for directions given by elevations (h,) and azimuths (w,), in radians.
-
-    size          H, W of the image that is asked
-    min_v, max_v  elevations of its first and its last row, radians; its columns begin at azimuth -pi and ascend
-
-    Equal to the published program's to 2.4e-7. That matters nowhere in ILN; LIIF's answer in line with the centres of
-    border pixels is a ratio of such roundings, in the published program too.
-    """
-    height, width = size
-    step = (max_v - min_v) / (height - 1)
-    v = 2 * (elevation - (min_v - step / 2)) / (max_v - min_v + step) - 1
-    turned = azimuth + math.pi / width
-    turned = torch.where(turned >= math.pi, turned - 2 * math.pi, turned)
-    h = 2 * (turned + math.pi) / (2 * math.pi) - 1
-    return torch.stack(torch.meshgrid(v, h, indexing="ij"), dim=-1).flatten(0, 1)

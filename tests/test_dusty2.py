@@ -9,7 +9,7 @@ from oracle import assert_close
 from test_gan import TOLERANCE, check_discriminator, check_structure, load
 
 from lidarsynth.networks.gan.dusty2 import Discriminator, Generator, unshift
-from lidarsynth.networks.gan.modulated import RandomFourierFeatures
+from lidarsynth.networks.gan.modulated import RandomFourierFeatures, circle, resize_angles
 
 SMALL, FULL = "gan_dusty_v2_small", "gan_dusty_v2_full"
 
@@ -166,3 +166,12 @@ def test_fourier_features_close_on_the_ring_in_the_bands_of_the_paper():
     turn = angles + torch.tensor([0, 2 * math.pi]).view(1, 2, 1, 1)
     features = RandomFourierFeatures((4, 32))
     assert_close(features(turn), features(angles), atol=2e-5, rtol=0)
+
+
+def test_angle_tables_resize_as_the_reference(fixture_tensors):
+    expected = fixture_tensors("gan_coords")
+    rows, columns = expected["table_elevation_64"], expected["table_azimuth_2048"]
+    table = torch.stack(torch.meshgrid(rows, columns, indexing="ij"))[None]
+    assert_close(resize_angles(table, (64, 512)), expected["angle_64x512"], atol=1e-5, rtol=0)
+    assert_close(resize_angles(table, (64, 2048))[:, :, 0], expected["angle_64x2048_row0"], atol=1e-5, rtol=0)
+    assert_close(circle(table)[:, 2:].square().sum(1), torch.ones(1, 64, 2048))

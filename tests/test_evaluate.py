@@ -15,19 +15,20 @@ from forked import Forked
 
 import lidarsynth as ls
 from lidarsynth.cli.main import main
-from lidarsynth.data.dataset import write_cache
+from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation import evaluate as evaluation
-from lidarsynth.evaluation.image_sets import image_set
+from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.pairs import Pairs
 from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING, STREET_1
 from lidarsynth.evaluation.report import Result
 from lidarsynth.evaluation.statistics import load_statistics
 from lidarsynth.files.formats import write
-from lidarsynth.lidar.projection import thin
+from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.verbs.learned_sensor import sensor_toml
 
 SENSOR = SENSORS["hdl-64e"].resized(width=64)
 
@@ -645,3 +646,32 @@ def test_the_verb_gathers_parts_and_refuses_in_one_line(tmp_path: Path, real: Pa
     ):
         code, _, error = run("evaluate", *words)
         assert code == 2 and reason in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(("projection", "wide"), [("unfolding", 2048), ("spherical", 1024)])
+def test_whole_scans_are_drawn_into_narrow_images_as_training_images_are(projection: str, wide: int):
+    """At the published programs' width, and thinned: with a turn's ray-drop; images as points stay whole."""
+    sensor = replace(SENSORS["hdl-64e-kitti"].resized(width=128), name="hdl-64e-kitti")
+    scan = street(3, SENSORS["hdl-64e-kitti"]).to_scan()
+    drawn = as_image(scan, sensor, projection)
+    expected = thin(project(scan, SENSORS["hdl-64e-kitti"], projection, wide), width=128)
+    np.testing.assert_array_equal(drawn.range, expected.range)
+    assert drawn.mask.mean() < 0.95 * project(scan, sensor, projection).mask.mean()
+    again = as_image(drawn.to_scan(), sensor, projection)
+    assert again.mask.sum() > 0.99 * drawn.mask.sum()
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3, 0.5])
+def test_a_sensor_of_few_columns_keeps_its_points(turned: float, tmp_path: Path):
+    """Wherever in its columns it looks: in a cache, and where it is judged."""
+    sensor = replace(SENSORS["os1-64"].resized(width=512), name="mine")
+    scan, angle = street(4, sensor).to_scan(), turned * 2 * np.pi / 512
+    turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    scan = replace(scan, xyz=(scan.xyz @ turn).astype(np.float32))
+    (tmp_path / "scans").mkdir()
+    write(tmp_path / "scans" / "0.pcd", scan)
+    (tmp_path / "mine.toml").write_text(sensor_toml(sensor), "utf-8")
+    main(["data", "files", str(tmp_path / "scans"), str(tmp_path / "cache"), "--sensor", str(tmp_path / "mine.toml")])
+    cached = CachedImages(tmp_path / "cache")[0]
+    for image in (as_image(scan, sensor, "auto"), cached):
+        assert image.mask.sum() > 0.9 * len(scan)

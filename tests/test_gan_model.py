@@ -103,11 +103,11 @@ def test_what_a_gan_cannot_do_is_said(model: GanModel):
     with pytest.raises(ValueError, match="expected n, steps and batch_size of at least 1, found 0"):
         model.generate(0)
     image = model.generate(1)[0]
-    with pytest.raises(ValueError, match="expected a method of auto, inversion, found 'repaint'"):
+    with pytest.raises(ValueError, match="expected a method of auto, inversion, w-plus, pivotal, found 'repaint'"):
         model.complete(image, method="repaint")
     with pytest.raises(ValueError, match="expected no sampler"):
         model.complete(image, sampler="ddim")
-    with pytest.raises(ValueError, match="expected at least one known pixel with a return, found none"):
+    with pytest.raises(ValueError, match=r"expected points within .*'s view, found none of \d+ points"):
         model.complete(image, np.zeros(image.shape, bool), steps=1)
     with pytest.raises(ValueError, match=r"data.codec: expected inverse or inverse-minmax for .*, found 'log'"):
         build_network(with_fields(model.experiment, {"data.codec": "log"}))
@@ -136,6 +136,35 @@ def test_inversion_finds_its_own_image_again(model: GanModel):
     assert errors[0] < 0.8 * errors[1]
     again = model.complete(before, known, steps=1)
     np.testing.assert_array_equal(again.range, start.range)
+
+
+def test_the_nearest_that_can_be_said_is_a_return():
+    """Both limits count, as in the published program: outputs of 1 and more are min_range."""
+    model = model_of(tiny("vanilla-gan"))
+    near, far = model.sensor.min_range, model.sensor.max_range
+    outputs = torch.tensor([1.0, 1.2, 0.0, 2.001 * near / far - 1, 1.999 * near / far - 1, -1.0])
+    image = model._image(outputs.repeat(11)[:64].expand(1, 32, 64))
+    np.testing.assert_allclose(image.range[0, :6], [near, near, 2 * near, far, 0, 0], rtol=1e-3)
+    np.testing.assert_array_equal(image.range[0, :2], np.float32(near))
+
+
+@pytest.mark.parametrize("method", ["w-plus", "pivotal"])
+def test_more_of_an_inversion_is_free_to_move(method: str, model: GanModel):
+    """A style per layer, or all weights of a copy: nearer to what is known than by one style alone."""
+    truth = model.generate(1, seed=11)[0]
+    known = corrupt(truth, "beams:2", 0)
+    before, weights = truth.keep(known), {k: v.clone() for k, v in model.network.state_dict().items()}
+    if model.network.angles is None and method == "w-plus":
+        with pytest.raises(ValueError, match="expected w-plus of a network with styles"):
+            model.complete(before, known, method=method)
+        return
+    calls: list[int] = []
+    filled = model.complete(before, known, method=method, steps=8, on_step=lambda: calls.append(1))
+    assert len(calls) == model.evaluations(method=method, steps=8) == (16 if method == "pivotal" else 8)
+    np.testing.assert_array_equal(filled.range[known], truth.range[known])
+    plain = model.complete(before, known, steps=8)
+    assert (filled.range[~known] != plain.range[~known]).any()
+    assert all(torch.equal(value, weights[key]) for key, value in model.network.state_dict().items())
 
 
 def test_inversion_tells_which_rays_of_a_simulation_return():

@@ -4,12 +4,11 @@ import json
 
 import pytest
 import torch
-from networks import angle_queries
 from oracle import assert_close, largest
 from procedural_weights import upsampling_weights
 from torch import Tensor
 
-from lidarsynth.networks.iln import ILN, LIIF, from_official, neighbours, pixel_centres
+from lidarsynth.networks.iln import ILN, LIIF, angle_queries, from_official, neighbours, pixel_centres
 
 DEPTHS = {"iln_0d_full": 0, "iln_1d_full": 1}
 FIXTURES = [*DEPTHS, "iln_liif_full"]

@@ -1,16 +1,22 @@
 """Interpolation: closed forms, a pixel-by-pixel second implementation, and the published resizers."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+import lidarsynth as ls
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.networks.interpolation import (
     METHODS,
     fill_in,
     interpolate,
     nearest_along_axes,
     nearest_around,
+    resize_rows,
+    sample_queries,
 )
+from lidarsynth.systems.interpolation.model import interpolated
 
 
 def rows_mask(shape: tuple[int, int, int, int], *rows: int) -> Tensor:
@@ -150,6 +156,41 @@ def test_bicubic_is_torch_bicubic_at_true_alignment():
     known = torch.zeros(1, 2, 32, 6)
     known[:, :, ::4] = x
     torch.testing.assert_close(interpolate(known, mask, "bicubic"), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_resize_rows_equals_opencv_and_torch(fixture_tensors, method):
+    expected = fixture_tensors("iln_interpolation")
+    truth = expected["lidargen.range_m"]
+    resized = resize_rows(truth[:, :, ::4], 64, method)
+    torch.testing.assert_close(resized, expected[f"lidargen.{method}"], atol=1e-4, rtol=0)
+    torch.testing.assert_close(resized, expected[f"torch_interpolate.{method}"], atol=1e-4, rtol=0)
+    torch.testing.assert_close((resized - truth).abs().mean(), expected[f"lidargen.{method}.mae"].squeeze())
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("grid", ["grid_64x64", "grid_40x100"])
+def test_sample_queries_equals_iln(fixture_tensors, method, grid):
+    expected = fixture_tensors("iln_interpolation")
+    result = sample_queries(expected["input"], expected[f"{grid}.queries"], method)
+    torch.testing.assert_close(result, expected[f"{grid}.{method}"].transpose(1, 2), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_resized_beams_are_a_baseline_of_their_own(method):
+    """Nearest ones as blocks of four rows; and only of every k-th beam from the first."""
+    sensor = ls.get_sensor("vlp-16").resized(width=8)
+    metres = np.arange(1, 129, dtype=np.float32).reshape(16, 8)
+    image = RangeImage(metres, metres / 200, np.ones((16, 8), bool), sensor)
+    known = np.zeros((16, 8), bool)
+    known[::4] = True
+    filled = interpolated(image.keep(known), known, f"resized-{method}")
+    pixels = torch.from_numpy(metres[::4])[None, None]
+    np.testing.assert_array_equal(filled.range, resize_rows(pixels, 16, method)[0, 0].clamp(min=0).numpy())
+    if method == "nearest":
+        np.testing.assert_array_equal(filled.range, metres[::4].repeat(4, 0))
+    with pytest.raises(ValueError, match=r"resized-\w+: expected every k-th beam from the first one"):
+        interpolated(image.keep(known), np.roll(known, 1, 0), f"resized-{method}")
 
 
 def test_errors_say_both_sides():

@@ -1,5 +1,6 @@
 """GAN inversion: its losses and steps equal the reference, and it finds the latent of an image; depth conversions."""
 
+import copy
 import math
 
 import pytest
@@ -9,9 +10,12 @@ from oracle import assert_close
 from lidarsynth.networks.gan.dcgan import Generator
 from lidarsynth.networks.gan.inverse_depth import to_depth, to_inverse_depth, to_points
 from lidarsynth.networks.gan.inversion import (
+    geocross,
     invert,
     learning_rate_factor,
     multiscale_loss,
+    squared_distance,
+    tune,
     unit_rms,
 )
 
@@ -25,6 +29,9 @@ def test_losses_equal_the_reference(fixture_tensors):
     for levels in (1, 2, 3):
         loss = multiscale_loss(generated, reference, mask, levels)
         assert_close(loss, expected[f"loss_level{levels}_relative"], **TOLERANCE)
+    squared = multiscale_loss(generated, reference, mask, 2, squared_distance)
+    assert_close(squared, expected["loss_level2_mse_nonrel"], **TOLERANCE)
+    assert_close(geocross(expected["latents"]), expected["geocross"], **TOLERANCE)
     generated.requires_grad_()
     (grad,) = torch.autograd.grad(multiscale_loss(generated, reference, mask).sum(), generated)
     assert_close(grad, expected["loss_level2_relative.grad"], atol=1e-8, rtol=1e-5)
@@ -46,7 +53,7 @@ def test_latent_steps_and_learning_rates_equal_the_reference(fixture_tensors):
         assert_close(latents.detach(), after, **TOLERANCE)
 
 
-def test_inversion_reaches_an_image_of_the_generator():
+def test_inversion_and_tuning_reach_an_image_of_the_generator():
     generator = torch.Generator().manual_seed(0)
     net = Generator((32, 64), 8, 4, 16).eval()
     with torch.no_grad():
@@ -63,6 +70,12 @@ def test_inversion_reaches_an_image_of_the_generator():
     assert torch.equal(fits[0].latents, start)
     assert bool((fits[-1].loss < 0.5 * fits[0].loss).all())
     assert_close(fits[-1].latents.square().mean(1), torch.ones(2))
+    tuned = copy.deepcopy(net)
+    render = lambda z: tuned.synthesize(z).image_orig  # noqa: E731
+    tunes = list(tune(tuned, render, start, reference, mask, LIMITS, steps=30, learning_rate=0.005))
+    assert_close(tunes[0].loss, fits[0].loss)
+    assert torch.equal(tunes[-1].latents, start)
+    assert tunes[-1].loss.sum() < 0.8 * tunes[0].loss.sum()
 
 
 def test_an_inversion_follows_the_schedule_of_learning_rates(monkeypatch: pytest.MonkeyPatch):

@@ -5,7 +5,7 @@ import torch
 from oracle import assert_close
 
 from lidarsynth.networks.gan.dcgan import Discriminator, Generator
-from lidarsynth.networks.gan.iros21 import generator_weights
+from lidarsynth.networks.gan.iros21 import discriminator_weights, generator_weights, uniform_noise
 from lidarsynth.networks.gan.losses import r1_penalty
 
 TOLERANCE = {"atol": 1e-5, "rtol": 1e-5}
@@ -15,18 +15,12 @@ def weights(tensors, prefix: str) -> dict[str, torch.Tensor]:
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
 
-def logistic_uniform(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Two uniforms in [0, 1), any shape -> the one whose logit is the release's logistic noise."""
-    tiny = 1e-10
-    return torch.sigmoid(-torch.log((first + tiny).log() / (second + tiny).log() + tiny))
-
-
 @pytest.mark.parametrize(("name", "raydrop"), [("gan_iros21_vanilla", False), ("gan_iros21_dusty1", True)])
 def test_generator_equals_the_reference(fixture_tensors, name, raydrop):
     expected = fixture_tensors(name)
     net = Generator((64, 128), 16, 4, 16, raydrop, bounded=True).eval()
     net.load_state_dict(generator_weights(weights(expected, "G_ema.")), strict=True)
-    uniform = logistic_uniform(expected["uniform0.u1"], expected["uniform0.u2"]) if raydrop else None
+    uniform = uniform_noise(expected["uniform0.u1"], expected["uniform0.u2"]) if raydrop else None
     z = expected["z"].requires_grad_()
     out = net(z, uniform)
     assert_close(out.image.detach(), expected["eval.depth"], **TOLERANCE)
@@ -42,8 +36,7 @@ def test_generator_equals_the_reference(fixture_tensors, name, raydrop):
 def test_discriminator_equals_the_reference(fixture_tensors, name):
     expected = fixture_tensors(name)
     net = Discriminator((64, 128), 4, 16, vertical="reflect").eval()
-    state = weights(expected, "D.")  # its blur filters are images of three pixels
-    net.load_state_dict({k: v.flatten() if k.endswith("kernel") else v for k, v in state.items()}, strict=True)
+    net.load_state_dict(discriminator_weights(weights(expected, "D.")), strict=True)
     images = expected["d_input"].requires_grad_()
     logits = net(images)
     assert_close(logits.detach(), expected["d_output"], **TOLERANCE)

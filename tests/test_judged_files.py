@@ -47,6 +47,23 @@ def stored(path: Path, **changed: np.ndarray) -> None:
     np.savez(path, sensor=np.array(json.dumps(SENSOR.to_dict())), **arrays)  # type: ignore[arg-type]
 
 
+def batch(path: Path, seeds: range) -> list[RangeImage]:
+    images, keys = [street(seed) for seed in seeds], ("range", "reflectance", "mask")
+    stored(path, **{key: np.stack([getattr(image, key) for image in images]) for key in keys})
+    return images
+
+
+def test_a_batch_that_is_written_anew_is_read_anew(tmp_path: Path):
+    """Under the stamp of the new file, its statistics would be kept on disk."""
+    for seeds in (range(2), range(2, 4)):
+        images = batch(tmp_path / "b.npz", seeds)
+        found = image_set(tmp_path)
+        for i in (0, 1):
+            read = found.item(i)
+            assert isinstance(read, RangeImage)
+            np.testing.assert_array_equal(read.range, images[i].range)
+
+
 @pytest.mark.parametrize("scale", [100, 1000])
 def test_ranges_in_other_units_than_metres_are_refused(scale: int, tmp_path: Path):
     real, folder = saved(tmp_path / "real", range(2)), tmp_path / "other"

@@ -8,7 +8,7 @@ from oracle import assert_close
 from procedural_weights import procedural_uniform, upsampling_weights
 from torch import Tensor
 
-from lidarsynth.networks.lidar_sr import LidarSR, from_keras, from_official, mc_dropout, remove_uncertain
+from lidarsynth.networks.lidar_sr import LidarSR, copy_measured, from_keras, from_official, mc_dropout, remove_uncertain
 
 SMALL = {"lsr_4h1w_small": (4, 1), "lsr_8h2w_small": (8, 2)}
 STAGES = ("up_scale", "down1", "down3", "downup", "up1", "up3")
@@ -86,6 +86,8 @@ def test_the_removal_rule_equals_the_reference(fixture_tensors, fixture):
     assert torch.equal(remove_uncertain(expected["filter.mean"], expected["filter.std"]), expected["filter.output"])
     filtered = remove_uncertain(expected["mc.mean"], expected["mc.std"])
     assert torch.equal(filtered, expected["mc.filtered"])
+    if "mc.filtered_copied" in expected:
+        assert torch.equal(copy_measured(filtered, expected["input"][0]), expected["mc.filtered_copied"])
 
 
 @pytest.mark.parametrize(("fixture", "scale"), SMALL.items())
@@ -169,6 +171,8 @@ def test_errors_say_both_sides(fixture_tensors):
         LidarSR((2, 4))
     with pytest.raises(ValueError, match="evaluation mode and at least 1 pass, got training mode and 50"):
         mc_dropout(network, torch.zeros(1, 1, 4, 16), torch.Generator())
+    with pytest.raises(ValueError, match=r"a multiple of 4 rows of 8, got \(6, 8\)"):
+        copy_measured(torch.zeros(6, 8), torch.zeros(4, 8))
     stored = fixture_tensors("lsr_4h1w_small")
     with pytest.raises(ValueError, match="checkpoint of 'lsr' in the format of ILN's repository, found one of 'iln'"):
         from_official(official(stored, "iln"))

@@ -326,10 +326,22 @@ def test_the_chamfer_distance_of_pairs_is_half_of_both_squared_means():
         distance = (rng.uniform(0.5, 70, mask.shape) * mask).astype(np.float32)
         images.append(RangeImage(distance, distance * 0, mask, sensor))
     value = evaluate.evaluate(images[:2], images[2:], "lidm-reconstruction-2024").values["CD"]
-    clouds = [i.points()[(i.range > 1) & (i.range < 56)] for i in images]
+    clouds = [i.points()[(i.range > 1) & (i.range < 56)] for i in images[:2]]
+    clouds += [decoded(i.range, 1, 56) for i in images[2:]]  # images of LiDM's grid are drawn already
     expected = [point_errors(clouds[i], clouds[i + 2]).chamfer_squared / 2 for i in (0, 1)]
     assert value == pytest.approx(np.mean(expected), rel=1e-4)
     assert LIDM_RECONSTRUCTION.pairs
+
+
+def test_a_perfect_reconstruction_has_no_distance(tmp_path: Path):
+    """The reference goes through LiDM's image and range code, and points of samples stay as they are."""
+    real, samples = folder_of_scans(tmp_path / "real", 2, 0), tmp_path / "samples"
+    samples.mkdir()
+    for path in sorted(real.glob("*.bin")):
+        xyz = drawn_and_coded(np.fromfile(path, np.float32).reshape(-1, 4)[:, :3], 1, 56).astype(np.float32)
+        np.concatenate([xyz, np.zeros((len(xyz), 1), np.float32)], 1).tofile(samples / path.name)
+    report = evaluate.evaluate(samples, real, "lidm-reconstruction-2024")
+    assert report.values["CD"] == pytest.approx(0, abs=1e-9)
 
 
 def test_scans_without_points_in_range_are_named(tmp_path: Path, published: Path):

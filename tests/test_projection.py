@@ -164,6 +164,18 @@ def test_unfolding_of_incomplete_scans_follows_the_published_rule(incomplete, ca
     np.testing.assert_array_equal(rows, published_rows(points[:, :3], 64))
 
 
+def test_rings_too_many_go_where_the_published_program_has_them(points64):
+    """The 65th from the end becomes row -1, which is the last; those before it keep row 0."""
+    rings, count = ring_of_points(scan_of(points64))
+    first = points64[rings == 0]
+    assert count == 64 and len(first) > 1000
+    rows = row_of_points(scan_of(np.concatenate([first, points64])), get_sensor("hdl-64e"), "unfolding")
+    np.testing.assert_array_equal(rows[len(first) :], np.maximum(rings, 0))
+    assert (rows[: len(first)] == 63).mean() > 0.99
+    rows = row_of_points(scan_of(np.concatenate([first, first, points64])), get_sensor("hdl-64e"), "unfolding")
+    assert (rows[: len(first)] == 0).mean() > 0.99 and (rows[len(first) : 2 * len(first)] == 63).mean() > 0.99
+
+
 def test_auto_never_unfolds_rings_onto_the_even_grid():
     """The rows of R2DM's grid are no beams of a unit: a ring belongs where its points are."""
     sensor = SENSORS["hdl-64e-kitti"]

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lidarsynth.metrics.knn import knn_labels, smooth_labels
 from lidarsynth.networks.rangenet import RangeNet, frechet_features, frechet_positions
 from lidarsynth.networks.rangenet_archive import read_rangenet
 from lidarsynth.networks.tensors import load_weights
@@ -190,6 +191,27 @@ def test_weights_may_lack_the_counters_but_nothing_else():
     ):
         with pytest.raises(ValueError, match=message):
             load_weights(network, state | change, "here", counters=True)
+
+
+def test_knn_equals_the_reference_exactly(fixture_tensors):
+    t = fixture_tensors("rangenet/knn")
+    for size in (3, 5):
+        points = knn_labels(t["proj_range"], t["proj_argmax"], t["py"], t["px"], t["unproj_range"], k=size, search=size)
+        assert torch.equal(points, t[f"original.k{size}.search{size}"])
+        image = smooth_labels(t["proj_range"], t["proj_argmax"], k=size, search=size)
+        assert torch.equal(image, t[f"simplified.k{size}.search{size}"])
+
+
+def test_knn_keeps_a_uniform_surface_and_separates_by_range():
+    ranges, labels = torch.full((8, 8), 10.0), torch.full((8, 8), 13)
+    ranges[:, 4:], labels[:, 4:] = 30.0, 9
+    row, column = torch.meshgrid(torch.arange(8), torch.arange(8), indexing="ij")
+    points = knn_labels(ranges, labels, row.flatten(), column.flatten(), ranges.flatten())
+    assert torch.equal(points.view(8, 8), labels)
+    behind = knn_labels(ranges, labels, torch.tensor([4]), torch.tensor([3]), torch.tensor([30.2]))
+    assert behind.tolist() == [9], "a point behind the edge takes the label of what lies as far"
+    with pytest.raises(ValueError, match="search 4 and k 5"):
+        knn_labels(ranges, labels, row, column, ranges, search=4)
 
 
 @pytest.mark.parametrize(

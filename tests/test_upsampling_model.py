@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from networks import angle_queries
 from oracle import assert_close
 from torch import Tensor
 
@@ -19,7 +18,7 @@ from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.networks.iln import ILN, LIIF
+from lidarsynth.networks.iln import ILN, LIIF, angle_queries
 from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated

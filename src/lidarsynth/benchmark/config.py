@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from lidarsynth.experiment.record import from_dict
 from lidarsynth.lidar.small_file import read_toml
-from lidarsynth.networks.interpolation import METHODS as INTERPOLATIONS
+from lidarsynth.networks.interpolation import METHODS, RESIZED
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class UpsamplingMethod:
     """One row of a table of upsampling, or one for each of several `steps`. It has an interpolation or a model."""
 
     name: str
-    interpolation: str | None = None  # nearest | bilinear | bicubic
+    interpolation: str | None = None  # nearest | bilinear | bicubic, or as images are enlarged: resized-nearest ...
     model: str | None = None  # whatever `load` takes
     method: str | None = None  # of the model's `complete`: conditional | repaint; None = its own
     steps: int | tuple[int, ...] | None = None  # None = the model's own
@@ -163,8 +163,8 @@ def _check_source(method: Any, where: str) -> None:
         raise ValueError(f"{where}: expected one of {', '.join(SOURCES[type(method)])}, "
                          f"found {' and '.join(given) or 'none'}")  # fmt: skip
     word = getattr(method, given[0])
-    if given[0] == "interpolation" and word not in INTERPOLATIONS:
-        raise ValueError(f"{where}.interpolation: expected one of {', '.join(INTERPOLATIONS)}, found {word!r}")
+    if given[0] == "interpolation" and word not in (*METHODS, *RESIZED):
+        raise ValueError(f"{where}.interpolation: expected one of {', '.join((*METHODS, *RESIZED))}, found {word!r}")
     if given[0] != "model":
         model_only = ("method", "steps", "resamples", "sampler", *(() if given[0] == "noise" else ("count",)))
         if useless := [key for key in model_only if getattr(method, key, None) is not None]:

@@ -18,10 +18,12 @@ from lidarsynth.data.index import INDEX, REPORT, read_index, report
 from lidarsynth.data.kitti import kitti
 from lidarsynth.data.kitti360 import kitti360
 from lidarsynth.data.nuscenes import NuScenes, nuscenes
-from lidarsynth.lidar.projection import PROJECTIONS, project, thin
+from lidarsynth.data.street_caches import begins_alike
+from lidarsynth.lidar.projection import PROJECTIONS, columns_of, project_thinned
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.streets.edition import EDITION
 
 __all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "prepare", "scan_files", "summary"]
 
@@ -62,13 +64,7 @@ class Projected:
     columns: int
 
     def __call__(self, i: int) -> RangeImage:
-        return thin(project(self.reader[i], self.sensor, self.projection, self.columns), width=self.sensor.width)
-
-
-def columns_of(projection: str, width: int) -> int:
-    """Columns to draw at before thinning to `width`: R2DM's 2048 for unfolding and 1024 else, where `width` is below
-    1024; so a narrow image keeps the ray-drop of a turn instead of the nearest point of many."""
-    return width if width >= 1024 else 2048 if projection == "unfolding" else 1024
+        return project_thinned(self.reader[i], self.sensor, self.projection, self.columns)
 
 
 def prepare(
@@ -133,8 +129,9 @@ def cache_source(
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
-    reader, columns = _reader(name, Path(root), split, intensity), columns_of(projection, width)
-    spec = _sensor(sensor or own.sensor or _recognised(reader), width)
+    reader = _reader(name, Path(root), split, intensity)
+    word = sensor or own.sensor or _recognised(reader)
+    spec, columns = _sensor(word, width), columns_of(projection, width, get_sensor(word).width)
     image = Projected(reader, spec, projection, columns)
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
     source |= {} if intensity == "auto" else {"intensity": intensity}
@@ -157,12 +154,15 @@ def cache_synthetic(
     """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`.
 
     apart  a world for each of them, for sets that are compared; else sixteen places in each, many times faster
+    A cache that tells no edition of its streets, as those of before 2026-11-26, is gone on with where it begins as
+    today's streets do. Raises ValueError for one of other streets.
     """
     from lidarsynth.streets.reader import SyntheticStreets
 
     spec = _sensor(sensor, width)
     streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart)
     source = {"name": "synthetic", "seed": seed} | ({"apart": True} if apart else {})
+    source |= {} if begins_alike(Path(folder), source, streets) else {"edition": EDITION}
     for done in write_cache(folder, streets.image, count, spec, source, workers=_processes(workers), check=check):
         yield done, count
 

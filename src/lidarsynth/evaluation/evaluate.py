@@ -37,6 +37,7 @@ from lidarsynth.networks.device import check_device
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
+THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
 
@@ -138,10 +139,14 @@ class _Run:
                 fresh.restore(read_json(unfinished, LARGEST_INDEX))
                 pairs = fresh
         saved = time.monotonic()
-        for start in range(len(pairs.errors), len(judged), self.batch_size):
+        for start in range(pairs.count, len(judged), self.batch_size):
             numbers = range(start, min(start + self.batch_size, len(judged)))
-            batch = ([of.image(i, sensor, projection, of is truth) for i in numbers] for of in (judged, truth))
-            pairs.update(*batch)
+            if (clouds := self.protocol.clouds) is not None:
+                points = ([of.points(i, sensor, clouds, of is truth) for i in numbers] for of in (judged, truth))
+                pairs.update_points(*points)
+            else:
+                batch = ([of.image(i, sensor, projection, of is truth) for i in numbers] for of in (judged, truth))
+                pairs.update(*batch)
             if self.on_images:
                 self.on_images("pairs", numbers.stop, len(judged))
             if unfinished and time.monotonic() - saved > accumulation.SAVE_EVERY:
@@ -167,6 +172,7 @@ class _Run:
         chosen = select(self.protocol, role, images.names, count)
         numbers = part_of(chosen.numbers(), part)
         identity = [definition(self.protocol), role, sensor.to_dict(), images.stamp, loaded.weights, numbers]
+        identity += [] if sensor.width >= 1024 else [THINNED]  # drawn otherwise before
         limits = [sorted(part) for part in (chosen.features, chosen.bev, chosen.sets)]
         key = sha256(repr([*identity, *limits]).encode()).hexdigest()[:16]
         kept = cache_folder() / "statistics" / f"{self.protocol.name}-{key}{ENDING}" if images.stamp else None

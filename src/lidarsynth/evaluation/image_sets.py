@@ -22,7 +22,7 @@ from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import MAX_BYTES, check_metres
 from lidarsynth.files.formats import READERS, holds_image, naming, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
-from lidarsynth.lidar.projection import project, thin
+from lidarsynth.lidar.projection import project_thinned, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import check_regular
@@ -163,8 +163,14 @@ def read_item(path: Path, number: int | None = None, intensity: str = "auto") ->
     return read_image(path) if holds_image(path) else read(path, intensity)
 
 
-@lru_cache(maxsize=1)  # images of a batch are read one after the other
 def _batch(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a batch as it is now."""
+    s = path.stat()
+    return _arrays(path, (s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino))
+
+
+@lru_cache(maxsize=1)  # images of a batch are read one after the other
+def _arrays(path: Path, stamp: tuple[int, ...]) -> dict[str, np.ndarray]:
     with naming(path):
         arrays = unzip(path.read_bytes())
     sizes = {name: array.shape[:1] for name, array in arrays.items() if name != "sensor"}
@@ -205,7 +211,7 @@ def as_image(item: Item, sensor: Sensor, projection: str, resize: bool = False) 
     """Any stored form as a range image of the sensor's size. Raises ValueError for another size, NaN, other shapes."""
     size = (sensor.height, sensor.width)
     if isinstance(item, Scan):
-        return project(item, sensor, projection)
+        return project_thinned(item, sensor, projection)
     if isinstance(item, Tensor):
         return from_tensor(item, sensor)
     if item.shape != size and not (resize and _divides(size, item.shape)):

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import nn
 
+from lidarsynth.evaluation.image_sets import points_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.report import Report, Result
-from lidarsynth.evaluation.statistics import hash_of
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.evaluation.statistics import hash_of, hash_of_points
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.metrics.reconstruction import (
     Errors,
@@ -54,11 +55,27 @@ class Pairs:
         for result, truth in zip(results, truths, strict=True):
             self.errors.append(reconstruction_errors(result, truth))
             if self.chamfer is not None:
-                self.chamfer.append(_chamfer(result, truth, self.protocol))
+                self.chamfer.append(_chamfer(self._points(result, False), self._points(truth, True)))
             self.lit |= bool(result.reflectance.any())
             self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:
             self.confusion += confusion_matrix(self._labels_of_truths(truths), self._labels(results))
+
+    def update_points(self, results: Sequence[Scan], truths: Sequence[Scan]) -> None:
+        """Take in a batch of point lists, as the protocol's `clouds` have them, and their truths."""
+        assert self.chamfer is not None
+        for result, truth in zip(results, truths, strict=True):
+            self.chamfer.append(_chamfer(result.xyz, truth.xyz))
+            self._add_digests([hash_of_points(result), hash_of_points(truth)])
+
+    def _points(self, image: RangeImage, real: bool) -> np.ndarray:
+        assert self.protocol.clouds is not None
+        return points_of(image, image.sensor, self.protocol.clouds, real)
+
+    @property
+    def count(self) -> int:
+        """How many pairs so far."""
+        return len(self.errors if self.chamfer is None else self.chamfer)
 
     def _add_digests(self, digests: Sequence[int]) -> None:
         self._digests = [(own + its) % (1 << 128) for own, its in zip(self._digests, digests, strict=True)]
@@ -110,7 +127,7 @@ class Pairs:
 
     def report(self, missing: Mapping[str, str] | None = None, weights: Mapping[str, str] | None = None) -> Report:
         """The protocol's rows so far. Raises ValueError for no pair."""
-        mean, results = mean_errors(self.errors), []
+        mean, results = None if self.chamfer and not self.errors else mean_errors(self.errors), []
         for row in self.protocol.rows:
             reason = ""
             if row.network and not self.classes:
@@ -119,7 +136,7 @@ class Pairs:
                 reason = "the samples have no reflectance"
             value = None if reason else MEASURES[row.measure](mean, self.confusion, self.chamfer or []) * row.scale
             results.append(Result(row.name, value, row.unit, row.digits, reason))
-        counts = {"samples": len(self.errors), "reference": len(self.errors)}
+        counts = {"samples": self.count, "reference": self.count}
         names = ("samples", "reference")
         hashes = {name: f"{digest:032x}" for name, digest in zip(names, self._digests, strict=True)}
         iou = class_iou(self.confusion, (0,)).tolist() if self.classes and self.lit else []
@@ -127,17 +144,12 @@ class Pairs:
         return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {}, classes=classes)
 
 
-def _chamfer(result: RangeImage, truth: RangeImage, protocol: EvaluationProtocol) -> float:
-    """CD of LiDAR-Diffusion, m^2: half the sum of both mean squared distances between the points in range."""
-    points = []
-    for image in (result, truth):
-        xyz = image.points()[image.mask]
-        distance = np.linalg.norm(xyz, axis=1)
-        points.append(xyz[(distance > protocol.near) & (distance < protocol.far)])
-    return point_errors(points[0], points[1]).chamfer_squared / 2
+def _chamfer(points: np.ndarray, truth: np.ndarray) -> float:
+    """CD of LiDAR-Diffusion, m^2: half the sum of both mean squared distances between points (N, 3) and (M, 3)."""
+    return point_errors(points, truth).chamfer_squared / 2
 
 
-MEASURES: dict[str, Callable[[Errors, np.ndarray, Sequence[float]], float]] = {
+MEASURES: dict[str, Callable[[Any, np.ndarray, Sequence[float]], float]] = {  # of mean errors, confusion, distances
     "range-mae": lambda errors, confusion, chamfer: errors.range_mae,
     "reflectance-mae": lambda errors, confusion, chamfer: errors.reflectance_mae,
     "iou": lambda errors, confusion, chamfer: mean_iou(confusion),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
 PROJECTIONS = ("auto", "spherical", "unfolding")
 # Rows by the order of points are wrong where more than this share of at most so many points lies on other beams, and
@@ -42,6 +42,25 @@ def project(
     row, column = pixel_of_points(scan, sensor, method) if pixels is None else pixels
     pixel = row * sensor.width + column
     return _draw(scan, sensor, depth, pixel, row >= 0)
+
+
+def columns_of(method: str, width: int, own: int) -> int:
+    """Columns to draw at before thinning to `width`: R2DM's 2048 for unfolding and 1024 else, where `width` is below
+    1024 and below the sensor's `own`; so a narrow image keeps the ray-drop of a turn instead of the nearest point of
+    many, and one of a sensor that has no more columns all its points."""
+    return width if width >= min(own, 1024) else 2048 if method == "unfolding" else 1024
+
+
+def project_thinned(scan: Scan, sensor: Sensor, method: str = "auto", columns: int | None = None) -> RangeImage:
+    """`project` as the published programs make their data sets: drawn at `columns`, of which the sensor's are kept.
+
+    columns   None = `columns_of`, for a scan of more points than the sensor has pixels; others are images already, or
+              of a sensor of so few columns
+    Raises ValueError as `project` does.
+    """
+    own = SENSORS.get(sensor.name, sensor).width if len(scan) > sensor.height * sensor.width else sensor.width
+    wide = columns_of(method, sensor.width, own) if columns is None else columns
+    return thin(project(scan, sensor, method, wide), width=sensor.width)
 
 
 def occupied(scan: Scan, sensor: Sensor, pixels: Pixels) -> np.ndarray:
@@ -103,8 +122,10 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
         )
     if scan.ring is not None:
         return np.where(ring < sensor.height, ring, -1)
-    # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows.
-    row = np.where(ring < 0, 0, np.maximum(ring + (sensor.height - count), 0))
+    # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows. One ring too
+    # many goes into the last row, and those before it into the first, as in the published program.
+    row = np.where(ring < 0, 0, ring + (sensor.height - count))
+    row = np.where(row == -1, sensor.height - 1, np.maximum(row, 0))
     return _rows_by_elevation(scan.xyz, sensor) if method == "auto" and _elsewhere(scan.xyz, row, sensor) else row
 
 

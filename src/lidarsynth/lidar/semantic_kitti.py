@@ -32,7 +32,7 @@ CLASS_NUMBER = {name: number for number, (name, _) in enumerate(CLASSES)}
 CLASS_COLOURS = np.array([colour for _, colour in CLASSES], np.uint8)
 
 RAW_OF_CLASS: tuple[tuple[int, ...], ...] = (  # index = class (CLASSES names them); 252-259 move
-    (0, 1, 52, 99), (10, 252), (11,), (15,), (18, 258), (13, 16, 20, 256, 257, 259), (30, 254), (31, 253), (32, 255),
+    (0, 1, 52, 99), (10, 252), (11,), (15,), (18, 258), (20, 13, 16, 256, 257, 259), (30, 254), (31, 253), (32, 255),
     (40, 60), (44,), (48,), (49,), (50,), (51,), (70,), (71,), (72,), (80,), (81,),
 )  # fmt: skip
 

@@ -5,6 +5,7 @@ return = 1), directions (vertical, horizontal) in [-1,1], where pixel i of n has
 Neighbours do not wrap around, so that queries beyond the centres of border pixels see those alone.
 """
 
+import math
 from itertools import pairwise
 
 import torch
@@ -223,6 +224,24 @@ def pixel_centres(height: int, width: int, device: torch.device | None = None) -
         -1 + 1 / size + 2 / size * torch.arange(size, device=device).float() for size in (height, width)
     )
     return torch.stack(torch.meshgrid(vertical, horizontal, indexing="ij"))
+
+
+def angle_queries(elevation: Tensor, azimuth: Tensor, size: tuple[int, int], min_v: float, max_v: float) -> Tensor:
+    """Queries (h w, 2), row by row, for directions given by elevations (h,) and azimuths (w,), in radians.
+
+    size          H, W of the image that is asked
+    min_v, max_v  elevations of its first and its last row, radians; its columns begin at azimuth -pi and ascend
+
+    Equal to the published program's to 2.4e-7. That matters nowhere in ILN; LIIF's answer in line with the centres of
+    border pixels is a ratio of such roundings, in the published program too.
+    """
+    height, width = size
+    step = (max_v - min_v) / (height - 1)
+    v = 2 * (elevation - (min_v - step / 2)) / (max_v - min_v + step) - 1
+    turned = azimuth + math.pi / width
+    turned = torch.where(turned >= math.pi, turned - 2 * math.pi, turned)
+    h = 2 * (turned + math.pi) / (2 * math.pi) - 1
+    return torch.stack(torch.meshgrid(v, h, indexing="ij"), dim=-1).flatten(0, 1)
 
 
 def from_official(checkpoint: object, model: str = "iln") -> ILN | LIIF:

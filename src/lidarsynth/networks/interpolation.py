@@ -5,10 +5,12 @@ Images are equirectangular: the width is circular, the height has ends. None of 
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from lidarsynth.networks.running import last_known
 
 METHODS = ("nearest", "bilinear", "bicubic")
+RESIZED = tuple(f"resized-{method}" for method in METHODS)  # as images are enlarged: see `resize_rows`
 
 
 @torch.no_grad()
@@ -55,6 +57,28 @@ class Interpolation(nn.Module):
 
     def forward(self, known: Tensor, mask: Tensor) -> Tensor:
         return interpolate(known, mask, self.method)
+
+
+def resize_rows(x: Tensor, height: int, method: str = "bilinear") -> Tensor:
+    """Enlarges (B,C,h,W) to (B,C,height,W) as OpenCV and torch resize images: LiDARGen's baselines.
+
+    Pixel centres stay where they are in the whole, so the rows come back moved: row i of h by (height/h - 1) / 2.
+    Raises ValueError for another method.
+    """
+    _check_method(method)
+    corners = None if method == "nearest" else False
+    return F.interpolate(x, size=(height, x.shape[3]), mode=method, align_corners=corners)
+
+
+def sample_queries(x: Tensor, queries: Tensor, method: str = "bilinear") -> Tensor:
+    """Values (B,C,Q) of the image (B,C,H,W) at `queries` (Q,2), (vertical, horizontal) in [-1,1] (ILN's baselines).
+
+    -1 and 1 are the outer edges of the border pixels; borders repeat, the width is not circular.
+    Raises ValueError for another method.
+    """
+    _check_method(method)
+    grid = queries.flip(-1).expand(len(x), 1, -1, -1)
+    return F.grid_sample(x, grid, mode=method, padding_mode="border", align_corners=False)[:, :, 0]
 
 
 @torch.no_grad()

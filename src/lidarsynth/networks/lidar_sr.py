@@ -261,3 +261,12 @@ def from_keras(weights: Sequence[Tensor], scale: int = 4, dropout: float = 0.25)
     counters = {name: value for name, value in network.state_dict().items() if name not in names}
     load_weights(network, {**dict(zip(names, own, strict=True)), **counters})
     return network.eval()
+
+
+def copy_measured(high: Tensor, low: Tensor) -> Tensor:
+    """The upsampled (...,H,W) with every (H/h)-th row, from row 0, as measured in (...,h,W)."""
+    if high.shape[-1] != low.shape[-1] or high.shape[-2] % low.shape[-2]:
+        raise ValueError(f"expected a multiple of {low.shape[-2]} rows of {low.shape[-1]}, got {tuple(high.shape)}")
+    copied = high.clone()
+    copied[..., :: high.shape[-2] // low.shape[-2], :] = low
+    return copied

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.networks.gan.inverse_depth import to_depth
@@ -36,6 +36,7 @@ def invert(
     steps: int = 500,
     learning_rate: float = 0.05,
     project: Callable[[Tensor], Tensor] | None = None,  # after each step, `unit_rms` for latents z
+    spread: float = 0.0,  # weight of `geocross`, 5e-3 for latents W+
 ) -> Iterator[Fit]:
     """Yields `steps` + 1 fits, better and better, of images to measured pixels: stage 1 of DUSty v2's inversion.
 
@@ -45,6 +46,7 @@ def invert(
     optimizer = torch.optim.Adam([latents], lr=learning_rate)
     for step in range(steps + 1):
         inverse, loss = reconstruction(render(latents), reference, mask, limits)
+        loss = loss + spread * geocross(latents) if spread else loss
         yield Fit(step, latents.detach().clone(), inverse.detach(), loss.detach())
         if step == steps:
             return
@@ -54,6 +56,28 @@ def invert(
         if project is not None:
             with torch.no_grad():
                 latents.copy_(project(latents))
+
+
+def tune(
+    network: nn.Module,  # changed in place: give a copy
+    render: Callable[[Tensor], Tensor],  # through that network, as in `invert`
+    latents: Tensor,
+    reference: Tensor,
+    mask: Tensor,
+    limits: tuple[float, float],
+    steps: int = 500,
+    learning_rate: float = 5e-4,
+) -> Iterator[Fit]:
+    """Stage 2, pivotal tuning: latents stay, all weights of the network follow the same loss; yields as `invert`."""
+    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    for step in range(steps + 1):
+        inverse, loss = reconstruction(render(latents), reference, mask, limits)
+        yield Fit(step, latents.detach().clone(), inverse.detach(), loss.detach())
+        if step == steps:
+            return
+        optimizer.zero_grad()
+        loss.sum().backward()
+        optimizer.step()
 
 
 def reconstruction(
@@ -68,6 +92,11 @@ def reconstruction(
 def relative_distance(generated: Tensor, reference: Tensor) -> Tensor:
     """|reference - generated| / reference, any shape."""
     return (reference - generated).abs() / (reference + 1e-11)
+
+
+def squared_distance(generated: Tensor, reference: Tensor) -> Tensor:
+    """(reference - generated)^2, any shape."""
+    return (reference - generated).square()
 
 
 def multiscale_loss(
@@ -113,6 +142,16 @@ def window(mask: Tensor) -> Tensor:
 
 def _length(x: Tensor) -> Tensor:
     return (x.square().sum(-1) + _TINY).sqrt()
+
+
+def geocross(w: Tensor) -> Tensor:
+    """How far the styles of W+ (B,num_styles,D) lie apart on the sphere: (B,).
+
+    Mean of D^3/8 over all ordered pairs, a style with itself included, D their angle. PULSE (Menon et al. 2020).
+    """
+    x, y = w[:, :, None], w[:, None]
+    angle = 2 * torch.atan2(_length(x - y), _length(x + y))
+    return (angle.square() * angle / 8).mean((1, 2))
 
 
 def unit_rms(latents: Tensor) -> Tensor:

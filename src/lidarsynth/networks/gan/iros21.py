@@ -6,6 +6,7 @@ Build `gan.Generator(..., bounded=True)` and `gan.Discriminator(..., vertical="r
 import re
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 _HEADS = {"depth": "image", "confidence": "raydrop_logit"}
@@ -41,3 +42,14 @@ def _layer(key: str) -> str:
     if re.fullmatch(r"[123]\.(1\.module\.weight|2\.bias)", key):
         return key
     raise ValueError(f"expected a key of the IROS 2021 generator, found {key!r}")
+
+
+def discriminator_weights(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """State dict of the release's D -> that of `gan.Discriminator`: its blur filters are images of three pixels."""
+    return {key: value.flatten() if key.endswith("kernel") else value for key, value in state.items()}
+
+
+def uniform_noise(first: Tensor, second: Tensor) -> Tensor:
+    """Two uniforms in [0,1), any shape -> the one whose logit is the release's logistic noise."""
+    tiny = 1e-10
+    return torch.sigmoid(-torch.log((first + tiny).log() / (second + tiny).log() + tiny))

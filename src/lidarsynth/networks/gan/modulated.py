@@ -6,6 +6,7 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from lidarsynth.networks.gan.layers import BINOMIAL_4, EqualLR, FusedLeakyReLU, Resample
 
@@ -186,3 +187,11 @@ def turned(angles: Tensor, shift: Tensor) -> Tensor:
 def circle(angles: Tensor) -> Tensor:
     """Sine and cosine of either angle: (B,2,H,W) radians -> (B,4,H,W): sin el, cos el, sin az, cos az."""
     return torch.stack([angles.sin(), angles.cos()], dim=2).flatten(1, 2)
+
+
+def resize_angles(angles: Tensor, resolution: tuple[int, int]) -> Tensor:
+    """Angles at another resolution, bilinear on the circle and on the ring: (B,2,h,w) -> (B,2,H,W), radians."""
+    height, width = resolution
+    wide = F.interpolate(circle(angles).repeat(1, 1, 1, 3), size=(height, 3 * width), mode="bilinear")
+    middle = wide[..., width : 2 * width]
+    return torch.atan2(middle[:, ::2], middle[:, 1::2])

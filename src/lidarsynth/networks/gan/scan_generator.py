@@ -53,7 +53,10 @@ class ScanGenerator(nn.Module):
 
     def styles_of_layers(self, z: Tensor) -> Tensor:
         """Latents (B,Z) -> a style for every layer (B,L,D) of DUSty v2, all equal; `styles` of the other two."""
-        w = self.styles(z)
+        return self.of_layers(self.styles(z))
+
+    def of_layers(self, w: Tensor) -> Tensor:
+        """Styles (B,D) -> W+, the same for every layer (B,L,D), of DUSty v2; as they are of the other two."""
         if isinstance(self.generator, gan.Generator):
             return w
         return w[:, None].repeat(1, self.generator.synthesis_network.num_styles, 1)

@@ -11,7 +11,7 @@ import torch
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.networks.interpolation import Interpolation, interpolate
+from lidarsynth.networks.interpolation import RESIZED, Interpolation, interpolate, resize_rows
 from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling
@@ -23,12 +23,27 @@ from lidarsynth.systems.scan_model import OnStep
 def interpolated(image: RangeImage, known: np.ndarray, method: str) -> RangeImage:
     """The baseline: range in metres and reflectance interpolated from the known pixels, empty ones as 0.
 
-    known (H, W) bool; method `nearest`, `bilinear` or `bicubic`. Negative overshoots become empty.
+    known (H, W) bool; method `nearest`, `bilinear` or `bicubic`, of which known pixels stay; or one of `RESIZED`, of
+    which they do not, and which are of every k-th beam from the first one alone. Negative overshoots become empty.
+    Raises ValueError for other known pixels with these.
     """
     pixels = torch.from_numpy(np.stack([image.range, image.reflectance]))[None].float()
-    mask = torch.from_numpy(known).expand(pixels.shape)
-    distance, reflectance = interpolate(pixels, mask, method)[0].clamp(min=0).numpy()
+    if method in RESIZED:
+        step = _step(known, method)
+        filled = resize_rows(pixels[:, :, ::step], len(known), method.removeprefix("resized-"))
+    else:
+        filled = interpolate(pixels, torch.from_numpy(known).expand(pixels.shape), method)
+    distance, reflectance = filled[0].clamp(min=0).numpy()
     return RangeImage(distance, reflectance.clip(0, 1), distance > 0, image.sensor)
+
+
+def _step(known: np.ndarray, method: str) -> int:
+    """k, of known pixels (H, W) bool in every k-th row. Raises ValueError for others."""
+    rows = np.flatnonzero(known.any(axis=1))
+    step = int(rows[1]) if len(rows) > 1 else len(known)
+    if len(known) % step or not np.array_equal(rows, np.arange(0, len(known), step)) or not known[rows].all():
+        raise ValueError(f"{method}: expected every k-th beam from the first one, such as beams:4 leaves, found others")
+    return step
 
 
 @dataclass(frozen=True, repr=False)
