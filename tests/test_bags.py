@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from full_scan import full_scan
 
-from lidarsynth.data.bag_writer import write_bag
-from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag, typestore
+from lidarsynth.cli.main import main
+from lidarsynth.data.bag_writer import FORMATS, message_of, points_topic, write_bag
+from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, cloud_of, is_bag, open_bag, typestore
 from lidarsynth.files.fields import PLACE, FileError, find, scan_from_fields
 from lidarsynth.verbs.batch import Job, Work, run
 from lidarsynth.verbs.inputs import Reading, inputs_of
+from lidarsynth.verbs.output_files import works
+from lidarsynth.viewer.series import series_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
 pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
@@ -167,3 +170,106 @@ def test_a_bag_completed_keeps_every_measured_bit(tmp_path: Path):
             if finite:
                 for mine, theirs in zip(kept, given, strict=True):
                     np.testing.assert_array_equal(mine[order], theirs[np.lexsort(given)])
+
+
+def clouds_at(path: Path, times: list[float], cut: int | None = None) -> Path:
+    """A bag of clouds that were recorded at these seconds, with only the start of message `cut`."""
+    encoding = FORMATS[path.suffix]
+    with write_bag(path) as writer:
+        for i, seconds in enumerate(times):
+            time, points = int(seconds * 10**9), table(i, False)
+            fields = {name: points[name].copy() for name in points.dtype.names or ()}
+            data = message_of(Cloud(time, "lidar", time, fields), encoding)
+            writer.put(points_topic("/points", encoding), time, data[: len(data) // 2 if i == cut else None])
+    return path
+
+
+CUT = r"1: expected a point cloud, found \d+ broken bytes: "
+
+
+@pytest.mark.parametrize(("suffix", "workers"), [(".bag", 1), (".mcap", 1), (".mcap", 2)])
+def test_the_messages_beside_a_broken_one_become_files(suffix: str, workers: int, tmp_path: Path):
+    path = clouds_at(tmp_path / f"in{suffix}", [100, 101, 102, 103], cut=1)
+    out = tmp_path / "o"
+    results = list(run(Job("project", sensor="vlp-16", picture=False), works(inputs_of([path]), out, "npz"), workers))
+    assert [r.error is None for r in results] == [True, False, True, True]
+    with pytest.raises(AssertionError, match=f"^{path}: in/00000{CUT}"):
+        raise AssertionError(results[1].error)
+    assert sorted(p.name for p in (out / "in").iterdir()) == ["000000.npz", "000002.npz", "000003.npz"]
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_the_messages_beside_a_broken_one_go_into_a_bag(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = clouds_at(tmp_path / f"in{suffix}", [100, 101, 102, 103], cut=1)
+    words = ["--model", "bilinear", "--sensor", "vlp-16", "--no-picture"]
+    main(["complete", str(path), "--out", str(tmp_path / f"out{suffix}"), *words])
+    assert f"in{suffix}: in/000001: expected a point cloud" in capsys.readouterr().err
+    with open_bag(tmp_path / f"out{suffix}") as bag:
+        assert [m.time // 10**9 for m in bag.messages()] == [100, 102, 103]
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_a_broken_message_is_told_in_words_and_the_next_are_shown(suffix: str, tmp_path: Path):
+    path = clouds_at(tmp_path / f"in{suffix}", [100, 101, 102], cut=1)
+    series = series_of([path], Reading())
+    with pytest.raises(FileError, match=rf"in{suffix}: /points 101.000 s: expected a point cloud, found \d+ broken"):
+        series[1]
+    assert len(series[2].scan) == len(full_scan())
+    with open_bag(path) as bag:
+        kinds = [type(cloud) for cloud in bag.clouds("/points")]
+    assert kinds == [Cloud, FileError, Cloud]
+
+
+def without_summary(path: Path) -> None:
+    """The MCAP file as a recorder leaves it that was killed, or was told to save the room."""
+    from mcap.writer import Writer
+
+    with open_bag(path) as bag:
+        messages = list(bag.messages())
+    with open(path, "wb") as file:
+        writer = Writer(file, use_statistics=False)
+        writer.start()
+        schema = writer.register_schema(POINTS, *messages[0].topic.schema)
+        channel = writer.register_channel("/points", "cdr", schema)
+        for message in messages:
+            writer.add_message(channel, message.time, message.data, message.time)
+        writer.finish()
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_the_parts_of_a_bag_are_read_in_the_order_of_their_times(summary: bool, tmp_path: Path):
+    """Names sort as 10, 11, 12, 2; the parts overlap, and one is empty."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    parts = {2: [100, 101, 103], 10: [102, 104], 11: [], 12: [109, 110]}
+    for number, times in parts.items():
+        clouds_at(folder / f"drive_{number}.mcap", times)
+        if not summary and times:
+            without_summary(folder / f"drive_{number}.mcap")
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    true = [100, 101, 102, 103, 104, 109, 110]
+    with open_bag(folder) as bag:
+        assert bag.seconds == 10 and [(t.name, t.count) for t in bag.topics] == [("/points", 7)]
+        assert [m.time // 10**9 for m in bag.messages()] == true
+        assert [m.time // 10**9 for m in bag.messages(start=103 * 10**9)] == true[3:]
+    series = series_of([folder], Reading())
+    shift = [0, 1, 0, 2, 1, 0, 1]  # `table` moves the i-th cloud of each part by i metres
+    first = full_scan().xyz[0]
+    for number in (6, 2, 3, 0, 5, 4, 1):
+        np.testing.assert_allclose(series[number].scan.xyz[0], first + shift[number], rtol=1e-5)
+    assert list(series.names) == [f"/points {t}.000 s" for t in true]
+
+
+def test_a_bag_is_told_by_its_ending_in_any_case(tmp_path: Path):
+    with open_bag(KINDS["bare mcap"](tmp_path)) as bag, write_bag(tmp_path / "NEW.BAG") as writer:
+        note = next(bag.messages(frozenset(["/note"])))
+        with pytest.raises(FileError, match=r"expected messages of ROS 1 to copy into a \.bag, found /note in cdr"):
+            writer.copy(note)
+
+
+def test_an_encoding_of_neither_ros_is_a_line():
+    topic = Topic("/points", POINTS, "json", ("jsonschema", b"{}"), 1)
+    with pytest.raises(FileError, match="expected messages of ROS 1 or ROS 2, found the encoding 'json'"):
+        cloud_of(Message(topic, 0, b"{}"))

@@ -202,3 +202,44 @@ def test_a_real_ouster_capture(shared: Path):
     assert recognise(loaded.scan)[0] == "os1-64"
     sensor = ouster.sensor_of(ouster.read_metadata(path.with_name("OS-1-64_sensor_config_reduced.json")))
     assert (sensor.height, sensor.width, sensor.elevations[0]) == (64, 1024, 16.46)
+
+
+def blocks(order: str, option: bytes, packets: list[tuple[int, bytes]], longest: int = 0) -> bytes:
+    """A pcapng of one interface with an option if_tsresol; each packet (ticks, frame), or a simple one where -1."""
+
+    def block(kind: int, body: bytes) -> bytes:
+        body += b"\0" * (-len(body) % 4)
+        return struct.pack(order + "II", kind, len(body) + 12) + body + struct.pack(order + "I", len(body) + 12)
+
+    options = struct.pack(order + "HH", 2, 3) + b"eth\0"  # its name, before
+    options += struct.pack(order + "HH", 9, len(option)) + option + b"\0" * (-len(option) % 4) if option else b""
+    parts = [block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1)),
+             block(1, struct.pack(order + "HHI", 1, 0, longest) + options + b"\0\0\0\0")]  # fmt: skip
+    for ticks, frame in packets:
+        high, low = divmod(max(ticks, 0), 1 << 32)
+        enhanced = struct.pack(order + "IIIII", 0, high, low, len(frame), len(frame)) + frame
+        simple = struct.pack(order + "I", len(frame)) + frame[: longest or None]
+        parts.append(block(6, enhanced) if ticks >= 0 else block(3, simple))
+    return b"".join(parts)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("option", "per_second"),
+    [(b"", 10**6), (b"\x06", 10**6), (b"\x09", 10**9), (b"\x03", 10**3), (b"\x0c", 10**12), (b"\x94", 2**20)],
+)
+def test_times_of_a_capture_are_in_the_ticks_of_its_clock(order: str, option: bytes, per_second: int, tmp_path: Path):
+    start = 17_000_000
+    packets = [(start * per_second + per_second // 4, udp(b"one", 1)), (-1, udp(b"two", 2))]
+    (tmp_path / "c.pcapng").write_bytes(blocks(order, option, packets))
+    found = list(datagrams(tmp_path / "c.pcapng"))
+    assert [(d.port, d.payload) for d in found] == [(1, b"one"), (2, b"two")]
+    assert [d.time for d in found] == [start * 10**9 + 250_000_000] * 2, "a simple packet has that of the one before"
+
+
+def test_simple_packets_of_a_capture(tmp_path: Path):
+    frames = [udp(b"x" * n, 5) for n in (1, 2, 3, 300)]
+    (tmp_path / "c.pcapng").write_bytes(blocks("<", b"", [(-1, f) for f in frames], longest=64))
+    found = list(datagrams(tmp_path / "c.pcapng"))
+    assert [d.payload for d in found] == [b"x", b"xx", b"xxx", b"x" * 22], "no more than the interface keeps"
+    assert {d.time for d in found} == {0}

@@ -105,6 +105,21 @@ def test_what_is_beside_a_bin_is_there_before_it(tmp_path: Path, monkeypatch: py
     assert (tmp_path / "a.new").is_file() and not (tmp_path / "a.bin").exists()
 
 
+@pytest.mark.parametrize("suffix", [".bin", ".npy"])
+def test_marks_of_a_file_that_is_gone_are_not_those_of_the_next(suffix: str, tmp_path: Path):
+    plain = Scan(np.ones((3, 3), np.float32))
+    extra = {"new": np.uint8([0, 1, 1]), "confidence": np.float32([1, 0.5, 0.25])}
+    path, users = tmp_path / f"q{suffix}", tmp_path / "r.new"
+    for again in (replace(plain, extra={"new": np.uint8([1, 0, 1])}), plain):
+        write(path, replace(plain, extra=extra))
+        path.unlink()
+        write(path, again)
+        assert read(path).extra.keys() == again.extra.keys()
+    users.write_bytes(b"no marks of ours")
+    write(users.with_suffix(suffix), plain)
+    assert users.read_bytes() == b"no marks of ours", "what would not be taken for marks is no business of ours"
+
+
 def test_centimetres_are_no_metres(tmp_path: Path):
     xyz = np.random.default_rng(0).normal(0, 2000, (500, 3)).astype(np.float32)
     np.save(tmp_path / "cm.npy", np.concatenate([xyz, np.zeros((500, 1), np.float32)], 1))
@@ -165,3 +180,16 @@ def test_a_failure_names_its_file_and_which_message_of_it():
     assert told("a.bag", "a/000002", "a.bag: a/000002: expected points") == "a.bag: a/000002: expected points"
     assert told("d/b.pcd.bin", "b", "expected points") == "d/b.pcd.bin: expected points"
     assert told("d/b.bin", "b", "d/b.bin: expected points") == "d/b.bin: expected points"
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npy"])
+def test_labels_of_bare_files_stand_beside_them(suffix: str, street: Scan, tmp_path: Path):
+    """As the verbs write them: beside the file, or in labels/ beside velodyne/."""
+    classes = np.arange(len(street)) % 20
+    for folder, labels in (("a", "a"), ("velodyne", "labels")):
+        (tmp_path / folder).mkdir()
+        path = tmp_path / folder / f"x{suffix}"
+        write(path, replace(street, label=classes))
+        assert [p.suffix for p in (tmp_path / labels).iterdir() if p.suffix == ".label"] == [".label"]
+        again = read(path, labels=tmp_path / labels / "x.label")
+        np.testing.assert_array_equal(again.label, classes)

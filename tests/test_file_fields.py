@@ -11,7 +11,7 @@ from lidarsynth.files.fields import NAMES, FileError, reflectance_from, rings_fr
 from lidarsynth.files.formats import read, read_with_report, write
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW
+from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW, RAW
 from lidarsynth.lidar.sensor import SENSORS
 
 
@@ -76,6 +76,22 @@ def test_nuscenes_files_that_someone_scaled_stay_so(tmp_path: Path):
     table[:, 3] = np.round(table[:, 3] * 3)  # dark, but whole numbers
     table.tofile(tmp_path / "b.pcd.bin")
     np.testing.assert_allclose(read(tmp_path / "b.pcd.bin").reflectance, table[:, 3] / 255, rtol=1e-6)
+
+
+def test_nuscenes_intensities_are_scaled_once(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    light = rng.integers(0, 256, 500).astype("<f4")
+    for name, values in (("bright", light), ("dark", light % 2)):  # of which a scan alone would not tell the scale
+        path = tmp_path / f"{name}.pcd.bin"
+        np.column_stack([rng.normal(0, 10, (500, 3)), values, np.zeros(500)]).astype("<f4").tofile(path)
+        for word, scale in (("auto", 255), ("byte", 255), ("uint16", 65535)):
+            found = read(path, intensity=word)
+            np.testing.assert_array_equal(found.reflectance, (values / np.float64(scale)).astype(np.float32))
+            assert not found.extra
+    np.testing.assert_array_equal(read(path, intensity="unit").reflectance, light % 2)
+    with pytest.raises(FileError, match=r"bright.pcd.bin: expected an intensity of 0-1 \(unit\), found 0 to 255"):
+        read(tmp_path / "bright.pcd.bin", intensity="unit")
+    np.testing.assert_array_equal(read(path, rings=(0, 3)).reflectance, (light % 2 / np.float64(255)).astype("f4"))
 
 
 def test_rings_of_one_sensor_are_read_by_the_numbers_of_the_file(scan: Scan, tmp_path: Path):
@@ -181,3 +197,10 @@ def test_a_column_of_fractions_beyond_53_bits_stays_as_it_is(tmp_path: Path):
     path = tmp_path / "a.csv"
     path.write_text("x,y,z,intensity,stamp\n1,0,0,0.5,1e17\n2,0,0,0.5,1.5\n", "ascii")
     np.testing.assert_array_equal(read(path).extra["stamp"], [1e17, 1.5])
+
+
+def test_classes_are_written_as_semantic_kitti_has_them():
+    """The published table from training classes back to raw ids."""
+    published = [0, 10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81]
+    np.testing.assert_array_equal(RAW, published)
+    np.testing.assert_array_equal(CLASS_OF_RAW[RAW], np.arange(20))

@@ -235,3 +235,15 @@ def test_argoverse_feather(scan: Scan, tmp_path: Path):
     (tmp_path / "cut.feather").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"^\S*: expected .* found"):
         read(tmp_path / "cut.feather")
+
+
+def test_fractions_in_a_column_of_whole_numbers_stay(tmp_path: Path):
+    rows = [f"{x} 2 3 {light}" for x, light in ((1, 0.25), (2, 0.75), (3, 1))]
+    pcd = "FIELDS x y z intensity\nSIZE 4 4 4 1\nTYPE F F F U\nWIDTH 3\nDATA ascii\n"
+    properties = "".join(f"property {kind}\n" for kind in ("float x", "float y", "float z", "uchar intensity"))
+    ply = f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}end_header\n"
+    for name, header in (("a.pcd", pcd), ("a.ply", ply)):
+        (tmp_path / name).write_text(header + "\n".join(rows) + "\n")
+        np.testing.assert_array_equal(read(tmp_path / name).reflectance, np.float32([0.25, 0.75, 1]))
+        (tmp_path / name).write_text(header + "\n".join(rows).replace("0.25", "51").replace("0.75", "102") + "\n")
+        np.testing.assert_allclose(read(tmp_path / name).reflectance, [51 / 255, 102 / 255, 1 / 255], rtol=1e-6)

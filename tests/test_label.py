@@ -88,7 +88,7 @@ def test_labels_of_the_source_are_never_replaced(place: Path, capsys: pytest.Cap
 
 
 def test_what_a_former_run_wrote_beside_is_replaced(place: Path, capsys: pytest.CaptureFixture[str]):
-    write("odo.bin", replace(perfect(SMALL), ring=None)[np.arange(6144) % 2 == 0])
+    write("odo.bin", replace(perfect(SMALL), ring=None, label=None)[np.arange(6144) % 2 == 0])
     for words in (
         "label scan.ply --out scan.bin",
         "complete odo.bin --out odo.npy --labels",

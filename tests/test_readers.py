@@ -11,6 +11,8 @@ from lidarsynth.data.frames import read_velodyne
 from lidarsynth.data.kitti import ODOMETRY_TO_RAW, RAW_TRAIN, RAW_VAL, kitti, kitti_odometry, kitti_raw, raw_test_drives
 from lidarsynth.data.kitti360 import kitti360
 from lidarsynth.data.nuscenes import nuscenes, rows
+from lidarsynth.files.fields import FileError
+from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 
 
@@ -218,6 +220,28 @@ def test_the_quick_way_reads_as_the_careful_one(tmp_path: Path):
     table[[3, 4]] = [[0, 0, 0, 0.5], [1, np.nan, 1, 0]]
     put(path, table)
     same(read_velodyne(path), np.delete(table, [3, 4], axis=0))
+
+
+def test_the_quick_way_refuses_what_the_careful_one_does(tmp_path: Path):
+    path = tmp_path / "a.bin"
+    for content, found in (
+        (b"1.0 2.0 3.0 0.5\n" * 100, "binary float32 a point, found text"),
+        ((points(0) * [100, 100, 1, 1]).astype("<f4").tobytes(), "are they centimetres"),
+    ):
+        path.write_bytes(content)
+        for way in (lambda p: read(p, "unit"), read_velodyne):
+            with pytest.raises(FileError, match=f"^{path}: expected .*{found}"):
+                way(path)
+    table = points(0)
+    table[3, 0] = 900  # one that is far, and no more
+    put(path, table)
+    same(read_velodyne(path), table)
+
+
+def test_the_quick_way_keeps_the_marks_beside(tmp_path: Path):
+    scan = Scan(points(0)[:, :3], points(0)[:, 3], extra={"new": (np.arange(200) % 2).astype(np.uint8)})
+    write(tmp_path / "a.bin", scan)
+    np.testing.assert_array_equal(read_velodyne(tmp_path / "a.bin").extra["new"], scan.extra["new"])
 
 
 @pytest.mark.parametrize(

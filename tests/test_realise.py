@@ -11,12 +11,13 @@ from networks import tiny_cascade
 from test_cascade import SMALL, perfect
 
 from lidarsynth.cli.main import main
+from lidarsynth.files.fields import PLACE, scan_from_fields
 from lidarsynth.files.formats import read, write, write_labels
 from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.systems.scan_model import ScanModel
-from lidarsynth.verbs.realisation import realise_scan
+from lidarsynth.verbs.realisation import realise_scan, realised_fields
 from lidarsynth.weights.load import load
 
 WORDS = ("--sensor", "own.toml", "--no-picture")
@@ -146,6 +147,21 @@ def test_bags_keep_their_columns(place: Path):
         for name in ("x", "y", "z", "ring"):
             np.testing.assert_array_equal(cloud.given[name], fields[name][kept])
         assert cloud.given["intensity"].max() > 1 and cloud.given["intensity"].std() > 0
+
+
+@pytest.mark.parametrize("full", [1, 255, 65535])
+def test_the_scale_of_a_message_is_that_which_it_was_read_by(full: int):
+    """One point in 2000 is brighter than its scale, half of them did not return, and one has no intensity."""
+    xyz = np.random.default_rng(0).normal(0, 10, (4000, 3)).astype(np.float32)
+    light = np.random.default_rng(1).random(4000).astype(np.float32) * full
+    light = np.ceil(light) if full > 1 else light
+    xyz[::2], light[::2], light[1] = 0, 0, np.nan
+    light[3] = {1: 1.5, 255: 300}.get(full, full)
+    given = {"intensity": light, **dict(zip("xyz", xyz.T, strict=True))}
+    scan, _ = scan_from_fields({**given, PLACE: np.arange(1, 4001)})
+    back = realised_fields(scan, given)["intensity"]
+    np.testing.assert_allclose(back[2:], light[1::2][2:], rtol=1e-6)
+    assert back[0] == 0 and back[1] == full
 
 
 def test_a_model_that_cannot_is_refused_before_any_work(place: Path, capsys: pytest.CaptureFixture[str]):

@@ -34,7 +34,17 @@ def test_unnamed_columns_are_told_by_their_numbers():
     assert list(read_text(b"1 2 3 255 0 9\n1 2 3 1 2 3\n")) == ["x", "y", "z"]  # colours
     assert list(read_text(b"1 2 3 0.5 7\n1 2 3 0.5 8\n")) == ["x", "y", "z", "intensity", "ring"]
     leica = read_text(b"2\n1 2 3 -2048 1 2 3\n1 2 3 2047 1 2 3\n")
-    np.testing.assert_array_equal(leica["intensity"], [0, 1])
+    np.testing.assert_array_equal(leica["intensity"], [-2048, 2047])
+
+
+def test_a_scan_stations_intensities_are_scaled_once(tmp_path):
+    (tmp_path / "p.pts").write_text("3\n1 2 3 -2048 1 2 3\n1 2 3 0 1 2 3\n1 2 3 2047 1 2 3\n")
+    found = read(tmp_path / "p.pts")
+    np.testing.assert_allclose(found.reflectance, [0, 2048 / 4095, 1], rtol=1e-6)
+    assert not found.extra
+    with pytest.raises(FileError, match=r"expected an intensity of 0-255 \(byte\), found -2048 to 2047"):
+        read(tmp_path / "p.pts", intensity="byte")
+    np.testing.assert_array_equal(read(tmp_path / "p.pts", intensity="none").reflectance, [0, 0, 0])
 
 
 def test_an_empty_cell_is_a_lost_point(tmp_path):

@@ -37,7 +37,7 @@ class BagWriter:
 
     def copy(self, message: Message) -> None:
         """A message of another bag as it is. Raises FileError where this kind of file cannot hold it."""
-        if self.path.suffix == ".bag" and message.topic.encoding != "ros1":
+        if self.path.suffix.lower() == ".bag" and message.topic.encoding != "ros1":
             raise FileError(f"{self.path}: expected messages of ROS 1 to copy into a .bag, found {message.topic.name} "
                             f"in {message.topic.encoding}; write a .mcap")  # fmt: skip
         self.put(message.topic, message.time, message.data)

@@ -6,6 +6,7 @@ until they are asked for, so that a bag of any size passes in the memory of one 
 
 from __future__ import annotations
 
+import heapq
 import struct
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
@@ -87,8 +88,8 @@ class Bag:
         for message in self.messages(frozenset([topic])):
             try:
                 yield cloud_of(message)
-            except (*BROKEN, *library_errors()) as error:
-                yield FileError(f"{self.path}: {topic}: expected a point cloud, found: {_line(error)}")
+            except FileError as error:
+                yield FileError(f"{self.path}: {topic}: {error}")
 
     def point_topic(self, name: str | None = None) -> str:
         """The topic named, or the only one of points. Raises ValueError that lists those there are."""
@@ -136,24 +137,29 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
 
 
 def cloud_of(message: Message) -> Cloud:
-    """The point cloud in a message of PointCloud2."""
+    """The point cloud in a message of PointCloud2. Raises FileError, without the bag's path, for one that is broken."""
     store = typestore(message.topic.encoding)
     read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
-    points: Any = read(message.data, POINTS)
-    stamp = points.header.stamp
-    return Cloud(stamp.sec * 10**9 + stamp.nanosec, points.header.frame_id, message.time, decode(points))
+    try:
+        points: Any = read(message.data, POINTS)
+        stamp = points.header.stamp
+        return Cloud(stamp.sec * 10**9 + stamp.nanosec, points.header.frame_id, message.time, decode(points))
+    except FileError:
+        raise
+    except (*BROKEN, *library_errors()) as error:
+        raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {_line(error)}") from None
 
 
 _STORES: dict[str, Any] = {}  # encoding -> the types of that ROS; a second to build, so once
 
 
 def typestore(encoding: str) -> Any:
-    """rosbags' message types of ROS 1 (`ros1`) or ROS 2 (`cdr`). Raises ValueError for another encoding."""
+    """rosbags' message types of ROS 1 (`ros1`) or ROS 2 (`cdr`). Raises FileError for another encoding."""
     from rosbags.typesys import Stores, get_typestore
 
     stores = {"ros1": Stores.ROS1_NOETIC, "cdr": Stores.LATEST}
     if encoding not in stores:
-        raise ValueError(f"expected messages of ROS 1 or ROS 2, found the encoding {encoding!r}")
+        raise FileError(f"expected messages of ROS 1 or ROS 2, found the encoding {encoding!r}")
     if encoding not in _STORES:
         _STORES[encoding] = get_typestore(stores[encoding])
     return _STORES[encoding]
@@ -184,45 +190,67 @@ def _topic(connection: Any, encoding: str) -> Topic:
 
 
 def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
-    """MCAP files one after the other: a bare one, or those of a ROS 2 folder."""
+    """MCAP files as one, whatever their names: a bare one, or those of a ROS 2 folder."""
     from contextlib import ExitStack
 
     with ExitStack() as stack:
-        streams = [stack.enter_context(open(file, "rb")) for file in files]
-        parts = [_mcap_topics(stream) for stream in streams]
+        parts = sorted((_mcap_part(stack.enter_context(open(file, "rb"))) for file in files), key=lambda p: p.first)
         topics: dict[str, Topic] = {}
-        for found, _ in parts:
-            for topic in found.values():
+        for part in parts:
+            for topic in part.topics:
                 before = topics.get(topic.name, topic)
                 more = topic.count if before is not topic else 0
                 topics[topic.name] = replace(before, count=before.count + more)
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
-            for stream in streams:
-                yield from _mcap_messages(stream, names, topics, start)
+            for together in _overlapping(parts):
+                each = (_mcap_messages(part.stream, names, topics, start) for part in together)
+                yield from heapq.merge(*each, key=lambda message: message.time)
 
-        yield Bag(path, tuple(topics.values()), sum(seconds for _, seconds in parts), messages)
+        full = [part for part in parts if part.last]
+        seconds = (max(part.last for part in full) - full[0].first) / 1e9 if full else 0.0
+        yield Bag(path, tuple(topics.values()), seconds, messages)
 
 
-def _mcap_topics(stream: IO[bytes]) -> tuple[dict[int, Topic], float]:
-    """Channel -> topic, and the seconds from first to last message. A file without summary is read through once."""
+class _Part(NamedTuple):
+    """An open MCAP file: its topics, the times of its first and last message (nanoseconds), 0 where it has none."""
+
+    stream: IO[bytes]
+    topics: tuple[Topic, ...]
+    first: int
+    last: int
+
+
+def _overlapping(parts: list[_Part]) -> list[list[_Part]]:
+    """The parts, given in the order of their first messages: together those whose times overlap."""
+    groups: list[list[_Part]] = []
+    for part in parts:
+        if groups and part.first < max(before.last for before in groups[-1]):
+            groups[-1].append(part)
+        else:
+            groups.append([part])
+    return groups
+
+
+def _mcap_part(stream: IO[bytes]) -> _Part:
+    """What a file holds, by its summary; one without is read through once."""
     from mcap.reader import make_reader
 
     summary = make_reader(stream).get_summary()
     if summary is not None and summary.statistics is not None:
         counts, s = summary.statistics.channel_message_counts, summary.statistics
-        topics = {
-            number: _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
+        topics = [
+            _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
             for number, channel in summary.channels.items()
-        }
-        return topics, (s.message_end_time - s.message_start_time) / 1e9
+        ]
+        return _Part(stream, tuple(topics), s.message_start_time, s.message_end_time)
     stream.seek(0)
     seen: dict[int, list[Any]] = {}
     times = [0, 0]
     for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
         times = [min(times[0] or message.log_time, message.log_time), max(times[1], message.log_time)]
         seen.setdefault(channel.id, [channel, schema, 0])[2] += 1
-    return {number: _mcap_topic(*found) for number, found in seen.items()}, (times[1] - times[0]) / 1e9
+    return _Part(stream, tuple(_mcap_topic(*found) for found in seen.values()), *times)
 
 
 def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:

@@ -13,6 +13,8 @@ from lidarsynth.lidar.small_file import check_regular
 MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
 NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
+INTERFACE, SIMPLE, ENHANCED = 1, 3, 6  # kinds of blocks of pcapng (draft-ietf-opsawg-pcapng)
+RESOLUTION = 9  # if_tsresol, an option of an interface
 MAX_RECORD = 1 << 18
 ETHERNET, RAW_IP, LOOPBACK, LINUX = 1, (12, 101, 228), 0, 113  # link types (the tcpdump group's list)
 IPV4, UDP = 0x0800, 17
@@ -20,7 +22,10 @@ VLAN = (b"\x81\x00", b"\x88\xa8", b"\x91\x00")  # IEEE 802.1Q, 802.1ad, and what
 
 
 class Datagram(NamedTuple):
-    """One UDP packet: nanoseconds of its capture, its destination port, its payload, the IPv4 address of its sender."""
+    """One UDP packet: nanoseconds of its capture, its destination port, its payload, the IPv4 address of its sender.
+
+    A simple packet of pcapng has no time: it gets that of the packet before it, or 0.
+    """
 
     time: int
     port: int
@@ -81,24 +86,55 @@ def _records(file: IO[bytes], order: str, nano: bool) -> Iterator[tuple[int, int
         yield seconds * 10**9 + part * (1 if nano else 1000), link, frame
 
 
+class _Interface(NamedTuple):
+    """What a capture was made from: its link type, the most bytes kept of a packet (0 = all), how often its clock
+    ticks in a second."""
+
+    link: int = ETHERNET
+    longest: int = 0
+    ticks: int = 10**6
+
+
 def _blocks(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
-    """The same of a pcapng file: sections (their byte order), interfaces (link type), enhanced and simple packets."""
+    """The same of a pcapng file: sections (their byte order), interfaces, enhanced and simple packets; these have no
+    time, so that they get that of the packet before, or 0."""
     file.seek(0)
-    order, links = "<", [ETHERNET]
+    order, time = "<", 0
+    interfaces: list[_Interface] = []
     while len(head := file.read(8)) == 8:
         if head[:4] == NEXT_GENERATION:
             magic = file.read(4)
-            order, links = ("<" if magic == b"\x4d\x3c\x2b\x1a" else ">"), []
+            order, interfaces = ("<" if magic == b"\x4d\x3c\x2b\x1a" else ">"), []
             file.seek(-4, 1)
         kind, size = struct.unpack(order + "2I", head)
         if not 12 <= size <= MAX_RECORD or len(body := file.read(size - 8)) < size - 8:
             return
-        if kind == 1:
-            links.append(struct.unpack(order + "H", body[:2])[0])
-        elif kind == 6 and len(body) >= 20:
+        body = body[:-4]  # the size once more
+        if kind == INTERFACE and len(body) >= 8:
+            interfaces.append(_interface(body, order))
+        elif kind == ENHANCED and len(body) >= 20:
             which, high, low, length, _ = struct.unpack(order + "5I", body[:20])
-            link = links[which] if which < len(links) else ETHERNET
-            yield ((high << 32) | low) * 1000, link, body[20 : 20 + length]  # microseconds, unless an option says else
+            one = interfaces[which] if which < len(interfaces) else _Interface()
+            time = ((high << 32) | low) * 10**9 // one.ticks
+            yield time, one.link, body[20 : 20 + length]
+        elif kind == SIMPLE and len(body) >= 4:
+            one = interfaces[0] if interfaces else _Interface()
+            length = struct.unpack(order + "I", body[:4])[0]  # as it was sent, of which less may be kept
+            yield time, one.link, body[4 : 4 + min(length, one.longest or length)]
+
+
+def _interface(body: bytes, order: str) -> _Interface:
+    link, _, longest = struct.unpack(order + "HHI", body[:8])
+    at = 8
+    while at + 4 <= len(body):
+        option, length = struct.unpack(order + "HH", body[at : at + 4])
+        if option == RESOLUTION and length == 1 and at + 4 < len(body):
+            power = body[at + 4]
+            return _Interface(link, longest, 2 ** (power & 127) if power & 128 else 10**power)
+        at += 4 + -(-length // 4) * 4
+        if option == 0:  # the end of them
+            break
+    return _Interface(link, longest)
 
 
 def _ip(frame: bytes, link: int) -> bytes:

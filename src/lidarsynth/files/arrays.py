@@ -13,7 +13,7 @@ from typing import IO
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, Fields, FileError, rings_of_grid, written_names
+from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, SCALED, Fields, FileError, rings_of_grid, written_names
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import from_dict
 
@@ -38,15 +38,21 @@ def read_bin(data: bytes) -> Fields:
 def read_pcd_bin(data: bytes) -> Fields:
     """nuScenes: x y z intensity (0-255) ring, five float32 a point; x right, y forward there, x forward, y left here.
 
-    Raises FileError as `read_bin`.
+    The field SCALED is the intensity / 255, but where someone has scaled the file before, or it goes beyond. Raises
+    FileError as `read_bin`.
     """
     fields = _floats(data, 5, "")
     fields["x"], fields["y"] = fields["y"], -fields["x"]
     light = fields["intensity"]
     unit = np.nanmax(light, initial=0) <= 1 and np.mean((light > 0) & (light < 1)) > 0.5  # scaled by someone before
     if not unit and np.nanmax(light, initial=0) <= 255:
-        fields["intensity"] = fields["intensity"] / np.float32(255)  # the format fixes the scale, however dark the scan
+        fields[SCALED] = light / np.float32(255)  # the format fixes the scale, however dark the scan
     return fields
+
+
+def is_text(data: bytes) -> bool:
+    """Whether these are printable characters, as far as the first 4096 tell."""
+    return PRINTABLE.issuperset(data[:4096])
 
 
 def _floats(data: bytes, columns: int, hint: str) -> Fields:
@@ -54,7 +60,7 @@ def _floats(data: bytes, columns: int, hint: str) -> Fields:
         raise FileError(
             f"expected whole points of {columns} float32 ({4 * columns} bytes), found {len(data)} bytes{hint}"
         )
-    if PRINTABLE.issuperset(data[:4096]):
+    if is_text(data):
         raise FileError(f"expected {columns} binary float32 a point, found text: {data[:24].decode('ascii')!r}")
     table = np.frombuffer(data, "<f4").reshape(-1, columns)
     extreme = np.nanmin(table[:, 3], initial=0), np.nanmax(table[:, 3], initial=0)

@@ -17,6 +17,7 @@ MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coor
 MAX_RINGS = 1024
 LONGEST = 10.0  # seconds that a turn may last
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
+SCALED = "reflectance by the format"  # a further field: intensities as 0-1, of formats that fix their scale; for "auto"
 PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
 NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found wins; case does not matter
@@ -58,15 +59,15 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
 
     Points with a non-finite coordinate, or at exactly (0, 0, 0) (no return), are dropped and counted; an intensity that
     is not finite is 0.
-    `intensity`: see `reflectance_from`; `rings`: see `on_rings`. Ring numbers that do not count from the top, and times
-    that are no seconds, stay among the further fields as the file has them. Raises FileError (without the path) for
-    anything that is not one LiDAR turn.
+    `intensity`: see `reflectance_from`; "auto" takes the field SCALED where there is one. `rings`: see `on_rings`.
+    Ring numbers that do not count from the top, and times that are no seconds, stay among the further fields as the
+    file has them. Raises FileError (without the path) for anything that is not one LiDAR turn.
     """
     x, y, z = _coordinates(fields)
     if rings is not None:
         fields = on_rings(fields, *rings)
         x, y, z = _coordinates(fields)
-    name = find(fields, "reflectance")
+    name = SCALED if intensity == "auto" and SCALED in fields else find(fields, "reflectance")
     if intensity == "none":
         values = np.zeros(len(x), np.float32)
     elif name is None:
@@ -74,7 +75,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
                         f"found {_listed(fields)}; --intensity none takes it for 0")  # fmt: skip
     else:
         values = _numbers(fields[name], name)
-    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
+    keep = _returned(x, y, z)
     values = values if np.isfinite(values[keep]).all() else np.where(np.isfinite(values), values, 0)
     if not keep.any():
         raise FileError(f"expected at least one finite point away from the origin, found none in {len(x)}")
@@ -93,7 +94,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     changed = [find(fields, name) for name, given, ours in (("ring", ring, from_top), ("time", time, seconds))
                if given is not None and (given != ours).any()]  # fmt: skip
     kept_too = {key for key in changed if f"file_{key}" not in fields}
-    taken = {find(fields, name) for name in NAMES if name != "label" or classes is not None} - kept_too
+    taken = {find(fields, name) for name in NAMES if name != "label" or classes is not None} - kept_too | {SCALED}
     return Scan(
         xyz,
         values,
@@ -102,6 +103,10 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
         label=classes,
         extra={key: column[kept] for key, column in fields.items() if key not in taken and column.dtype.kind in "biuf"},
     ), dropped
+
+
+def _returned(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    return np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
 
 
 def check_metres(far: np.ndarray) -> None:
@@ -151,7 +156,7 @@ def _numbers(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def _listed(fields: Fields) -> str:
-    names = ", ".join([name for name in fields if name != PLACE][:12])
+    names = ", ".join([name for name in fields if name not in (PLACE, SCALED)][:12])
     return f"only {names}" if names else "no field at all"
 
 
@@ -173,6 +178,17 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
     if low < 0 or high > limit:
         raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}")
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
+
+
+def full_scale(fields: Fields) -> float:
+    """What a reflectance of 1 is in the intensities of N columns, as "auto" takes it. Raises FileError where there are
+    none, or no coordinates."""
+    name = find(fields, "reflectance")
+    if name is None:
+        raise FileError(f"expected an intensity field, found {_listed(fields)}")
+    values = _numbers(fields[name], name)
+    values = np.where(np.isfinite(values), values, 0)[_returned(*_coordinates(fields))]
+    return SCALES[_scale_of(values, float(values.max(initial=0)))]
 
 
 def _scale_of(values: np.ndarray, high: float) -> str:

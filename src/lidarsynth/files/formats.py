@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarsynth.files import arrays, e57, feather, las, pcd, ply, text
 from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
-from lidarsynth.files.labels import read_labels, read_words
+from lidarsynth.files.labels import label_path, read_labels, read_words
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.whole_file import whole_file
@@ -69,8 +69,9 @@ def read_with_report(
 ) -> tuple[Scan, int]:
     """The scan, and how many of the file's points were dropped: not finite, or (0, 0, 0) where nothing returned.
 
-    intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" by type and range
-               (`fields.reflectance_from`), "none" to read a file without intensity with reflectance 0
+    intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" as the kind of file
+               fixes it, else by type and range (`fields.reflectance_from`), "none" to read a file without intensity
+               with reflectance 0
     labels     a SemanticKITTI `.label` file with one word per point of the file
     words      likewise, of any ids, which are kept as they are in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last to read, as the file numbers them; None = all
@@ -132,9 +133,10 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given.
 
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
-    points. `.bin` and `.npy` hold x y z reflectance only, and of a filled scan `new` beside them in a `.new` file, a
-    byte a point, and `confidence` in a `.confidence` file, a float32 a point; the others hold ring, time, label and
-    every further field too. The file appears whole or not at all: it is written beside its place, then
+    points. `.bin` and `.npy` hold x y z reflectance only, and of a labelled scan the labels where `label_path` says; of
+    a filled one `new` beside them in a `.new` file, a byte a point, and `confidence` in a `.confidence` file, a float32
+    a point; such marks of another scan that would be taken for this one's are removed. The others hold ring, time,
+    label and every further field too. The file appears whole or not at all: it is written beside its place, then
     renamed. Raises FileError, also for anything else, such as an array.
     """
     path = Path(path)
@@ -147,11 +149,16 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     if path.is_dir():
         raise FileError(f"{path}: expected the name of a file to write, found a folder")
     if isinstance(content, Scan) and suffix in BARE:  # before the file itself: where that stands, all is whole
-        _without_marks(path, content.extra)
+        _without_marks(path, content)
         for name, kind in BESIDE.items():
             if name in content.extra:
                 values = content.extra[name].astype(kind).tobytes()
                 _put(path.with_suffix(f".{name}"), lambda file, values=values: file.write(values))
+        if content.label is not None or "raw_label" in content.extra:
+            labels = label_path(path)
+            if labels.parent != path.parent and path.parent.is_dir():
+                labels.parent.mkdir(exist_ok=True)
+            write_labels(labels, content)
     _put(path, lambda file: WRITERS[suffix](file, content))
 
 
@@ -187,13 +194,13 @@ def _marks_beside(path: Path, count: int) -> Fields:
     return {name: np.fromfile(place, BESIDE[name]) for name, place in fit.items()}
 
 
-def _without_marks(path: Path, stay: Iterable[str]) -> None:
-    """Removes the marks of the points of a file that is about to be replaced, but for those that are written anew."""
-    try:
-        count = len(next(iter(READERS[path.suffix.lower()](path.read_bytes()).values()), ()))
-    except (OSError, FileError):  # no such file, or none of ours
-        return
-    for name in _marks_beside(path, count).keys() - set(stay):
+def _without_marks(path: Path, scan: Scan) -> None:
+    """Removes the marks of the points of a file that is about to be replaced, and those of one that is gone which would
+    fit the scan, but for those that are written anew."""
+    counts = [len(scan)]
+    with suppress(OSError, FileError):  # no such file, or none of ours
+        counts.append(len(next(iter(READERS[path.suffix.lower()](path.read_bytes()).values()), ())))
+    for name in {name for count in counts for name in _marks_beside(path, count)} - set(scan.extra):
         path.with_suffix(f".{name}").unlink(missing_ok=True)
 
 

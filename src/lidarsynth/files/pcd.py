@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsynth.files.fields import MAX_BYTES, MAX_POINTS, Fields, FileError, rings_of_grid, scan_table
 from lidarsynth.files.lzf import decompress
-from lidarsynth.files.whole_numbers import exact
+from lidarsynth.files.whole_numbers import typed
 from lidarsynth.lidar.scan import Scan
 
 MAX_HEADER = 1 << 16
@@ -137,22 +137,12 @@ def _ascii(body: bytes, header: Header) -> list[np.ndarray]:
     except ValueError as error:
         raise FileError(f"expected numbers in an ascii PCD, found {_tail(error)}") from None
     starts = np.cumsum([0, *header.counts[:-1]])
-    # An integer column is given its own type back: the intensity scale is recognised from it.
-    columns = [table[:, at] if t.kind == "f" else exact(table[:, at], words[at::width])
-               for at, t in zip(starts, header.types, strict=True)]  # fmt: skip
-    return [_typed(column, dtype) for column, dtype in zip(columns, header.types, strict=True)]
+    return [table[:, at] if t.kind == "f" else typed(table[:, at], words[at::width], t)
+            for at, t in zip(starts, header.types, strict=True)]  # fmt: skip
 
 
 def _tail(error: Exception) -> str:
     return str(error).replace("\n", " ").rpartition(":")[2].strip()[:40]
-
-
-def _typed(column: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    if dtype.kind == "f" or not np.isfinite(column).all():
-        return column
-    limits = np.iinfo(dtype)
-    inside = len(column) == 0 or (column.min() >= limits.min and column.max() <= limits.max)
-    return column.astype(dtype) if inside else column
 
 
 def _binary(body: bytes, header: Header) -> list[np.ndarray]:

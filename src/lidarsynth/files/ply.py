@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, scan_table
-from lidarsynth.files.whole_numbers import EXACT, exact
+from lidarsynth.files.whole_numbers import typed
 from lidarsynth.lidar.scan import Scan
 
 MAX_HEADER = 1 << 16
@@ -134,8 +134,8 @@ def _ascii(body: bytes, vertex: Element, skipped_lines: int) -> Fields:
             f"expected numbers in an ascii PLY, found {str(error).rpartition(':')[2].strip()[:40]}"
         ) from None
     dtypes = [np.dtype(TYPES[types[0]]) for types in vertex.order]
-    typed = [_typed(column, words[i::width], t) for i, (column, t) in enumerate(zip(table.T, dtypes, strict=True))]
-    return dict(zip(vertex.names, typed, strict=True))
+    columns = [_typed(column, words[i::width], t) for i, (column, t) in enumerate(zip(table.T, dtypes, strict=True))]
+    return dict(zip(vertex.names, columns, strict=True))
 
 
 def _typed(column: np.ndarray, words: list[bytes], dtype: np.dtype) -> np.ndarray:
@@ -146,12 +146,7 @@ def _typed(column: np.ndarray, words: list[bytes], dtype: np.dtype) -> np.ndarra
         with np.errstate(over="ignore"):
             single = column.astype(dtype)
         return single if len(np.unique(single)) == len(np.unique(column)) else column
-    whole, limits = exact(column, words), np.iinfo(dtype)
-    if whole.dtype.kind != "f":
-        return whole.astype(dtype) if limits.min <= int(whole.min()) <= int(whole.max()) <= limits.max else whole
-    low, high = max(limits.min, -EXACT), min(limits.max, EXACT)
-    inside = (low <= column) & (column <= high) & (column == np.floor(column))
-    return column.astype(dtype) if inside.all() else column
+    return typed(column, words, dtype)
 
 
 def _skip(data: bytes, at: int, element: Element, dtypes: dict[tuple[str, ...], tuple[str, ...]]) -> int:

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_POINTS, NAMES, Fields, FileError
+from lidarsynth.files.fields import MAX_POINTS, NAMES, SCALED, Fields, FileError
 from lidarsynth.files.whole_numbers import exact
 
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
@@ -46,22 +46,19 @@ def read_text(data: bytes) -> Fields:
 
 
 def guessed(table: np.ndarray) -> Fields:
-    """The columns (N, 3 or more) of points without names, by what their numbers can be."""
+    """The columns (N, 3 or more) of points without names, by what their numbers can be; SCALED of a scan station's."""
     fields = dict(zip("xyz", table[:, :3].T, strict=True))
     more = [table[:, i] for i in range(3, table.shape[1])]
     whole = [bool(np.all((c >= 0) & (c <= 255) & (c == np.floor(c)))) for c in more]
     if len(more) == 3 and all(whole):
         return fields  # x y z r g b
     if more:
-        fields["intensity"] = _scan_station(more[0]) if len(more) == 4 and all(whole[1:]) else more[0]
+        fields["intensity"] = more[0]
+    if len(more) == 4 and all(whole[1:]) and more[0].min() < 0 and abs(more[0]).max() <= 2048:
+        fields[SCALED] = (more[0] + 2048) / 4095  # -2048 to 2047, as Leica's scan stations write .pts
     if len(more) == 2 and whole[1]:
         fields["ring"] = more[1]
     return fields
-
-
-def _scan_station(values: np.ndarray) -> np.ndarray:
-    """A .pts file's intensity of -2048 to 2047 (Leica), as 0-1; others as they are."""
-    return (values + 2048) / 4095 if values.min() < 0 and abs(values).max() <= 2048 else values
 
 
 def _lines(data: bytes) -> list[str]:

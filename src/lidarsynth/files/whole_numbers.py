@@ -1,4 +1,5 @@
-"""Whole numbers of 64 bits in text, such as times in nanoseconds, of which float64 does not tell neighbours apart."""
+"""Whole numbers in text: of 64 bits, such as times in nanoseconds, where float64 does not tell neighbours apart, and of
+the types that headers declare."""
 
 from __future__ import annotations
 
@@ -23,3 +24,14 @@ def exact(column: np.ndarray, words: Sequence[bytes] | Sequence[str]) -> np.ndar
         if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max:
             return np.array(whole, kind)
     return column
+
+
+def typed(column: np.ndarray, words: Sequence[bytes] | Sequence[str], dtype: np.dtype) -> np.ndarray:
+    """A column (N,) of float64 in the whole type that the header declares, from which the scale of intensities is told;
+    where it holds fractions, or numbers that this type does not, as `exact` has it, so that none is lost."""
+    whole, limits = exact(column, words), np.iinfo(dtype)
+    if whole.dtype.kind != "f":
+        return whole.astype(dtype) if limits.min <= int(whole.min()) <= int(whole.max()) <= limits.max else whole
+    low, high = max(limits.min, -EXACT), min(limits.max, EXACT)
+    inside = (low <= column) & (column <= high) & (column == np.floor(column))
+    return column.astype(dtype) if inside.all() else column

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from lidarsynth.files.fields import PLACE, Fields, find
+from lidarsynth.files.fields import PLACE, Fields, find, full_scale
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -29,11 +27,5 @@ def realised_fields(real: Scan, given: Fields) -> Fields:
     name = find(given, "reflectance")
     if name is None:
         return fields | {"intensity": real.reflectance}
-    fields[name] = (real.reflectance * _full(given[name])).astype(given[name].dtype)
+    fields[name] = (real.reflectance * full_scale(given)).astype(given[name].dtype)
     return fields
-
-
-def _full(values: np.ndarray) -> float:
-    """What a reflectance of 1 is in a column: 1 of floats up to 1, else the full scale of 8 or 16 bits."""
-    highest = values.max(initial=0)
-    return 1.0 if values.dtype.kind == "f" and highest <= 1 else 255.0 if highest <= 255 else 65535.0
