@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from test_frame import street
 from test_recognise import turn
 
@@ -19,6 +20,7 @@ from lidarsynth.data.windows import in_window
 from lidarsynth.data.workers import in_order
 from lidarsynth.experiment.folder import save
 from lidarsynth.files.formats import read, write
+from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.frame import parse_transform, transformed
 from lidarsynth.lidar.scan import Scan, scan_of
 from lidarsynth.lidar.sensor import SENSORS
@@ -41,8 +43,8 @@ def scans(tmp_path: Path) -> Path:
     return tmp_path / "in"
 
 
-def told(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text())
+def told(folder: Path, name: str = "report.json") -> dict:
+    return json.loads((folder / name).read_text())
 
 
 def names(folder: Path) -> list[str]:
@@ -94,6 +96,26 @@ def test_what_is_there_is_skipped(scans: Path, tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "o" / "000.npz").stat().st_mtime_ns == first["000.npz"]
     main(["project", str(scans / "d2"), *out, "--skip-existing"])
     assert told(tmp_path / "o")["skipped"] == 2
+
+
+@pytest.mark.parametrize("shards", [1, 2])
+def test_the_report_tells_of_the_scans_that_were_there(shards: int, scans: Path, tmp_path: Path):
+    """Rows and errors of those that a run before has made, without those that were taken away and failed."""
+    words = ["complete", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS, "--model", "bilinear"]
+    words += ["--corrupt", "beams:2", "--no-picture"]
+    parts = [["--shard", f"{i + 1}/{shards}"] for i in range(shards)] if shards > 1 else [[]]
+    for part in parts:
+        main([*words, *part])
+    whole = told(tmp_path / "o")
+    assert len(whole["scans"]) == 2 and whole["errors"]["lidarsynth"]["pixels"] > 0
+    for gone in ("001.ply", None):
+        if gone is not None:
+            (tmp_path / "o" / gone).unlink()
+        for part in parts:
+            main([*words, *part, "--skip-existing"])
+        again = told(tmp_path / "o")
+        assert again["errors"] == whole["errors"] and again["skipped"] == (1 if gone else 2)
+        assert sorted(row["name"] for row in again["scans"]) == ["000", "001"]
 
 
 def test_what_is_there_of_another_recipe_is_not_gone_on_with(
@@ -345,3 +367,99 @@ def test_the_library_warns_of_another_sensor_as_the_verbs_do(word: str):
         warnings.simplefilter("error")
         load("nearest").upsample(scan, "vlp-16")  # made to
         model.complete(street("hdl-64e-kitti"))
+
+
+SENSOR_FILE = "name = 'mine'\nwidth = 512\nelevations = [{}]\n"
+
+
+def test_a_recipe_is_what_its_words_mean(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A sensor that is learned anew under its name is another, one that is only called otherwise is the same."""
+    mine, other = tmp_path / "mine.toml", tmp_path / "other.toml"
+    for path in (mine, other):
+        path.write_text(SENSOR_FILE.format("2.0, 0.0, -2.0"))
+    words = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), "--no-picture", "--skip-existing", "--sensor"]
+    main([*words, str(mine)])
+    main([*words, str(other)])
+    assert told(tmp_path / "o")["skipped"] == 2
+    mine.write_text(SENSOR_FILE.format("2.0, 0.0, -3.0"))
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, str(mine)])
+    error = capsys.readouterr().err
+    assert "expected scans made as they are asked for now" in error and "sensor_is" in error and error.count("\n") == 1
+    report = told(tmp_path / "o")
+    report["settings"]["recipe"] = {"verb": "project", "sensor": str(mine), "projection": "auto"}
+    (tmp_path / "o" / "report.json").write_text(json.dumps(report))
+    main([*words, str(mine)])
+    assert told(tmp_path / "o")["skipped"] == 2, "a report of before tells words alone"
+
+
+def test_a_model_that_was_trained_further_does_not_go_on(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    experiment, network = load_parts("default")
+    save(tmp_path / "run", experiment, network)
+    words = ["complete", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS, "--skip-existing", "--model"]
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        with pytest.raises(SystemExit, match="130"):
+            main([*words, str(tmp_path / "run")])
+    report = told(tmp_path / "o")
+    weights = report["settings"]["recipe"]["weights"]
+    monkeypatch.chdir(tmp_path)
+    main([*words, "run/"])
+    assert told(tmp_path / "o")["skipped"] == 1 and told(tmp_path / "o")["settings"]["recipe"]["weights"] == weights
+    with torch.no_grad():
+        next(network.parameters()).mul_(1.5)
+    save(tmp_path / "run", experiment, network)
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "run"])
+    assert f" for {weights}; another --out" in capsys.readouterr().err
+    del report["settings"]["recipe"]["weights"], report["settings"]["recipe"]["sensor_is"], report["unfinished"]
+    report["settings"]["recipe"]["model"] = "run"
+    (tmp_path / "o" / "report.json").write_text(json.dumps(report))
+    (tmp_path / "o" / "000.ply").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        with pytest.raises(SystemExit, match="130"):
+            main([*words, "run"])
+    assert "mixed" not in told(tmp_path / "o"), "one of before goes on, and tells from now on"
+    assert told(tmp_path / "o")["settings"]["recipe"]["weights"] != weights
+
+
+def test_shards_of_several_recipes_are_told(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = ["project", str(scans), "--out", str(tmp_path / "o"), *WORDS]
+    main([*words, "--shard", "1/2", "--width", "256"])
+    main([*words, "--shard", "2/2", "--width", "512"])
+    said = capsys.readouterr().err
+    assert "report.json: expected shards of one recipe, found several" in said and told(tmp_path / "o")["mixed"] is True
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--width", "256", "--skip-existing"])
+    assert "other settings" in capsys.readouterr().err
+    main(["info", str(tmp_path / "o" / "report.json")])
+    assert "made with several settings" in capsys.readouterr().out
+    main([*words, "--shard", "1/2", "--width", "512"])
+    assert "mixed" not in told(tmp_path / "o") and "several" not in capsys.readouterr().err
+
+
+def test_a_second_run_into_a_folder_is_refused_and_touches_nothing(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    words, place = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS], tmp_path / "o"
+    place.mkdir()
+    at_work = ".000.0123456789abcdef.part"
+    (place / at_work).write_bytes(b"what the first is at")
+    with only_writer(place, "run"), pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert "expected a folder that nobody else writes to, found another run at work" in capsys.readouterr().err
+    assert names(place) == [at_work]
+    with only_writer(place, "run"):  # by a shard that is at work beside others
+        main([*words, "--shard", "1/2"])
+    shard = told(place, "report-1-of-2.json")
+    (place / "report-1-of-2.json").write_text(json.dumps({"unfinished": True} | shard))
+    main(words)
+    assert at_work in names(place)
+    (place / "report-1-of-2.json").write_text(json.dumps(shard))
+    main(words)
+    assert at_work not in names(place)

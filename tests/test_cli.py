@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -27,6 +28,8 @@ from lidarsynth.files.formats import read, read_image, write
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.cascade.layout import block, sampling
+from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.verbs.generation import cut, processes
 from lidarsynth.weights.load import load
@@ -138,10 +141,13 @@ def test_processes_generate_what_one_does(run: Run, tiny: Path, tmp_path: Path):
 
 def test_runs_are_cut_where_blocks_end_and_each_process_has_one():
     assert cut([range(3, 20), range(40, 41)], 16) == [range(3, 16), range(16, 20), range(40, 41)]
-    model = load("default")
-    for runs, asked, found in (([range(64)], 3, 3), ([range(64)], 9, 4), ([range(16)], None, 1), ([], 2, 1)):
-        assert processes(model, runs, asked) == found
-    assert processes(model, [range(64)]) == min(4, os.cpu_count() or 1)
+    for model, size in ((load("default"), 8), (load("default").choosing(1), 16)):
+        blocks = [range(4 * size)]
+        assert isinstance(model, CascadeModel)
+        assert model.together == size == block(sampling(model.network, None, None), model.layouts)
+        for runs, asked, found in ((blocks, 3, 3), (blocks, 9, 4), ([range(size)], None, 1), ([], 2, 1)):
+            assert processes(model, runs, asked) == found
+        assert processes(model, blocks) == min(4, os.cpu_count() or 1)
 
 
 def test_generate_makes_only_what_lacks(run: Run, tiny: Path, tmp_path: Path):
@@ -385,6 +391,32 @@ def test_info_knows_scans_models_presets_and_sensors(run: Run, tiny: Path, scan:
     assert [a.code for a in answers] == [0] * 4
     for answer, word in zip(answers, ("hdl-64e-kitti (", "42,", "31,099,650", "16 from +15.00"), strict=True):
         assert word in answer.out
+
+
+@pytest.mark.parametrize("found", [
+    {"settings": {}, "done": True, "scans": []}, {"settings": {}, "done": 1, "scans": 3, "skipped": 0, "failed": 0,
+    "seconds": 1}, {"protocol": 1, "version": 2, "values": [3]}, {"world": 0, "frame": 0, "boxes": 3, "points": 1},
+    {"protocol": 1, "version": 2, "values": {"a": {"value": 1.0, "unit": 3}, "b": {"value": "x"}}, "scans": 0},
+])  # fmt: skip
+def test_info_of_somebody_elses_json_of_the_same_words_is_a_line(run: Run, tmp_path: Path, found: dict):
+    (tmp_path / "a.json").write_text(json.dumps(found))
+    answer = run("info", tmp_path / "a.json")
+    if answer.code:
+        refused(answer, "a.json: expected a sensor, Ouster metadata or a report in JSON, found ", ", ".join(found))
+
+
+@pytest.mark.parametrize(("sensor", "said"), [
+    ('{"name": "mine"}', "mine"), ("[1, 2]", "[1, 2]"), ("HDL", "HDL"), ("{}", "{}"), ("3", "3"),
+])  # fmt: skip
+def test_info_of_a_network_tells_what_others_call_a_sensor(run: Run, tmp_path: Path, sensor: str, said: str):
+    onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in "xy"]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["x"], ["y"])], "g", values[:1], values[1:])
+    model = onnx.helper.make_model(graph)
+    onnx.helper.set_model_props(model, {"sensor": sensor})
+    onnx.save(model, str(tmp_path / "a.onnx"))
+    answer = run("info", tmp_path / "a.onnx")
+    assert answer.code == 0 and re.search(rf"sensor +{re.escape(said)}\n", answer.out), answer
 
 
 def test_a_recipe_that_stands_twice_is_refused(run: Run, scan: Path, tmp_path: Path):

@@ -372,6 +372,41 @@ def test_streets_apart_are_those_of_other_worlds(tmp_path: Path):
         prepare("files", tmp_path, tmp_path / "x", apart=True)
 
 
+def untold(folder: Path) -> None:
+    """The cache as it was before 2026-11-26, when none told the edition of its streets."""
+    index = json.loads((folder / "index.json").read_text())
+    del index["source"]["edition"]
+    (folder / "index.json").write_text(json.dumps(index))
+
+
+def test_no_cache_mixes_two_editions_of_the_streets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("embreex")
+    list(cache_synthetic(tmp_path / "new", 1, width=64, seed=3))
+    shutil.copytree(tmp_path / "new", tmp_path / "older")
+    untold(tmp_path / "older")
+    assert list(cache_synthetic(tmp_path / "older", 2, width=64, seed=3))[-1] == (2, 2), "today's streets are the same"
+    assert "edition" not in read_index(tmp_path / "older")["source"] and len(CachedImages(tmp_path / "older")) == 2
+    monkeypatch.setattr("lidarsynth.data.sources.EDITION", 3)
+    with pytest.raises(ValueError, match=r"expected a cache of source \{edition 3\}, found one of \{edition 2\}"):
+        list(cache_synthetic(tmp_path / "new", 2, width=64, seed=3))
+    assert len(CachedImages(tmp_path / "new")) == 1
+
+
+def test_a_cache_of_older_streets_is_read_and_not_added_to(tmp_path: Path):
+    pytest.importorskip("embreex")
+    from lidarsynth.streets.reader import SyntheticStreets
+
+    streets = SyntheticStreets(seed=4, sensor=SENSORS["hdl-64e-kitti"].resized(width=64))
+    list(write_cache(tmp_path, streets.image, 1, streets.sensor, {"name": "synthetic", "seed": 3}))
+    before = state(tmp_path)
+    for count in (1, 2):
+        with pytest.raises(ValueError, match=r"expected a cache of streets of edition .*, found one of other streets"):
+            list(cache_synthetic(tmp_path, count, width=64, seed=3))
+    assert state(tmp_path) == before and len(CachedImages(tmp_path)) == 1
+    (tmp_path / "0000000.npy").write_bytes(b"damaged")
+    assert list(cache_synthetic(tmp_path, 2, width=64, seed=3))[-1] == (2, 2), "all of it is made anew"
+
+
 @pytest.mark.parametrize(
     ("method", "columns", "size", "codec", "key"),
     [

@@ -1,6 +1,7 @@
 """Predictions, losses and weights: reference values, inverse pairs, and what the network is given."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,9 @@ from torch.testing import assert_close
 
 from lidarsynth.diffusion.denoiser import KINDS, LOSSES, Denoiser, masked_mean, min_snr_weight, target, to_x_0
 from lidarsynth.diffusion.schedule import SCHEDULES, Schedule, cosine
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import Diffusion
+from lidarsynth.systems.diffusion.training import generation_loss
 
 
 def close(actual: Tensor, expected: Tensor) -> None:
@@ -59,8 +63,13 @@ def test_loss_equals_the_reference(fixture_tensors, kind, loss, min_snr, gamma, 
     close(denoiser.loss(x_0, t, eps, mask, loss, gamma=None), values[f"per_sample_loss.{key}"])
     weighted = denoiser.loss(x_0, t, eps, mask, loss, gamma)
     close(weighted.mean(), values[f"weighted_per_sample_loss.{key}"])
-    as_released = denoiser.loss(x_0, t, eps, mask, loss, gamma, mean_weight=True)
-    close(as_released.mean(), values[f"reference_loss.{key}"])
+    weight = min_snr_weight(kind, *cosine().at(t, t), gamma)  # R2DM's program pairs every loss with every weight
+    as_released = denoiser.loss(x_0, t, eps, mask, loss, gamma=None).mean() * weight.mean()
+    close(as_released, values[f"reference_loss.{key}"])
+    if not use_mask and min_snr:
+        diffusion = Diffusion(kind=kind, loss=loss, gamma=gamma, mean_weight=True)
+        experiment = replace(preset("r2dm-h"), diffusion=diffusion)
+        close(generation_loss(experiment, denoiser, x_0, t, eps, t).mean(), values[f"reference_loss.{key}"])
 
 
 @pytest.mark.parametrize("name", ["cosine", "flow"])

@@ -16,7 +16,8 @@ from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, read_sensor
 from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.verbs.learned_sensor import doubts, sensor_toml, summary
+from lidarsynth.verbs.inputs import Inputs, Loaded
+from lidarsynth.verbs.learned_sensor import ENOUGH, doubts, learn, sensor_toml, summary
 
 
 def unpacked(path: Path) -> Scan:
@@ -25,6 +26,27 @@ def unpacked(path: Path) -> Scan:
     n = int(np.frombuffer(raw, "<i4", 1)[0])
     steps = np.frombuffer(raw, "<i4", 3 * n, 4).reshape(3, n)
     return Scan((np.cumsum(steps, axis=1, dtype=np.int32) / 1000.0).T.astype(np.float32))
+
+
+class Turn:
+    """A turn of a capture: how many there are is known when the last is read."""
+
+    path = Path("a.pcap")
+
+    def __init__(self, number: int, read: list[int]):
+        self.name, self.number, self.asked = f"{number:06d}", number, read
+
+    def read(self) -> Loaded:
+        self.asked.append(self.number)
+        return Loaded(turn(SENSORS["vlp-16"]), {}, 0)
+
+
+@pytest.mark.parametrize("count", [None, 450])
+def test_of_many_scans_enough_are_read_evenly_whether_their_number_is_known_or_not(count: int | None):
+    read: list[int] = []
+    learned = learn(Inputs(False, count, lambda: (Turn(i, read) for i in range(450)), True), "own")
+    assert ENOUGH / 2 <= learned.scans == len(read) <= ENOUGH
+    assert len(set(np.diff(read).tolist())) == 1 and read[0] == 0 and read[-1] > 440
 
 
 @pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e", "vlp-16"])

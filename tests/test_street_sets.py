@@ -19,6 +19,7 @@ from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.boxes import Box
+from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
@@ -300,6 +301,15 @@ def test_other_settings_and_other_folders_are_refused(tmp_path: Path):
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(ValueError, match="expected an empty folder"):
         list(write_streets(tmp_path / "mine", LabelledStreets(0, 1, SENSOR), "pcd"))
+
+
+def test_sets_and_caches_have_one_edition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    line = LabelledStreets(0, 1, Sensor("line", (-10.0,), 32, 1.0, 30.0))
+    written(tmp_path / "set", "pcd", line)
+    assert json.loads((tmp_path / "set" / "streets.json").read_text())["edition"] == EDITION
+    monkeypatch.setattr("lidarsynth.data.street_sets.EDITION", EDITION + 1)
+    with pytest.raises(ValueError, match=r"made with \{'edition': \d\}, found \{'edition': \d\}"):
+        written(tmp_path / "set", "pcd", line)
 
 
 def test_what_is_refused_leaves_the_folder_to_the_corrected_command(tmp_path: Path):

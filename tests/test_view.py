@@ -9,6 +9,7 @@ import threading
 import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -21,7 +22,8 @@ from lidarsynth.data.bags import POINTS, Cloud, cloud_of, open_bag, typestore
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.verbs.inputs import Loaded, Reading
+from lidarsynth.verbs.file_kinds import file_lines
+from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of, read_transform
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.colouring import colourings
 from lidarsynth.viewer.packing import Shown, packed
@@ -126,11 +128,15 @@ def test_labels_boxes_and_marks_lie_beside(tmp_path: Path):
     assert series_of([tmp_path], Reading()).count == 1, "rings/*.bin are no scans"
 
 
-@pytest.mark.parametrize("boxes", [
-    "[]", '{"boxes": 3}', '{"boxes": [{"kind": "car"}]}', "not json",
-    '{"boxes": [{"kind": "car", "centre": [0, 0, NaN], "size": [1, 1, 1], "yaw": 0}]}',
+@pytest.mark.parametrize(("boxes", "told"), [
+    ('{"boxes": 3}', "expected a list of boxes, found 3"), ('{"boxes": [{"kind": "car"}]}', "found {'kind': 'car'}"),
+    ("not json", "a.json: expected"),
+    ('{"boxes": [{"kind": "car", "centre": [0, 0, NaN], "size": [1, 1, 1], "yaw": 0}]}', "expected boxes of a kind,"),
 ])  # fmt: skip
-def test_what_does_not_fit_is_left_out_and_said(boxes: str, tmp_path: Path):
+def test_what_does_not_fit_is_left_out_and_said(boxes: str, told: str, tmp_path: Path):
+    """And boxes of the same number in another folder are not taken for those that are broken."""
+    (tmp_path / "boxes").mkdir()
+    (tmp_path / "boxes" / "a.json").write_text(json.dumps({"boxes": [BOX]}))
     path = tmp_path / "a.bin"
     write(path, turn())
     path.with_suffix(".json").write_text(boxes)
@@ -138,9 +144,45 @@ def test_what_does_not_fit_is_left_out_and_said(boxes: str, tmp_path: Path):
     path.with_suffix(".new").write_bytes(b"\0" * 12)
     shown = read_shown(path)
     assert shown.boxes == [] and shown.scan.label is None and "new" not in shown.scan.extra
-    labels, marks = shown.notes
+    labels, marks, broken = shown.notes
     assert re.search(r"labels left out: .*expected 16384 bytes.*found 12", labels)
-    assert re.search(r"a.new left out: expected 4096 bytes for 4096 points.* found 12 bytes", marks)
+    assert marks == "a.new left out: expected 4096 bytes for 4096 points, found 12 bytes"
+    assert broken.startswith(f"boxes left out: {path.with_suffix('.json')}") and told in broken
+
+
+def test_marks_of_points_without_a_return_go_with_them_unsaid(tmp_path: Path):
+    scan, path = turn(), tmp_path / "a.bin"
+    write(path, Scan(np.concatenate([np.zeros((2, 3), np.float32), scan.xyz])))
+    new = np.arange(len(scan) + 2) % 2
+    path.with_suffix(".new").write_bytes(new.astype("u1").tobytes())
+    shown = read_shown(path)
+    assert shown.notes == ("2 points without a return or not finite were dropped",)
+    np.testing.assert_array_equal(shown.scan.extra["new"], new[2:])
+
+
+@pytest.mark.parametrize("other", ["[]", '{"beams": 16}'])
+def test_a_json_without_boxes_is_something_else(other: str, tmp_path: Path):
+    write(tmp_path / "a.bin", turn())
+    (tmp_path / "a.json").write_text(other)
+    (tmp_path / "boxes").mkdir()
+    (tmp_path / "boxes" / "a.json").write_text(json.dumps({"boxes": [BOX]}))
+    shown = read_shown(tmp_path / "a.bin")
+    assert list(shown.boxes) == [BOX] and shown.notes == ()
+
+
+def test_rings_count_from_the_top_of_the_sensors_frame(tmp_path: Path):
+    """Of a file whose z points down, as messages of a bag do: its strip is not upside down, and `info` knows it."""
+    scan, reading = turn(), Reading(transform=read_transform(None, axes="frd"))
+    write(tmp_path / "up.ply", scan)
+    write(tmp_path / "down.ply", replace(scan, xyz=scan.xyz * np.float32([1, -1, -1])))
+    shown = series_of([tmp_path / "down.ply"], reading)[0].scan
+    np.testing.assert_allclose(shown.xyz, scan.xyz, atol=1e-5)
+    np.testing.assert_array_equal(shown.ring, scan.ring)
+    (item,) = inputs_of([tmp_path / "down.ply"], reading).stream()
+    np.testing.assert_array_equal(shown.ring, item.read().scan.ring)
+    np.testing.assert_array_equal(rows_of(shown).row, rows_of(scan).row)
+    lines, upright = file_lines(tmp_path / "down.ply", reading), file_lines(tmp_path / "up.ply", Reading())
+    assert lines is not None and upright is not None and lines["sensor"] == upright["sensor"]
 
 
 def bag(path: Path, times: list[int]) -> Path:

@@ -57,7 +57,7 @@ Steps = Annotated[
 Resamples = Annotated[int | None, arg(metavar="INT", help="passes over each step of repaint; default 10.")]
 Least = Annotated[
     float | None,
-    arg(metavar="P", help="leave out new points that are right with less than this chance, 0 to 1; see docs/files.md."),
+    arg(metavar="P", help="leave out new points less likely right than this, 0 to 1; see docs/confidence.md."),
 ]
 Intensity = Annotated[
     Literal["auto", "unit", "byte", "uint16", "none"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
     from lidarsynth.data.bag_writer import BagWriter
     from lidarsynth.systems.scan_model import ScanModel
-    from lidarsynth.verbs.batch import Job, Result
+    from lidarsynth.verbs.batch import Job, Result, Work
     from lidarsynth.verbs.inputs import Inputs
 
 PICTURES, NAMED = 10, 5  # scans that get a picture unasked; failures that are named one by one
@@ -133,58 +134,113 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
 
 def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str) -> list[Result]:
     from lidarsynth.lidar.whole_file import TOKEN, sweep
-    from lidarsynth.verbs.batch import run
-    from lidarsynth.verbs.batch_report import merge_shards, parse_shard, report_of, report_path, write_report
+    from lidarsynth.verbs.batch_report import (
+        is_mixed,
+        merge_shards,
+        parse_shard,
+        report_of,
+        report_path,
+        rows_before,
+        shards_at_work,
+        write_report,
+    )
     from lidarsynth.verbs.output_files import works
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
-    ending = many.format or ("npz" if job.verb == "project" else "ply")
-    settings, report = _settings(job, out, many, ending, intensity), report_path(out, shard)
-    if shard[1] == 1:  # other machines may be writing there else
-        sweep(out, deep=True, token=TOKEN)
+    ending, report = many.format or ("npz" if job.verb == "project" else "ply"), report_path(out, shard)
     stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside)
     first = next(stream, None)
-    model = _model(job) if first is not None else None
-    count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
-    results = []
-    with scan_bar(job.verb, count) as on_scan:
-        for result in run(job, _again(first, stream), many.workers, model):
-            if result.error is None and all(earlier.error is not None for earlier in results):
-                _begin(report, settings)
-            results.append(result)
-            on_scan()
-            _tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
-    seconds = time.perf_counter() - begun
-    if all(result.error is not None for result in results) and results:
-        _refuse_all(results)
-    out.mkdir(parents=True, exist_ok=True)
-    write_report(report, report_of(results, len(skipped), seconds, settings))
-    merged = merge_shards(out, shard[1])
+    with _held(out, alone=shard[1] == 1):
+        model = _model(job) if first is not None or skipped else None
+        settings = _settings(job, model, out, many, ending, intensity)
+        if shard[1] == 1 and not shards_at_work(out):  # whose files are half written, and which hold no lock
+            sweep(out, deep=True, token=TOKEN)
+        count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
+        results = _done(job, model, _again(first, stream), many, count, report, settings)
+        seconds = time.perf_counter() - begun
+        if all(result.error is not None for result in results) and results:
+            _refuse_all(results)
+        out.mkdir(parents=True, exist_ok=True)
+        before = rows_before(report, skipped)
+        write_report(report, report_of(results, len(skipped), seconds, settings, before))
+        merged = merge_shards(out, shard[1])
+    if merged is not None and is_mixed(merged):
+        warn(f"{merged}: expected shards of one recipe, found several in report-*-of-{shard[1]}.json; make those of "
+             "another anew, without --skip-existing")  # fmt: skip
     _summary(results, len(skipped), seconds, merged or report)
     return results
 
 
-def _settings(job: Job, out: Path, many: Many, ending: str, intensity: str) -> dict[str, Any]:
+def _done(
+    job: Job,
+    model: ScanModel | None,
+    works: Iterator[Work],
+    many: Many,
+    count: int | None,
+    report: Path,
+    settings: dict[str, Any],
+) -> list[Result]:
+    """What came of the works, said as they are done; from the first that is, the report tells that the run goes on."""
+    from lidarsynth.verbs.batch import run
+
+    results = []
+    with scan_bar(job.verb, count) as on_scan:
+        for result in run(job, works, many.workers, model):
+            if result.error is None and all(earlier.error is not None for earlier in results):
+                _begin(report, settings, many.skip_existing)
+            results.append(result)
+            on_scan()
+            _tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
+    return results
+
+
+@contextmanager
+def _held(out: Path, alone: bool) -> Iterator[None]:
+    """The folder, which nobody else writes to if `alone`; shards share it. One that is made for the lock, and stays
+    empty, is taken away.
+
+    Raises ValueError where another process holds it.
+    """
+    from lidarsynth.files.lock import only_writer
+
+    made = [folder for folder in (out, *out.parents) if not folder.exists()] if alone else []
+    try:
+        with only_writer(out, "run") if alone else nullcontext():
+            yield
+    finally:
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _settings(job: Job, model: ScanModel | None, out: Path, many: Many, ending: str, intensity: str) -> dict[str, Any]:
     """What the report says of the run. Raises ValueError where files that are there already would be gone on with, and
     were made in another way."""
+    from lidarsynth.systems.fingerprint import fingerprint
     from lidarsynth.verbs.batch_report import check_same
 
     reading = {"intensity": None if intensity == "auto" else intensity, "rings": many.rings, "topic": many.topic}
-    recipe = job.recipe() | {name: word for name, word in reading.items() if word is not None}
+    recipe = job.recipe(None if model is None else fingerprint(model))
+    recipe |= {name: word for name, word in reading.items() if word is not None}
     if many.skip_existing:
         check_same(out, recipe)
     settings = {"verb": job.verb, "model": job.model, "out": str(out), "format": ending, "workers": many.workers}
     return settings | ({"shard": many.shard} if many.shard else {}) | {"recipe": recipe}
 
 
-def _begin(report: Path, settings: dict[str, Any]) -> None:
-    """Says how the scans of a run are made that may be killed; the report of such scans stays until the run is done."""
+def _begin(report: Path, settings: dict[str, Any], goes_on: bool) -> None:
+    """Says how the scans of a run are made that may be killed; the report of such scans stays until the run is done.
+
+    goes_on  with the scans that are there, which `check_same` found to be alike
+    """
     from lidarsynth.verbs.batch_report import same, unfinished, write_report
 
-    if same(report, settings["recipe"]):
+    recipe = settings["recipe"]
+    if same(report, recipe):
         return
     report.parent.mkdir(parents=True, exist_ok=True)
-    write_report(report, unfinished(settings, mixed=report.exists()))
+    mixed = report.exists() and not (goes_on and same(report, recipe, told=False))
+    write_report(report, unfinished(settings, mixed))
 
 
 def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:

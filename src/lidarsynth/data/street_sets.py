@@ -31,6 +31,7 @@ from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
 from lidarsynth.streets.areas import MORE
 from lidarsynth.streets.drawing import bev_with_boxes, strips
+from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import LabelledStreets, Options
 from lidarsynth.streets.world import POSES
 
@@ -40,8 +41,6 @@ LAYOUTS: dict[str, Layout] = {
     "nuscenes": NUSCENES,
     "pcd": PCD,
 }
-EDITION = 2  # of the streets: raised when equal settings give other scans or boxes, so that no set mixes them;
-# `_edition` raises it for some settings only
 RECORD = "streets.json"
 CHUNK = 16  # frames that one process makes in a row, at most; they share their world
 

@@ -112,14 +112,9 @@ class Denoiser:
         mask: Tensor | None = None,  # broadcastable to x_0, 1 = counts; None = every pixel counts
         loss: str = "l2",  # a key of LOSSES
         gamma: float | None = 5.0,  # min-SNR; inf = R2DM's unweighted option; None = no weight at all
-        mean_weight: bool = False,  # give every sample the batch's mean weight, see below
         floor: float = 0.0,  # least weight of a sample; x_0 prediction has weights of almost 0 where noise is high
     ) -> Tensor:
-        """Weighted loss per sample (B,); minimise its mean.
-
-        R2DM's program multiplies losses (B, 1) with weights (B, 1, 1, 1), which pairs every loss with every weight: it
-        minimises mean(loss) * mean(weight). `mean_weight=True` does the same.
-        """
+        """Weighted loss per sample (B,); minimise its mean."""
         if loss not in LOSSES:
             raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
         log_snr, alpha, sigma = self.schedule.at(t, x_0)
@@ -129,5 +124,4 @@ class Denoiser:
         per_sample = masked_mean(error, mask)
         if gamma is None:
             return per_sample
-        weight = min_snr_weight(self.kind, log_snr, alpha, sigma, gamma).flatten().clamp(min=floor)
-        return per_sample * (weight.mean() if mean_weight else weight)
+        return per_sample * min_snr_weight(self.kind, log_snr, alpha, sigma, gamma).flatten().clamp(min=floor)

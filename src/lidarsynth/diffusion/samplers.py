@@ -115,7 +115,7 @@ def sample(
     step: Step,  # one of STEPS
     steps: int,
     rng: Rng,
-    grid: Grid = even_times,  # one of GRIDS
+    grid: Grid = even_times,  # or even_log_snr
 ) -> Iterator[State]:
     """Carry x_1 to x_0 in `steps` steps and yield the state after each; `functools.partial` sets a step's options.
 
@@ -231,9 +231,4 @@ STEPS: dict[str, Step] = {
     "ddim": ddim,
     "dpmpp-2m": dpmpp_2m,
     "heun": heun,
-}
-
-GRIDS: dict[str, Grid] = {
-    "time": even_times,
-    "log-snr": even_log_snr,
 }

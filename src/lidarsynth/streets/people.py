@@ -7,8 +7,6 @@ import numpy as np
 
 from lidarsynth.streets.shapes import Mesh, box, frustum, join, moved
 
-WAIST = 0.83  # metres up, of the hip of a grown person
-
 
 def scaled(shape: Mesh, length: float, width: float, height: float) -> Mesh:
     """Longer, wider and higher by these factors."""

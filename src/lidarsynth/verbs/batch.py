@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from lidarsynth.verbs.realisation import realise_scan, realised_fields
 
 THIN = 0.1  # of the usual points of a ring; fewer do not make it one more than a sensor's beams
 FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
+MEANT = {"model": "weights", "sensor": "sensor_is", "into": "into_is"}  # words of a recipe -> what they mean, in digits
 FIELDS = {"realise": realised_fields, "label": labelled_fields}  # of a bag's messages; of the others, `message_fields`
 
 
@@ -80,14 +83,26 @@ class Job:
         marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample") else ()
         return (*marks, LABEL) if self.labels or self.verb == "realise" else marks
 
-    def recipe(self) -> dict[str, Any]:
-        """What decides the results, as plain values; what was not asked for is left out."""
+    def recipe(self, weights: str | None = None) -> dict[str, Any]:
+        """What decides the results, as plain values; what was not asked for is left out.
+
+        weights  the `fingerprint` of the model, where it is loaded: a folder of that name may hold others tomorrow, and
+                 a file of a sensor others too, whose digits are told as `sensor_is` and `into_is`
+        Raises ValueError for a sensor that is none.
+        """
         names = ["verb", "sensor", "projection", "width"]
         if self.verb != "project":
             names = ["verb", "model", "sensor", "corrupt", "into", "times", "least", "labels"]
         kept = {name: getattr(self, name) for name in names} | (vars(self.how) if self.verb != "project" else {})
         kept["transform"] = None if self.transform is None else np.asarray(self.transform).tolist()
+        kept |= {MEANT[name]: _digits(word) for name in ("sensor", "into") if (word := kept.get(name)) is not None}
+        kept |= {MEANT["model"]: weights}
         return {name: value for name, value in kept.items() if value is not None and value is not False}
+
+
+def _digits(word: str) -> str:
+    """16 hex digits of what a sensor is, whatever it is called here."""
+    return blake2b(json.dumps(get_sensor(word).to_dict(), sort_keys=True).encode(), digest_size=8).hexdigest()
 
 
 @dataclass(frozen=True)

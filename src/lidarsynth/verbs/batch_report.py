@@ -12,7 +12,7 @@ from typing import Any
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
-from lidarsynth.verbs.batch import Result
+from lidarsynth.verbs.batch import MEANT, Result
 
 REPORT = "report.json"
 Shard = tuple[int, int]  # this part, counted from 1, and all parts
@@ -45,12 +45,26 @@ def check_same(out: Path, recipe: Mapping[str, Any]) -> None:
                              "another --out, or without --skip-existing all are made anew")  # fmt: skip
 
 
-def same(path: Path, recipe: Mapping[str, Any]) -> bool:
-    """Whether there is a report of scans of this recipe, and of no other."""
+def same(path: Path, recipe: Mapping[str, Any], told: bool = True) -> bool:
+    """Whether there is a report of scans of this recipe, and of no other.
+
+    told  whether it has to say of each word what it meant; those of before 2026-11-26 do not
+    """
     report = _read(path) if path.is_file() else None
-    return (
-        report is not None and "recipe" in report["settings"] and "mixed" not in report and not _unlike(report, recipe)
-    )
+    if report is None or "recipe" not in report["settings"] or "mixed" in report or _unlike(report, recipe):
+        return False
+    return not told or all((name in recipe) == (name in report["settings"]["recipe"]) for name in MEANT.values())
+
+
+def is_mixed(path: Path) -> bool:
+    """Whether a report is of scans of several recipes."""
+    return "mixed" in (_read(path) or {})
+
+
+def shards_at_work(out: Path) -> list[Path]:
+    """Reports of those shards of a folder that are not done: at work, or killed."""
+    reports = {path: _read(path) for path in sorted(out.glob("report-*-of-*.json"))}
+    return [path for path, report in reports.items() if report is not None and "unfinished" in report]
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -63,9 +77,13 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _unlike(report: Mapping[str, Any], recipe: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """What differs from a report's recipe, now and as it was; until 2026-11-26 they had verb and model alone."""
+    """What differs from a report's recipe, now and as it was; what a word meant decides, where both tell that. Until
+    2026-11-26 they had verb and model alone, then words alone."""
     found = report["settings"].get("recipe", {name: report["settings"][name] for name in ("verb", "model")})
     names = recipe.keys() | found.keys() if "recipe" in report["settings"] else recipe.keys() & found.keys()
+    for word, meant in MEANT.items():
+        told = meant in recipe and meant in found
+        names = names - {word if told and recipe[meant] == found[meant] else meant if not told else ""}
     pairs = {name: (recipe.get(name), found.get(name)) for name in sorted(names)}
     return {name: (_word(now), _word(was)) for name, (now, was) in pairs.items() if now != was}
 
@@ -74,10 +92,24 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)[:60]
 
 
-def report_of(results: Sequence[Result], skipped: int, seconds: float, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values: settings, totals, rate, mean errors where a corruption was asked for, and a row per scan."""
+def rows_before(path: Path, skipped: Sequence[Path]) -> list[dict[str, Any]]:
+    """What a report that lies there says of the scans that were left out, by the files that were made of them."""
+    there = set(map(str, skipped))
+    rows = ((_read(path) if path.is_file() else None) or {}).get("scans", [])
+    return [row for row in rows if row.get("target") in there and "error" not in row]
+
+
+def report_of(
+    results: Sequence[Result],
+    skipped: int,
+    seconds: float,
+    settings: Mapping[str, Any],
+    before: Sequence[dict[str, Any]] = (),
+) -> dict[str, Any]:
+    """Plain values: settings, totals and rate of this run, mean errors where a corruption was asked for, and a row per
+    scan; rows of those that a run before has made go `before`."""
     failed = [result for result in results if result.error is not None]
-    done, rows = len(results) - len(failed), [_row(result) for result in results]
+    done, rows = len(results) - len(failed), [*before, *(_row(result) for result in results)]
     return {
         "settings": dict(settings),
         "done": done,
@@ -142,6 +174,8 @@ def merge_shards(out: Path, parts: int) -> Path | None:
     total: dict[str, Any] = {key: sum(r[key] for r in reports) for key in ("done", "skipped", "failed")}
     longest = max(r["seconds"] for r in reports)
     merged = {"settings": reports[0]["settings"] | {"shards": parts}, **total, "seconds": longest}
+    recipe = reports[0]["settings"].get("recipe", {})
+    merged |= {"mixed": True} if any("mixed" in r or _unlike(r, recipe) for r in reports) else {}
     merged |= {"scans_per_second": round(total["done"] / longest, 3) if longest else None}
     rows = sorted((row for r in reports for row in r["scans"]), key=lambda row: row["name"])
     merged |= {**_means(rows), "scans": rows}

@@ -9,7 +9,7 @@ from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import BARE, BESIDE, READERS
 from lidarsynth.files.labels import label_path
 
-LABEL = ".label"
+LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
 BYTES = {LABEL: 4} | {f".{name}": kind.itemsize for name, kind in BESIDE.items()}  # a point
 
 

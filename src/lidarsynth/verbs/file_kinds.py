@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -18,11 +17,11 @@ from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
-from lidarsynth.lidar.frame import check_frame, transformed
+from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict
-from lidarsynth.verbs.inputs import Reading, has_scans, is_stream
+from lidarsynth.verbs.inputs import Reading, has_scans, is_stream, moved
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 
@@ -100,7 +99,7 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
 def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
     """Points, range, reflectance, fields, sensor and frame of a scan, moved as `reading` says."""
     if reading.transform is not None:
-        scan = replace(scan, xyz=transformed(scan.xyz, reading.transform))
+        scan = moved(scan, reading.transform)
     name, reason = recognise(scan)
     depth, light = np.linalg.norm(scan.xyz, axis=1), scan.reflectance
     own = [field for field in ("ring", "time", "label") if getattr(scan, field) is not None]

@@ -24,11 +24,11 @@ from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.scan_model import OnStep, ScanModel
+from lidarsynth.verbs.companions import LABEL
 
 RECORD = "generate.json"
 NAMED = frozenset({"model", "sensor"})  # in words what `weights` says in digits, by which alone folders are compared
 MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
-LABEL = ".label"  # ending of a file with SemanticKITTI's id of each point
 
 
 def endings_of(format: str, labels: bool, picture: bool) -> tuple[str, ...]:

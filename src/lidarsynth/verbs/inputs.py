@@ -326,12 +326,18 @@ def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
     if reading.transform is None:
         return Loaded(scan, given, dropped)
     extra = {PLACE: np.arange(1, len(scan) + 1), **scan.extra}  # that of a message stays
-    xyz, ring = transformed(scan.xyz, reading.transform), scan.ring
-    if ring is not None:  # where up is elsewhere now, they count from the other end
-        ring = rings_from_top(ring, xyz)
-        if (ring != scan.ring).any() and find(dict(scan.extra), "ring") is None:
-            extra["ring"] = scan.ring
-    return Loaded(replace(scan, xyz=xyz, ring=ring, extra=extra), given, dropped)
+    return Loaded(moved(replace(scan, extra=extra), reading.transform), given, dropped)
+
+
+def moved(scan: Scan, transform: np.ndarray) -> Scan:
+    """The scan in another frame, by a (4, 4) `transform`: where up is elsewhere then, its rings count from the other
+    end, and `extra["ring"]` has the numbers as they were. Raises FileError for ring numbers that are none."""
+    xyz, ring, extra = transformed(scan.xyz, transform), scan.ring, dict(scan.extra)
+    if (was := scan.ring) is not None:
+        ring = rings_from_top(was, xyz)
+        if (ring != was).any() and find(extra, "ring") is None:
+            extra["ring"] = was
+    return replace(scan, xyz=xyz, ring=ring, extra=extra)
 
 
 def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) -> Scan:

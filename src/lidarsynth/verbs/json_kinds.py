@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ def json_lines(path: Path) -> Lines | None:
     keys = set(values) if isinstance(values, Mapping) else set()
     for needed, told in OURS.items():
         if set(needed) <= keys:
-            return told(values)
+            with suppress(LookupError, TypeError, AttributeError, ValueError):  # somebody else's of the same words
+                return told(values)
     if keys & {"elevations", "beams"}:
         return None
     listed = ", ".join(list(values)[:6]) if keys else type(values).__name__
@@ -40,6 +42,8 @@ def _many(values: Mapping[str, Any]) -> Lines:
         lines["rate"] = f"{rate} scans a second"
     if values.get("unfinished"):
         lines["kind"] += ", which is not done: stopped, or still running"
+    if values.get("mixed"):
+        lines["kind"] += ", made with several settings"
     wrong = [row for row in values["scans"] if "error" in row]
     return lines | ({"first failure": str(wrong[0]["error"])[:200]} if wrong else {})
 

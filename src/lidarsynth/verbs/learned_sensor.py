@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,14 +17,30 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.inputs import Input, Inputs
 
+T = TypeVar("T")
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
 def learn(inputs: Inputs, name: str, broken: list[str] | None = None) -> LearnedSensor:
     """The sensor of at most ENOUGH of the inputs, evenly chosen. Those that cannot be read are left out, and why is
     added to `broken`; where none can be, ValueError."""
-    every = max(-(-(inputs.count or ENOUGH) // ENOUGH), 1)
-    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every), [] if broken is None else broken), name)
+    broken = [] if broken is None else broken
+    if inputs.count is None:
+        return learn_sensor(_readable(spread(inputs.stream(), ENOUGH), broken), name)
+    every = max(-(-inputs.count // ENOUGH), 1)
+    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every), broken), name)
+
+
+def spread(items: Iterable[T], most: int) -> list[T]:
+    """At most `most` items of a stream of unknown length, evenly chosen: every first, second, fourth or 2^k-th, of
+    which half as many or more are kept. No more than `most` + 1 are held at a time."""
+    kept, every = [], 1
+    for number, item in enumerate(items):
+        if number % every == 0:
+            kept.append(item)
+        if len(kept) > most:
+            kept, every = kept[::2], 2 * every
+    return kept
 
 
 def from_metadata(path: Path, name: str) -> Sensor | None:

@@ -91,8 +91,16 @@ def _onnx(path: Path) -> Lines:
     lines = {"kind": f"network in ONNX, {by}, opset {max((o.version for o in proto.opset_import), default=0)}"}
     lines |= {key: told[key] for key in ("model", "does", "licence", "data", "columns") if told.get(key)}
     if told.get("sensor"):
-        lines["sensor"] = str(json.loads(told["sensor"]).get("name"))
+        lines["sensor"] = _sensor(told["sensor"])
     return lines | {"in": _tensors(proto.graph.input), "out": _tensors(proto.graph.output)}
+
+
+def _sensor(text: str) -> str:
+    """The name of a sensor in JSON, or the start of what other writers say under this word."""
+    try:
+        return str(json.loads(text)["name"])
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return text[:60]
 
 
 def _tensors(values: Any) -> str:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from torch import nn
 
+from lidarsynth.data.index import read_index
 from lidarsynth.diffusion.denoiser import KINDS, LOSSES
 from lidarsynth.diffusion.schedule import SCHEDULES
 from lidarsynth.experiment.folder import read_experiment
@@ -20,20 +23,26 @@ from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.depth import CODECS
 from lidarsynth.lidar.projection import PROJECTIONS
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.systems.table import SYSTEMS, build_network, task_of, transfer
+from lidarsynth.pictures.figure import compare
+from lidarsynth.systems.table import SYSTEMS, build_network, system_of, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import VARIED, VIRTUAL, TrainingImages, open_images
+from lidarsynth.training.examples import ENDLESS, SYNTHETIC, VARIED, VIRTUAL, TrainingImages, folders_of, open_images
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import DECAYS, Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
 from lidarsynth.training.monitor import Monitor
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training_start import Start, check_start, start_of, write_start
-from lidarsynth.weights.load import load_parts
+from lidarsynth.weights.load import load_parts, shipped
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
+
+TERMS = "for what was learned from the scans, their own terms"  # a licence that nobody but their owner knows
+UNTRUE_NOW = "; no real scan"  # of a card, once scans are learned from
+EVERY = 4  # beams, of which pictures are completed from one
 
 
 def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str | Path | None = None) -> Experiment:
@@ -130,8 +139,9 @@ def _run(
     resume: bool,
     accelerator: Accelerator,
 ) -> Iterator[Progress]:
-    experiment, state, note = _begin(experiment, images, out, begun, resume, accelerator)
-    monitor = Monitor(experiment, state.task, data, validation)
+    experiment, state, note = _begin(experiment, images, data, out, begun, resume, accelerator)
+    task = replace(state.task, pictures=completions) if experiment.base else state.task  # which a base generates
+    monitor = Monitor(experiment, task, data, validation)
     if accelerator.is_main_process:
         yield Progress(state.step, {}, 0.0, 0.0, note=note)
     with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
@@ -152,6 +162,7 @@ def _run(
 def _begin(
     experiment: Experiment,
     images: TrainingImages,
+    data: str | Path,
     out: Path,
     begun: Start,
     resume: bool,
@@ -176,9 +187,7 @@ def _begin(
     if weights and not saved:
         source, trained = load_parts(weights)
         transfer(network, experiment, trained, source, weights)
-        learned = "; ".join(filter(None, (source.card.data, card.data)))
-        licence = card.licence or source.card.licence
-        card = Card(licence, learned, (*source.card.history, f"from {source.name}"), sensor=sensor)
+        card = _gone_on(source, weights, card, data)
     state = start(experiment, network, task_of(experiment), accelerator.scaler)
     if saved:
         card = _same_experiment(saved, experiment).card
@@ -196,6 +205,22 @@ def _begin(
     accelerator.wait_for_everyone()
     notes = note, "" if saved else _never_averaged(experiment, state)
     return replace(experiment, card=card), state, "; ".join(filter(None, notes))
+
+
+def _gone_on(source: Experiment, weights: str, card: Card, data: str | Path) -> Card:
+    """The card of a run that begins with the `weights` of `source`: what both learned from, and under which terms."""
+    licence, scans = card.licence or source.card.licence, str(data) not in ENDLESS and _holds_scans(data)
+    told = source.card.data.removesuffix(UNTRUE_NOW) if scans else source.card.data
+    before = f"what `{weights}` learned from" if weights in shipped() else told
+    if scans and licence and not card.licence and not licence.startswith(TERMS):
+        licence = f"{TERMS}; for the rest, {licence}"
+    learned = ", then ".join(filter(None, (before, card.data)))
+    return Card(licence, learned, (*source.card.history, f"from {source.name}"), sensor=card.sensor)
+
+
+def _holds_scans(data: str | Path) -> bool:
+    """Whether any of the caches holds others than synthetic streets."""
+    return any(read_index(Path(folder))["source"].get("name") != SYNTHETIC for folder in folders_of(data))
 
 
 def _never_averaged(experiment: Experiment, state: Run) -> str:
@@ -232,6 +257,23 @@ def _with_history(experiment: Experiment, step: int, accelerator: Accelerator) -
     device = torch.cuda.get_device_name() if accelerator.device.type == "cuda" else accelerator.device.type
     line = f"{step:,} steps of {experiment.training.batch_size} on {accelerator.num_processes} x {device}"
     return replace(experiment, card=replace(experiment.card, history=(*experiment.card.history, line)))
+
+
+@torch.no_grad()
+def completions(
+    experiment: Experiment, network: nn.Module, images: Sequence[RangeImage], count: int = 2
+) -> list[np.ndarray]:
+    """Pictures (H', W', 3) uint8 of images completed from every fourth beam, where these hold any return."""
+    make, pictures = system_of(experiment).model, []
+    assert make is not None
+    for truth in images[:count]:
+        known = np.zeros(truth.shape, bool)
+        known[::EVERY] = True
+        before = truth.keep(known)
+        if before.mask.any():
+            filled = make(experiment, network).complete(before, known)
+            pictures.append(compare({f"every {EVERY}th beam": before, "completed": filled, "measured": truth}))
+    return pictures
 
 
 def _due(step: int, every: int, experiment: Experiment) -> bool:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import BARE, BESIDE, read_with_report
 from lidarsynth.files.labels import read_labels
-from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.verbs.inputs import stem
 from lidarsynth.viewer.packing import Shown
@@ -27,7 +23,7 @@ def read_shown(path: Path, intensity: str = "auto") -> Shown:
     `boxes` up to three levels up, as `lidarsynth streets` writes them. Raises FileError for the scan itself.
     """
     labels = next((p for p in _label_places(path) if p.is_file()), None)
-    notes = []
+    notes: list[str] = []
     try:
         scan, dropped = read_with_report(path, intensity, labels)
     except FileError:
@@ -37,11 +33,16 @@ def read_shown(path: Path, intensity: str = "auto") -> Shown:
         notes.append(_why(labels, len(scan) + dropped))
     if dropped:
         notes.append(f"{dropped} points without a return or not finite were dropped")
-    for name in BESIDE if path.name.lower().endswith(BARE) else ():
-        if (marks := path.with_suffix(f".{name}")).is_file() and name not in scan.extra:
-            scan, note = _with_marks(scan, name, marks, dropped)
-            notes += note
-    boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])
+    bare = path.name.lower().endswith(BARE) and not path.name.lower().endswith(".pcd.bin")
+    for name, kind in BESIDE.items() if bare else ():
+        if (marks := path.with_suffix(f".{name}")).is_file() and name not in scan.extra:  # those that fit are read
+            count = len(scan) + dropped
+            notes.append(f"{marks.name} left out: expected {count * kind.itemsize} bytes for {count} points, "
+                         f"found {marks.stat().st_size} bytes")  # fmt: skip
+    try:
+        boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])
+    except ValueError as error:
+        return Shown(scan, [], (*notes, f"boxes left out: {error}"))
     return Shown(scan, boxes, tuple(notes))
 
 
@@ -65,14 +66,19 @@ def _box_places(path: Path) -> list[Path]:
 
 
 def _boxes(path: Path) -> list[dict[str, Any]] | None:
-    """The boxes of a frame's JSON; None where there is no such file, or it is of another kind."""
+    """The boxes of a frame's JSON; None where there is no such file, or it holds something else.
+
+    Raises ValueError for one that is no JSON, and for boxes that are none."""
     try:
         record = read_json(path, LARGEST_INDEX // 16) if path.is_file() else None
-    except (ValueError, OSError):
+    except OSError as error:
+        raise ValueError(f"{path}: expected a file that can be read, found: {error.strerror}") from None
+    if not isinstance(record, dict) or "boxes" not in record:
         return None
-    found = record.get("boxes") if isinstance(record, dict) else None
-    if not isinstance(found, list) or not all(_is_box(box) for box in found):
-        return None
+    if not isinstance(found := record["boxes"], list):
+        raise ValueError(f"{path}: expected a list of boxes, found {found!r:.60}")
+    if wrong := [box for box in found if not _is_box(box)]:
+        raise ValueError(f"{path}: expected boxes of a kind, a centre, a size and a yaw, found {wrong[0]!r:.60}")
     keys = ("kind", *THREE, "yaw", "velocity", "points", "instance")
     return [{key: box[key] for key in keys if key in box} for box in found]
 
@@ -91,12 +97,3 @@ def _is_box(box: Any) -> bool:
 def _are_numbers(values: Any, count: int) -> bool:
     plain = isinstance(values, list) and len(values) == count and all(type(v) in (int, float) for v in values)
     return plain and all(math.isfinite(v) for v in values)
-
-
-def _with_marks(scan: Scan, name: str, path: Path, dropped: int) -> tuple[Scan, list[str]]:
-    """The scan with a field that has a file of its own, such as .new with a byte a point."""
-    kind, count = BESIDE[name], len(scan) + dropped
-    if dropped or path.stat().st_size != count * kind.itemsize:
-        return scan, [f"{path.name} left out: expected {count * kind.itemsize} bytes for {count} points, none of them "
-                      f"dropped, found {path.stat().st_size} bytes and {dropped} dropped"]  # fmt: skip
-    return replace(scan, extra={**scan.extra, name: np.fromfile(path, kind)}), []

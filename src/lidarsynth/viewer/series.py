@@ -11,8 +11,7 @@ from typing import Protocol
 
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.folder import scan_files
-from lidarsynth.lidar.frame import transformed
-from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of
+from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of, moved
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.packing import Shown
 
@@ -47,9 +46,8 @@ class Files:
         shown = read_shown(self.paths[index], self.reading.intensity)
         if self.reading.transform is None:
             return shown
-        moved = transformed(shown.scan.xyz, self.reading.transform)
         notes = (*shown.notes, "boxes left out: they belong to the frame before --transform") if shown.boxes else ()
-        return replace(shown, scan=replace(shown.scan, xyz=moved), boxes=(), notes=notes or shown.notes)
+        return replace(shown, scan=moved(shown.scan, self.reading.transform), boxes=(), notes=notes or shown.notes)
 
 
 Opener = Callable[[int, int], Iterator[tuple[int, Input]]]
