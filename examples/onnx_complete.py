@@ -18,9 +18,11 @@ elevations, width = np.array(sensor["elevations"]), sensor["width"]
 
 with open(source, "rb") as file:  # the points
     header = {}
-    while "DATA" not in header:
-        key, *values = file.readline().decode().split() or ["#"]
+    while "DATA" not in header and (line := file.readline(500)):
+        key, *values = line.decode("latin-1").split() or ["#"]
         header[key] = values
+    if (data := " ".join(header.get("DATA", ["no DATA"]))) != "binary":
+        sys.exit(f"{source}: expected a .pcd with DATA binary, found {data}")
     kind = {"F4": "f4", "U1": "u1", "U2": "u2", "U4": "u4", "I4": "i4", "F8": "f8", "I1": "i1", "I2": "i2"}
     types = [kind[t + s] for t, s in zip(header["TYPE"], header["SIZE"], strict=True)]
     cloud = np.fromfile(file, np.dtype(list(zip(header["FIELDS"], types, strict=True))), int(header["POINTS"][0]))

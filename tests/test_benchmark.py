@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from networks import trained
+from networks import tiny_cascade, trained
 from PIL import Image
 
 import lidarsynth as ls
@@ -99,6 +99,7 @@ class Counted:
     stop_at: int = -1
     calls: list[int] = field(default_factory=list)  # seeds
     together: int = 1
+    any_sensor: bool = False
 
     @property
     def network(self) -> torch.nn.Module:
@@ -308,7 +309,7 @@ def test_rows_that_cannot_be_are_told(data: Path, tiny: Path, tmp_path: Path):
     class Broken(Counted):
         def complete(self, scan, known, **options):
             filled = self.model.complete(scan, known)
-            return replace(filled, range=filled.range * np.float32("nan"))
+            return replace(filled, reflectance=filled.reflectance * np.float32("nan"))
 
     text = benchmark("upsampling", config, tmp_path / "nan", lambda word: Broken(ls.load(tiny)))
     assert "- N/A, range only: scan 0: expected finite numbers, found NaN or infinity" in text
@@ -341,7 +342,8 @@ def test_the_figure_shows_a_labelled_scan_in_the_colours_of_its_classes(tmp_path
     benchmark("upsampling", config, tmp_path / "out", no_model)
     colours = picture(tmp_path / "out" / "figure.png").reshape(-1, 3).astype(int)
     assert ((colours[:, 0] > 200) & (colours[:, 1] < 20) & (colours[:, 2] > 200)).sum() > 200, "the road is magenta"
-    shifted = drawings.with_labels_of(replace(truth, mask=np.ones_like(truth.mask), label=None), truth)
+    everywhere = replace(truth, range=truth.range + 1, mask=np.ones_like(truth.mask), label=None)
+    shifted = drawings.with_labels_of(everywhere, truth)
     assert (shifted.label[truth.mask] == truth.label[truth.mask]).all() and not shifted.label[~truth.mask].any()
 
 
@@ -446,6 +448,29 @@ def test_models_whose_scans_come_in_blocks_make_whole_blocks(generation: Path, t
         measured = [{key: value["value"] for key, value in row[name].items()} for row in rows]
         assert measured[0] == pytest.approx(measured[1], rel=1e-4, nan_ok=True), name
     assert all("tiny, 2 steps" in text for text in texts)
+
+
+def test_models_of_any_sensor_make_scans_of_the_reference_s(tmp_path: Path):
+    small, other = (SENSORS[word].resized(width=128) for word in ("vlp-16", "hdl-32e"))
+    cascade, made = tiny_cascade(SENSORS["hdl-64e-kitti"].resized(16, 256)), {}
+    for sensor in (small, other):
+        data = stored(tmp_path / sensor.name, [street(i, sensor) for i in range(2)])
+        config = f'reference = "{data}"\ncount = 2\n[[method]]\nname = "any"\nmodel = "any"\nsteps = 1\n'
+        benchmark("generation", written(tmp_path / f"{sensor.name}.toml", config), tmp_path / "out" / sensor.name,
+                  lambda word: cascade)  # fmt: skip
+        row = results(tmp_path / "out" / sensor.name)["any"]
+        assert row["reports"]["bev-1"]["values"]["JSD x1e2"]["value"] is not None
+        made[sensor.name] = row
+    assert made["vlp-16"] != made["hdl-32e"]
+
+
+def test_models_of_any_sensor_are_not_said_to_have_learned_other_beams(data: Path, tiny: Path, tmp_path: Path):
+    config = f'data = "{data}"\n{METHODS}[[method]]\nname = "own"\nmodel = "own"\n'
+    other = replace(SENSOR, name="other", elevations=tuple(e + 0.1 for e in SENSOR.elevations))
+    for model, said in ((tiny_cascade(other), False), (replace(ls.load(tiny), sensor=other), True)):
+        out = tmp_path / type(model).__name__
+        text = benchmark("upsampling", written(tmp_path / "b.toml", config), out, lambda word, m=model: m)
+        assert "learned images of" not in text and ("expected an image of other's beams" in text) == said
 
 
 def test_samples_of_others_compete_and_other_sizes_are_told(generation: Path, data: Path, tiny: Path, tmp_path: Path):

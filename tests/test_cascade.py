@@ -273,7 +273,9 @@ def test_measured_pixels_come_back_bit_by_bit_in_any_sensor(model: CascadeModel,
 
 def test_blocked_rays_stay_empty_and_no_other_sensor_gets_kittis_car(model: CascadeModel):
     blocked = replace(SMALL, blocked=((22, 10, 60), (23, 250, 80)))
-    image = RangeImage(*(np.zeros((24, 256), t) for t in (np.float32, np.float32, bool)), blocked)
+    metres = np.zeros((24, 256), np.float32)
+    metres[0, 0] = 30.0
+    image = RangeImage(metres, metres / 60, metres > 0, blocked)
     filled = model.into(blocked).complete(image)
     assert not filled.mask[blocked.blocked_rays()].any()
     assert filled.mask[23, 81:249].any() == model.complete(image).mask[23, 81:249].any()

@@ -21,6 +21,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import training as cascade_training
 from lidarsynth.systems.cascade.examples import crop, mixed, pattern
+from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.scores import absolute_errors, energy_score, expected_errors, misnamed
 from lidarsynth.systems.cascade.training import fit_standard
 from lidarsynth.training import monitor
@@ -230,10 +231,12 @@ def test_with_a_base_what_one_sensor_has_of_its_own_alone_is_learned_and_kept(
     from lidarsynth import load
 
     monkeypatch.setattr(monitor, "IMAGES", 1)
+    monkeypatch.setattr(CascadeModel, "stream", None)  # what the base generates does not change, and is not drawn
     few = {"training.batch_size": 2, "training.steps": 2, "training.warmup": 0}
     for progress in run(with_fields(preset("kitti"), few), "virtual", tmp_path / "run", options=Options(workers=0)):
         parts = {"likeliest", "named", *(["observed"] if progress.step == 1 else [])}  # every fourth step
         assert progress.step == 0 or set(progress.losses) == {"loss", *parts}
+    assert len(list((tmp_path / "run" / "pictures").glob("sample-00000002-*.png"))) == 1
     kept = load_file(tmp_path / "run" / "model.safetensors")
     assert kept and {name.split(".")[0] for name in kept} == {"likeliest", "observer", "classes"}
     before, after = (load(source).network.state_dict() for source in ("default", tmp_path / "run"))

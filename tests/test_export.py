@@ -147,3 +147,24 @@ def test_the_example_needs_no_torch(exported: Exported, tmp_path: Path):
     assert dense.shape[1] == 5 and len(dense) > len(scan)
     filled = cascade().into(SENSOR).complete(scan)
     assert abs(len(dense) - len(filled.to_scan())) < 0.1 * len(filled.to_scan())
+
+
+def test_the_example_refuses_what_is_no_binary_cloud_in_one_line(tmp_path: Path):
+    meta = {"sensor": json.dumps({"elevations": [1.0, 0.0], "width": 8})}
+    (tmp_path / "onnxruntime.py").write_text(
+        "from types import SimpleNamespace as N\n"
+        f"def InferenceSession(*_, **__): return N(get_modelmeta=lambda: N(custom_metadata_map={meta!r}))\n"
+    )
+    head = (
+        "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
+    )
+    for content, found in ((f"{head}DATA binary_compressed\n0000", "binary_compressed"),
+                           (f"{head}DATA ascii\n1 2 3 0\n", "ascii"), (head, "no DATA"), ("", "no DATA"),
+                           ("\x89PNG\x00\xff", "no DATA")):  # fmt: skip
+        (tmp_path / "scan.pcd").write_text(content, "latin-1")
+        program = [sys.executable, str(ROOT / "examples" / "onnx_complete.py"), "x.onnx", "scan.pcd", "d.npy"]
+        done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, timeout=60,
+                              env={**os.environ, "PYTHONPATH": str(tmp_path)})  # fmt: skip
+        said = done.stderr.strip()
+        assert done.returncode == 1 and "\n" not in said and not (tmp_path / "d.npy").exists()
+        assert said == f"scan.pcd: expected a .pcd with DATA binary, found {found}"

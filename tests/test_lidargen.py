@@ -380,7 +380,7 @@ def test_fine_tuning_begins_with_official_weights(official, cache, tmp_path):
     list(run(same, cache, tmp_path / "tuned", str(official), options=QUIET))
     found, network = load(tmp_path / "tuned")
     torch.testing.assert_close(dict(network.named_parameters()), dict(load_official(official).named_parameters()))
-    assert found.card.data == "KITTI-360; 12 images of walls"
+    assert found.card.data == "KITTI-360, then 12 images of walls"
     wide = with_fields(same, {"model.base_channels": 16})
     with pytest.raises(ValueError, match=r"expected an experiment like that of the weights \(--set model.base_chan"):
         list(run(wide, cache, tmp_path / "wide", str(official), options=QUIET))

@@ -2,10 +2,12 @@
 
 import os
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import CLASSES
@@ -21,8 +23,10 @@ from lidarsynth.pictures.colours import (
     reflectance_colours,
     turbo,
 )
-from lidarsynth.pictures.figure import colour_bar, compare, panel
+from lidarsynth.pictures.figure import PAPER, class_legend, colour_bar, compare, panel
+from lidarsynth.pictures.learned import learned_figure
 from lidarsynth.pictures.perspective import Camera, perspective
+from lidarsynth.pictures.portrait import before_and_after, portrait
 from lidarsynth.pictures.render import (
     BACKGROUNDS,
     EMPTY,
@@ -268,3 +272,66 @@ def test_save_png_round_trips_and_is_whole_or_not_at_all(tmp_path, monkeypatch: 
     assert [p.name for p in tmp_path.iterdir()] == ["strip.png"]
     with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 with pixels, got \(2, 2, 4\) uint8"):
         save_png(path, np.zeros((2, 2, 4), np.uint8))
+
+
+def colours_of(picture: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(colour) for colour in np.unique(picture.reshape(-1, 3), axis=0).tolist()}
+
+
+def test_a_legend_has_the_classes_that_occur_in_as_many_lines_as_they_take():
+    image = small_image()
+    every = replace(image, label=np.arange(128).reshape(4, 32) % 20, mask=np.ones((4, 32), bool), range=image.range + 1)
+    for width in (1024, 300, 40):
+        legend = class_legend([every], width)
+        assert legend.shape[1] == width and colours_of(label_colours(np.arange(20))) <= colours_of(legend)
+    lines = [len(class_legend([every], width)) / (2 * size) for width, size in ((1024, 16), (500, 12), (300, 12))]
+    assert lines[0] == 2 and lines == sorted(set(lines)), "and not one that is cut"
+    cars = replace(every, label=np.where(np.arange(32) < 9, 1, 9) * np.ones((4, 1), int), mask=image.mask)
+    cars.mask[:, :9] = False
+    shown = colours_of(class_legend([cars], 500))
+    assert tuple(label_colours(9).tolist()) in shown and tuple(label_colours(1).tolist()) not in shown
+    assert colours_of(class_legend([replace(every, label=None)], 500)) == {PAPER}
+
+
+def test_the_portrait_of_a_labelled_scan_has_a_legend():
+    image = small_image()
+    with_classes, without = portrait(image), portrait(replace(image, label=None))
+    legend = class_legend([image], 1024)
+    assert any(
+        np.array_equal(with_classes[row : row + len(legend), 20:-20], legend) for row in range(len(with_classes))
+    )
+    assert len(with_classes) > len(without) + len(legend)
+
+
+def test_a_reflectance_that_nobody_gave_is_not_drawn_as_if_it_were_dark():
+    image = small_image()
+    dark = replace(image, reflectance=np.zeros_like(image.reflectance))
+    drawn, lit = (before_and_after({"simulated": one, "real": image}, {}) for one in (dark, image))
+    black = tuple(reflectance_colours(0.0).tolist())
+    right = slice(drawn.shape[1] // 2, None)
+    above, strips = drawn[: drawn.shape[0] // 6, right], lit[: lit.shape[0] // 6, right]
+    assert colours_of(strips) - colours_of(above), "of the first row"
+    assert (above == np.array(black)).all(-1).sum() == 0 and drawn.shape == lit.shape
+
+
+@pytest.mark.parametrize("word", ["vlp-16", "hdl-64e-kitti", "os1-128"])
+def test_the_picture_of_a_sensor_has_whole_round_ticks(word: str, monkeypatch: pytest.MonkeyPatch):
+    sensor, ticks = SENSORS[word], []
+    draw = ImageDraw.ImageDraw.text
+
+    def told(self, xy, text, *more, **options):
+        if text.lstrip("+-").isdecimal():
+            ticks.append(
+                (int(text), xy[1], self.textbbox(xy, text, font=options.get("font"), anchor=options.get("anchor")))
+            )
+        return draw(self, xy, text, *more, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", told)
+    rings = [SimpleNamespace(residual=0.01)] * sensor.height
+    shares = np.ones((sensor.height, sensor.width))
+    learned_figure(SimpleNamespace(sensor=sensor, scans=3, returned=shares, rings=rings))  # type: ignore[arg-type]
+    degrees, places, boxes = zip(*ticks, strict=True)
+    (step,) = set(np.diff(degrees).tolist())
+    assert step in (1, 2, 5, 10, 20) and all(number % step == 0 for number in degrees)
+    assert len(ticks) >= 3 and all(box[1] >= 0 and box[3] <= 480 for box in boxes), "none is cut"
+    assert np.ptp(np.diff(places) / np.diff(degrees)) < 1e-6

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
 from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.turns import several_turns
 
 SENSOR = get_sensor("hdl-64e-kitti").resized(16, 64)
 
@@ -95,3 +96,98 @@ def test_keeping_pixels_empties_the_others_in_every_field(image):
         assert ours.dtype == theirs.dtype
     with pytest.raises(ValueError, match=r"known must be \(16, 64\), got \(64, 16\)"):
         image.keep(known.T)
+
+
+def test_rings_and_labels_that_are_whole_floats_become_whole_numbers():
+    azimuth = np.linspace(np.pi, -np.pi, 500, endpoint=False)
+    xyz = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1) * 9
+    rings = np.arange(500) % 2
+    for dtype in (np.float32, np.float64, np.uint64, np.uint8):
+        scan = Scan(xyz, ring=rings.astype(dtype), label=rings.astype(dtype))
+        assert scan.ring.dtype.kind in "iu" and scan.ring.tolist() == scan.label.tolist() == rings.tolist()
+        assert several_turns(scan) is None, "which counts points by rings"
+    kept = rings.astype(np.uint16)
+    assert Scan(xyz, ring=kept).ring is kept
+
+
+@pytest.mark.parametrize("name", ["ring", "label"])
+@pytest.mark.parametrize(
+    ("values", "found"),
+    [
+        (np.array([0.5, 1, 2]), "expected whole numbers, found 0.5"),
+        (np.array([0, np.nan, 2]), "expected whole numbers, found nan"),
+        (np.array([0, np.inf, 2], np.float32), "expected whole numbers, found inf"),
+        (np.array([0, 1, 2**63], np.uint64), "expected whole numbers, found 9223372036854775808"),
+        (np.array(["a", "b", "c"]), "expected an array of numbers, found one of <U1"),
+        (np.array([True, False, True]), "expected an array of numbers, found one of bool"),
+    ],
+)
+def test_rings_and_labels_that_are_no_whole_numbers_are_refused_in_one_line(name: str, values: np.ndarray, found: str):
+    with pytest.raises(ValueError, match=f"^{name}: {found}$"):
+        Scan(np.zeros((3, 3)), **{name: values})
+
+
+def test_times_and_further_fields_that_are_none_are_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"^time: expected an array of numbers, found one of <U1$"):
+        Scan(np.zeros((3, 3)), time=np.array(list("abc")))
+    for wrong in ([1], {3: np.zeros(3)}, [np.zeros(300)], None):
+        with pytest.raises(ValueError, match=r"^extra: expected arrays by name, found .*$"):
+            Scan(np.zeros((3, 3)), extra=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.filterwarnings("ignore:the matrix subclass:PendingDeprecationWarning")
+def test_arrays_of_points_are_taken_as_they_are_or_refused_in_one_line():
+    points = np.array([[1, 2, 3, 0.5]])
+    assert as_scan(points).reflectance.tolist() == [0.5] and not as_scan(points[:, :3]).reflectance.any()
+    for wrong, found in (
+        (np.matrix(points), "a matrix"),
+        (np.ma.masked_array(points, points > 2), "a MaskedArray"),
+        (np.zeros((2, 5)), r"\(2, 5\) of float64"),  # whose fifth column would be lost
+        (np.zeros((2, 2)), r"\(2, 2\) of float64"),
+    ):
+        with pytest.raises(ValueError, match=f"^expected .*points.*, found {found}$"):
+            as_scan(wrong)
+    with pytest.raises(ValueError, match=r"^xyz: expected an array of numbers, found a matrix$"):
+        Scan(np.matrix(points[:, :3]))
+
+
+def test_an_image_takes_the_word_of_a_sensor_and_numbers_of_any_type(image):
+    vlp = get_sensor("vlp-16")
+    distance = np.full((16, 1024), 7.5)
+    made = RangeImage(distance, distance / 10, distance > 0, "vlp-16", xyz=vlp.points(distance).astype(np.float64))  # type: ignore[arg-type]
+    assert made.sensor is vlp and made.shape == (16, 1024)
+    assert made.range.dtype == made.reflectance.dtype == made.xyz.dtype == np.float32
+    with pytest.raises(ValueError, match=r"expected a sensor of .*, found 'vlp-15'"):
+        replace(image, sensor="vlp-15")
+    with pytest.raises(ValueError, match=r"^reflectance: expected an array of numbers, found one of <U1$"):
+        replace(image, reflectance=np.full(image.shape, "a"))
+    for name in ("range", "reflectance"):
+        assert getattr(replace(image), name) is getattr(image, name), "and none is copied that is right"
+
+
+def test_measured_pixels_have_a_range(image):
+    row, column = np.argwhere(image.mask)[5]
+    for wrong in (0, -1, np.nan, np.inf):
+        spoilt = image.range.copy()
+        spoilt[row, column] = wrong
+        with pytest.raises(ValueError, match=f"^expected ranges of measured pixels .* above 0, found {wrong:g}$"):
+            replace(image, range=spoilt)
+        empty = image.mask.copy()
+        empty[row, column] = False
+        assert len(replace(image, range=spoilt, mask=empty).to_scan()) == empty.sum(), "elsewhere anything may stand"
+    near = replace(SENSOR, min_range=0.0)
+    spoilt[row, column] = 0
+    assert replace(image, range=spoilt, sensor=near).mask[row, column], "which is within the limits of such a sensor"
+
+
+def test_scans_and_images_tell_of_themselves_in_one_line(image):
+    xyz = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 70.25]], np.float32)
+    scan = Scan(xyz, np.array([0.5, 0.0]), ring=np.arange(2), extra={"new": np.zeros(2)})
+    assert repr(scan) == "Scan(2 points, 5.0 to 70.2 m, reflectance, ring, new)"
+    assert repr(Scan(np.zeros((0, 3)))) == "Scan(0 points)"
+    measured = image.range[image.mask]
+    assert repr(image) == (
+        f"RangeImage({SENSOR.name}, 16 x 64, {image.mask.sum()} measured, {measured.min():.1f} to "
+        f"{measured.max():.1f} m, reflectance, label)"
+    )
+    assert repr(image.keep(np.zeros(image.shape, bool))) == f"RangeImage({SENSOR.name}, 16 x 64, 0 measured, label)"

@@ -125,8 +125,8 @@ def test_dropped_points_are_empty_and_have_no_class():
 
 def test_a_cut_is_part_of_the_scan_anywhere():
     experiment = small(**{"data.roll": False, "data.mirror": False, "segmentation.drop": 0.0})
-    image = replace(scene(2), label=np.full((16, 64), 9), mask=np.ones((16, 64), bool))
-    image = replace(image, range=np.tile(np.arange(1, 65, dtype=np.float32), (16, 1)))
+    metres = np.tile(np.arange(1, 65, dtype=np.float32), (16, 1))
+    image = replace(scene(2), label=np.full((16, 64), 9), mask=np.ones((16, 64), bool), range=metres)
     firsts = set()
     for step in range(200):
         columns = augment(experiment, image, sample_rng(0, step, 0))[0][0, 0]

@@ -119,6 +119,15 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ("beams = 4\ntop = 1", r"expected the fields .* found \['beams', 'top'\]"),
         ("beams = 0\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found 0"),
         ("beams = 2.5\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found 2.5"),
+        (
+            "elevations = [2, 1]\nbeams = 2\ntop = 1\nbottom = 0",
+            "expected elevations, or beams with top and bottom, found elevations and beams, bottom, top",
+        ),
+        ("elevations = [2, 1]\nbeams = 4", "expected elevations, or beams with top and bottom, found .* and beams"),
+        (
+            "elevations = [1]\nmount = 'high'",
+            "mine.toml: expected numbers in the sensor's fields, found 'high' as mount",
+        ),
         ("beams = 2\ntop = 1\nbottom = 1", r"elevations must fall from top to bottom within \+-90 degrees"),
         ("beams = 2\ntop = 'a'\nbottom = 1", r"mine.toml: expected numbers in the sensor's fields, found"),
         ("elevations = ['a']", r"mine.toml: expected numbers in the sensor's fields, found"),
@@ -166,3 +175,10 @@ def test_files_of_another_kind_get_one_line(tmp_path):
 def test_unknown_words_list_the_known_ones():
     with pytest.raises(ValueError, match=r"expected a sensor of hdl-64e, hdl-64e-kitti, .*, found 'hdl64'"):
         get_sensor("hdl64")
+
+
+def test_a_mount_that_is_no_number_gets_one_line():
+    for wrong in ("high", None, [1.0]):
+        with pytest.raises(ValueError, match=r"sensor mine: expected numbers, .* as mount") as refused:
+            Sensor("mine", (1.0, 0.0), mount=wrong)  # type: ignore[arg-type]
+        assert "\n" not in str(refused.value)

@@ -7,25 +7,32 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from forked import Forked, pair
+from networks import tiny_cascade
 from safetensors.torch import load_file
 
+import lidarsynth as ls
 from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import write_cache
 from lidarsynth.experiment.presets import preset
-from lidarsynth.experiment.record import Experiment, with_fields
+from lidarsynth.experiment.record import Card, Experiment, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.systems.model_card import card_text
 from lidarsynth.systems.table import build_network, transfer
 from lidarsynth.systems.table import load_folder as load
+from lidarsynth.training import monitor
 from lidarsynth.training.checkpoint import checkpoints
 from lidarsynth.training.options import Options
+from lidarsynth.verbs import training as training_verb
 from lidarsynth.verbs.training import resolve, run
+from lidarsynth.weights.load import load_parts
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 QUIET = Options(sample_every=0, workers=0)
@@ -317,17 +324,60 @@ def test_from_weights_starts_there_and_keeps_their_history(cache: Path, tmp_path
     found, network = load(tmp_path / "second")
     torch.testing.assert_close(network.state_dict(), load(tmp_path / "first")[1].state_dict())
     assert found.card.history == ("2 steps of 4 on 1 x cpu", "from tiny", "1 steps of 4 on 1 x cpu")
-    assert found.card.data == "24 images of noise; 24 images of noise"
+    assert found.card.data == "24 images of noise, then 24 images of noise"
+
+
+def test_a_run_from_shipped_weights_says_what_these_learned_from_and_under_which_terms(cache: Path, tmp_path: Path):
+    streets = tmp_path / "streets"
+    list(write_cache(streets, noise_image, 3, SENSOR, {"name": "synthetic", "seed": 3}))
+    own = "for what was learned from the scans, their own terms; for the rest, "
+    for word in ("default", "kitti"):
+        source = load_parts(word)[0]
+        licence = source.card.licence
+        for data, terms in ((cache, own + licence), (f"{streets},{cache}", own + licence), (streets, licence),
+                            ("virtual", licence)):  # fmt: skip
+            card = training_verb._gone_on(source, word, Card(data="4 images of files, split all"), data)
+            assert card.data == f"what `{word}` learned from, then 4 images of files, split all"
+            assert card.licence == terms and card.history[-1] == f"from {word}"
+        mine = replace(source, card=replace(source.card, licence=own + licence))
+        assert training_verb._gone_on(mine, "runs/mine", Card(data="more"), cache).licence == own + licence
+    source = load_parts("default")[0]  # of a copy elsewhere, whose word says nothing
+    copied = training_verb._gone_on(source, "./copy", Card(data="4 images of files"), cache).data
+    assert copied.startswith("synthetic streets alone") and copied.endswith(", then 4 images of files")
+    assert "no real scan" not in copied
+    assert "no real scan" in training_verb._gone_on(source, "./copy", Card(data="4 images"), streets).data
 
 
 def test_the_licence_is_the_user_s_else_that_of_the_weights(cache: Path, tmp_path: Path):
     licensed = resolve("tiny", ("training.steps=1", "card.licence=CC BY 4.0"), data=cache)
     list(run(licensed, cache, tmp_path / "first", options=QUIET))
     assert load(tmp_path / "first")[0].card.licence == "CC BY 4.0"
-    for chosen, expected in (("", "CC BY 4.0"), ("ours alone", "ours alone")):
-        experiment = tiny(1, **{"card.licence": chosen})
-        list(run(experiment, cache, tmp_path / expected, str(tmp_path / "first"), options=QUIET))
-        assert load(tmp_path / expected)[0].card.licence == expected
+    own = "for what was learned from the scans, their own terms; for the rest, CC BY 4.0"
+    for chosen, expected in (("", own), ("ours alone", "ours alone")):
+        experiment, out = tiny(1, **{"card.licence": chosen}), tmp_path / f"second {chosen}"
+        list(run(experiment, cache, out, str(tmp_path / "first"), options=QUIET))
+        assert load(out)[0].card.licence == expected
+        assert ("license: other" in card_text(load(out)[0], ls.load(out).description)) == bool(expected)
+
+
+def test_completions_are_drawn_of_images_with_something_to_go_on_from(cache: Path):
+    sensor = SENSOR.resized(16, 64)
+    model, images = tiny_cascade(sensor), [noise_image(i) for i in range(3)]
+    for network in (model.network, tiny_cascade(sensor).network):
+        pictures = training_verb.completions(model.experiment, network, images)
+        assert len(pictures) == 2 and all(p.dtype == np.uint8 and p.ndim == 3 for p in pictures)
+    empty = images[0].keep(np.zeros((16, 64), bool))
+    assert len(training_verb.completions(model.experiment, model.network, [empty, images[1]])) == 1
+
+
+def test_images_in_which_nothing_returned_are_not_looked_at(tmp_path: Path):
+    def image(i: int) -> RangeImage:
+        return noise_image(i).keep(np.full((16, 64), i != 1))
+
+    list(write_cache(tmp_path / "some", image, 3, SENSOR, {"name": "noise"}))
+    assert len(monitor._spread(tiny(1), tmp_path / "some")) == 2
+    list(write_cache(tmp_path / "none", lambda i: image(1), 3, SENSOR, {"name": "noise"}))
+    assert len(monitor._spread(tiny(1), tmp_path / "none")) == 3
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.semantic_kitti import CLASS_COLOURS, CLASSES
 from lidarsynth.lidar.whole_file import whole_file
 from lidarsynth.networks.rangenet import RangeNet
-from lidarsynth.pictures.figure import GAP, Picture, colour_bar, panel
+from lidarsynth.pictures.figure import GAP, Picture, class_legend, colour_bar, panel
 from lidarsynth.pictures.perspective import Camera, perspective
 from lidarsynth.pictures.portrait import STRIP, strips
 
@@ -44,19 +42,6 @@ def side_by_side(images: Mapping[str, RangeImage], title: str, note: str = "") -
         rows.append([(note, class_legend(list(images.values()), width))])
     rows += [views[i : i + COLUMNS] for i in range(0, len(views), COLUMNS)]
     return panel(rows, title, width)
-
-
-def class_legend(images: Sequence[RangeImage], width: int) -> np.ndarray:
-    """(36, width, 3) uint8: the classes that occur, with their colours."""
-    found = sorted({int(c) for image in images if image.label is not None for c in np.unique(image.label[image.mask])})
-    picture = Image.new("RGB", (width, 36), (255, 255, 255))
-    draw, font, left = ImageDraw.Draw(picture), ImageFont.load_default(20), 0
-    for number in found:
-        name = CLASSES[number][0]
-        draw.rectangle((left, 8, left + 20, 28), fill=tuple(int(v) for v in CLASS_COLOURS[number]))
-        draw.text((left + 26, 18), name, fill=(25, 28, 34), font=font, anchor="lm")
-        left += 46 + int(font.getlength(name))
-    return np.asarray(picture)
 
 
 @torch.no_grad()

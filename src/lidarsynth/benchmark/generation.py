@@ -57,6 +57,8 @@ def generation_row(
     """Make the scans and judge them; of a method that cannot, a row with the reason."""
     model, word = setup.model(method.model), method.samples or method.held_out
     deciding = setup.settings(method, DECIDING) | {"seed": config.seed}
+    if model is not None and model.any_sensor and model.sensor != sensor:
+        model, deciding = model.into(sensor), deciding | {"sensor": sensor.to_dict()}
     if word:
         deciding = {"scans": word, "held out": method.held_out is not None}
     if method.noise:

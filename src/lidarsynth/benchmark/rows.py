@@ -29,7 +29,6 @@ class Row:
     evaluations  of the network per scan, or None
     floor        whether the scans are real ones, or noise: a bound, no competitor
     reason       why there is nothing at all
-    remark       what to be careful about, or ""
     published    protocol -> row of the report -> value of the paper
     image        number -> a scan, for pictures
     """
@@ -44,7 +43,6 @@ class Row:
     evaluations: int | None = None
     floor: bool = False
     reason: str = ""
-    remark: str = ""
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     image: Callable[[int], RangeImage] | None = None
 
@@ -72,7 +70,6 @@ class Row:
             "evaluations",
             "floor",
             "reason",
-            "remark",
             "published",
             "reports",
         )
@@ -81,7 +78,7 @@ class Row:
             for clock in Seconds._fields
         }
         told = {"seconds per scan": timing if self.seconds else None, "errors of each scan": dict(self.errors)}
-        return {key: vars(self)[key] for key in (*keys, "published", "reports")} | told
+        return {key: vars(self)[key] for key in keys} | told
 
 
 class Declined(Exception):

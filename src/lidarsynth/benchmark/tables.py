@@ -134,7 +134,6 @@ def notes(rows: Sequence[Row], columns: Sequence[Column], protocol: str) -> list
             if reason:
                 told.setdefault(reason, []).append(row.name if reason == row.reason else column.heading)
     lines = [f"- N/A, {', '.join(dict.fromkeys(names))}: {_escaped(reason)}" for reason, names in told.items()]
-    lines += [f"- {_escaped(row.remark)}" for row in rows if row.remark]
     warnings = {warning: None for row in rows for warning in row.reports.get(protocol, {}).get("warnings", ())}
     lines += [f"- {_escaped(warning)}" for warning in warnings]
     return lines

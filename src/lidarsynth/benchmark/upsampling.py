@@ -90,7 +90,6 @@ def upsampling_row(setup: Setup, problem: Problem, group: str, method: Upsamplin
         errors=next(iter(judged.values()))["errors"],
         seconds=store.seconds(count),
         evaluations=evaluations,
-        remark=_remark(method.name, model, data),
         published={name: published(name, word, data.names, config.corruption) for name in judged},
         image=store.image,
     )
@@ -116,10 +115,3 @@ def _judged(setup: Setup, name: str, data: Corrupted, store: Store, stamps: Sequ
 
     key = [definition(protocol), list(stamps), judges.weights]
     return store.report(key, judge)
-
-
-def _remark(name: str, model: ScanModel | None, data: Corrupted) -> str:
-    """Images of another sensor are filled all the same, row by row."""
-    if model is None or model.sensor.elevations == data.sensor.elevations:
-        return ""
-    return f"{name} learned images of {model.sensor.name}, these are of {data.sensor.name}: other beams"

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 
+ODD = (np.ma.MaskedArray, np.matrix)  # arrays that do not compute as others do
 _UNKNOWN = np.zeros(0, np.float32)  # stands for a reflectance that is not given
 
 
@@ -24,8 +25,8 @@ class Scan:
     extra        further fields of the file by name, each (N,), such as ambient or return_type; `new` is 1 for a point
                  that was filled in, 0 for a measured one; `confidence` as in `RangeImage`, 1 for a measured one
 
-    Numbers of other types become float32. Raises ValueError when a shape does not fit, and for what is no array of
-    numbers.
+    Numbers of other types become float32, whole ones of a ring or label that are floating become int. Raises ValueError
+    when a shape does not fit, and for what is no array of numbers, or of whole ones.
     """
 
     xyz: np.ndarray
@@ -42,15 +43,29 @@ class Scan:
         given = None if self.reflectance is _UNKNOWN else self.reflectance
         light = np.zeros(len(self.xyz), np.float32) if given is None else _numbers("reflectance", given)
         object.__setattr__(self, "reflectance", light)
+        if not isinstance(self.extra, Mapping) or not all(isinstance(name, str) for name in self.extra):
+            raise ValueError(f"extra: expected arrays by name, found {self.extra!r:.60}".partition("\n")[0])
         own = {name: getattr(self, name) for name in ("reflectance", "ring", "time", "label")}
         for name, value in [*own.items(), *self.extra.items()]:
             if value is not None and np.shape(value) != (len(self.xyz),):
                 raise ValueError(f"{name} must be ({len(self.xyz)},) like xyz, got {np.shape(value)}")
             if value is not None and not isinstance(value, np.ndarray):
                 raise ValueError(f"{name} must be an array, got a {type(value).__name__}")
+        for name in ("ring", "label"):
+            if own[name] is not None:
+                object.__setattr__(self, name, _whole(name, own[name]))
+        if self.time is not None:
+            _check_numbers("time", self.time)
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def __repr__(self) -> str:
+        """One line: how many points, how far away, and which fields."""
+        far = np.linalg.norm(self.xyz, axis=1)
+        has = [name for name in ("ring", "time", "label") if getattr(self, name) is not None]
+        has = ["reflectance"] * bool(self.reflectance.any()) + has + [str(name) for name in self.extra]
+        return f"Scan({', '.join([f'{len(self):,} points{_span(far)}', *has])})"
 
     __iter__ = None  # a scan is no sequence of points
 
@@ -63,13 +78,34 @@ class Scan:
         return Scan(*chosen, {name: _chosen(values, index) for name, values in self.extra.items()})  # type: ignore[arg-type]
 
 
-def _numbers(name: str, values: np.ndarray) -> np.ndarray:
-    """The array as float32. Raises ValueError for what is no array, is masked, or has no numbers."""
-    if not isinstance(values, np.ndarray) or isinstance(values, np.ma.MaskedArray):
+def _check_numbers(name: str, values: np.ndarray) -> None:
+    """Raises ValueError for what is no array, is masked or a matrix, or has no numbers."""
+    if not isinstance(values, np.ndarray) or isinstance(values, ODD):
         raise ValueError(f"{name}: expected an array of numbers, found a {type(values).__name__}")
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected an array of numbers, found one of {values.dtype}")
+
+
+def _numbers(name: str, values: np.ndarray) -> np.ndarray:
+    """The array as float32. Raises ValueError as `_check_numbers`."""
+    _check_numbers(name, values)
     return values if values.dtype == np.float32 else values.astype(np.float32)
+
+
+def _whole(name: str, values: np.ndarray) -> np.ndarray:
+    """The array with whole numbers as int. Raises ValueError for others, NaN and text."""
+    _check_numbers(name, values)
+    if values.dtype.kind == "i" or (values.dtype.kind == "u" and values.dtype.itemsize < 8):
+        return values
+    other = ~((np.abs(values) < 2**53) & (np.floor(values) == values)) if values.dtype.kind == "f" else values >= 2**63
+    if other.any():
+        raise ValueError(f"{name}: expected whole numbers, found {values[other][0]}")
+    return values.astype(np.int64)
+
+
+def _span(metres: np.ndarray) -> str:
+    """The least and largest of metres, in words; nothing of none, and NaN where one is."""
+    return f", {metres.min():.1f} to {metres.max():.1f} m" if len(metres) else ""
 
 
 def _chosen(values: np.ndarray, index: np.ndarray | Sequence[int] | slice) -> np.ndarray:
@@ -89,17 +125,17 @@ def as_scan(points: Scan | np.ndarray) -> Scan:
     if isinstance(points, Scan):
         _check(points.xyz, points.reflectance)
         return points
-    if not isinstance(points, np.ndarray):
+    if not isinstance(points, np.ndarray) or isinstance(points, ODD):
         raise ValueError(f"expected a scan or an array of points, found a {type(points).__name__}")
     return scan_of(points)
 
 
 def scan_of(points: np.ndarray) -> Scan:
-    """The scan of an array (N, 3) x y z in metres, or (N, 4) with a reflectance of 0 to 1; other columns are left out.
+    """The scan of an array (N, 3) x y z in metres, or (N, 4) with a reflectance of 0 to 1.
 
     Raises ValueError for another shape, or a reflectance in another scale.
     """
-    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
+    if points.ndim != 2 or points.shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
         raise ValueError(f"expected points of (N, 3) x y z or (N, 4) x y z reflectance, found {points.shape} of "
                          f"{points.dtype}")  # fmt: skip
     xyz = np.ascontiguousarray(points[:, :3], np.float32)
@@ -119,6 +155,13 @@ def check_image(image: RangeImage) -> None:
                          "its scale")  # fmt: skip
 
 
+def check_seen(image: RangeImage, count: int) -> RangeImage:
+    """The image of `count` points. Raises ValueError where it has none of them."""
+    if not image.mask.any():
+        raise ValueError(f"expected points within {image.sensor.name}'s view, found none of {count} points")
+    return image
+
+
 def _check(xyz: np.ndarray, light: np.ndarray, where: str = "") -> None:
     if not np.isfinite(xyz).all():
         raise ValueError("expected finite points, found NaN or infinite ones; leave them out")
@@ -134,7 +177,7 @@ class RangeImage:
     range        (H, W) float32, metres, 0 where nothing returned
     reflectance  (H, W) float32 in [0, 1], 0 where nothing returned
     mask         (H, W) bool, True where measured
-    sensor       gives every pixel's ray angles
+    sensor       gives every pixel's ray angles; a word becomes the sensor it stands for
     label        (H, W) int, SemanticKITTI training class, 0 where nothing returned, or None
     xyz          (H, W, 3) float32, metres: the measured points themselves where the image came from a scan, or None
     completed    every point of the scan that was completed to this image, bit by bit, with the new ones, or None
@@ -144,7 +187,9 @@ class RangeImage:
                  or not, 0 for nothing; or None. It is not saved
 
     Points of the image are `xyz` where it has them, and of a completed scan `completed`: who changes `range` alone
-    changes neither. Raises ValueError when a shape does not fit, and for a mask that is not bool.
+    changes neither. Numbers of other types become float32. Raises ValueError when a shape does not fit, for a mask that
+    is not bool, and for measured pixels whose range is not finite and above 0 (a sensor that sees from 0 m on may
+    measure 0).
     """
 
     range: np.ndarray
@@ -158,6 +203,7 @@ class RangeImage:
     surface: np.ndarray | None = None
 
     def __post_init__(self):
+        object.__setattr__(self, "sensor", get_sensor(self.sensor))
         shape = (self.sensor.height, self.sensor.width)
         for name in ("range", "reflectance", "mask", "label", "confidence", "surface"):
             value = getattr(self, name)
@@ -167,8 +213,27 @@ class RangeImage:
                 raise ValueError(f"{name} must be {shape}, the sensor's beams and columns, got {value.shape}")
         if self.mask.dtype != np.bool_:
             raise ValueError(f"mask must be bool, got {self.mask.dtype}")
-        if self.xyz is not None and self.xyz.shape != (*shape, 3):
-            raise ValueError(f"xyz must be {(*shape, 3)}, got {self.xyz.shape}")
+        if self.xyz is not None and np.shape(self.xyz) != (*shape, 3):
+            raise ValueError(f"xyz must be {(*shape, 3)}, got {np.shape(self.xyz)}")
+        for name in ("range", "reflectance", "xyz", "confidence", "surface"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _numbers(name, value))
+        self._check_ranges()
+
+    def _check_ranges(self) -> None:
+        above = np.greater if self.sensor.min_range else np.greater_equal
+        good = above(self.range, 0)
+        good &= self.range < np.inf
+        if np.greater(self.mask, good).any():
+            found = self.range[self.mask & ~good][0]
+            raise ValueError(f"expected ranges of measured pixels in metres, finite and above 0, found {found:g}")
+
+    def __repr__(self) -> str:
+        """One line: sensor, size, how many pixels are measured, how far away, and what else there is."""
+        has = ["reflectance"] * bool(self.reflectance.any())
+        has += [n for n in ("label", "xyz", "completed", "confidence", "surface") if getattr(self, n) is not None]
+        count = f"{np.count_nonzero(self.mask):,} measured{_span(self.range[self.mask])}"
+        return f"RangeImage({', '.join([self.sensor.name, '{} x {}'.format(*self.shape), count, *has])})"
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from numbers import Real
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.lidar.small_file import read_json, read_toml
+
+METRES = ("min_range", "max_range", "mount")  # fields that are one number each
 
 
 @dataclass(frozen=True)
@@ -79,9 +82,11 @@ class Sensor:
         try:
             for name in ("elevations", "offsets", "tilt", "dimness"):
                 object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
-            for name in ("min_range", "max_range", "mount"):
+            for name in METRES:
                 if isinstance(value := getattr(self, name), np.generic):
                     object.__setattr__(self, name, value.item())
+                if not isinstance(value := getattr(self, name), Real):
+                    raise TypeError(f"{value!r:.60} as {name}")
             object.__setattr__(self, "width", index(self.width))
             object.__setattr__(self, "blocked", tuple(tuple(index(v) for v in run) for run in self.blocked))
         except (TypeError, ValueError) as error:
@@ -185,6 +190,9 @@ class Sensor:
         return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self).items()}
 
 
+EVENLY = {"beams", "top", "bottom"}  # fields that stand for elevations
+
+
 def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> Sensor:
     """A sensor from a plain table; `elevations` in degrees, or `beams`, `top` and `bottom` for even spacing.
 
@@ -195,14 +203,17 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected a table of a sensor's fields, found {values!r:.60}")
     values = dict(values)
-    if {"beams", "top", "bottom"} <= values.keys():
+    if "elevations" in values and (both := sorted(EVENLY & values.keys())):
+        raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found elevations and "
+                         f"{', '.join(both)}")  # fmt: skip
+    if values.keys() >= EVENLY:
         if not (isinstance(values["beams"], int) and 1 <= values["beams"] <= 1024):
             raise ValueError(f"{source}: expected beams of 1 to 1024, found {values['beams']!r}")
         top, bottom = _numbers([values.pop("top"), values.pop("bottom")], source)
         if not np.isfinite([top, bottom]).all():
             raise ValueError(f"{source}: expected finite top and bottom, found {top} and {bottom}")
         spaced = np.linspace(top, bottom, values.pop("beams"))
-        values.setdefault("elevations", spaced.tolist())
+        values["elevations"] = spaced.tolist()
     known = set(Sensor.__dataclass_fields__)
     if unknown := values.keys() - known:
         raise ValueError(f"{source}: expected the fields {sorted(known)} or beams/top/bottom, found {sorted(unknown)}")
@@ -210,6 +221,9 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
     if not isinstance(values.get("width", 4), int):
         raise ValueError(f"{source}: expected a whole number of columns as width, found {values['width']!r:.60}")
+    for key in METRES:
+        if not isinstance(values.get(key, 1), Real):
+            raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values[key]!r:.60} as {key}")
     beams = {key: _numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
     order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
     for key, numbers in beams.items():  # each number goes with its beam

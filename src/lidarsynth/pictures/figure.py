@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_COLOURS, CLASSES
 from lidarsynth.pictures.colours import range_colours, reflectance_colours
 from lidarsynth.pictures.render import range_strip, reflectance_strip
 
@@ -90,6 +91,27 @@ def colour_bar(by: str, width: int = 480, max_range: float = 80.0) -> np.ndarray
     for tick, place in zip(ticks, places, strict=True):
         anchor = "l" if place < 0.02 else "r" if place > 0.98 else "m"
         draw.text((place * (width - 1), 13), f"{tick:g}{unit}", fill=FAINT, font=font, anchor=f"{anchor}a")
+    return np.asarray(picture)
+
+
+def class_legend(images: Sequence[RangeImage], width: int) -> np.ndarray:
+    """(h, width, 3) uint8: the classes that returns of the images have, with their colours, in as many lines as these
+    take."""
+    size = max(width // 64, 12)
+    font, found = ImageFont.load_default(size), [image.label[image.mask] for image in images if image.label is not None]
+    places, left, top = [], 0, 0
+    for number in np.unique(np.concatenate([*found, np.zeros(0, int)])).astype(int):
+        long = round(1.3 * size + font.getlength(CLASSES[number][0]))
+        if left and left + long > width:
+            left, top = 0, top + 2 * size
+        places.append((number, left, top))
+        left += long + size
+    picture = Image.new("RGB", (width, top + 2 * size), PAPER)
+    draw = ImageDraw.Draw(picture)
+    for number, left, top in places:
+        colour = tuple(int(v) for v in CLASS_COLOURS[number])
+        draw.rectangle((left, top + size // 2, left + size, top + size // 2 + size), fill=colour)
+        draw.text((left + 1.3 * size, top + size), CLASSES[number][0], fill=INK, font=font, anchor="lm")
     return np.asarray(picture)
 
 

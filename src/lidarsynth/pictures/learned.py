@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.lidar.learning import LearnedSensor
 from lidarsynth.pictures.colours import viridis
@@ -13,6 +13,7 @@ from lidarsynth.pictures.figure import FAINT, INK, PAPER, panel
 
 STRIP = 1200  # pixels
 BLOCKED = (214, 48, 49)
+STEPS, MOST = (1, 2, 5, 10, 20, 50), 12  # degrees from tick to tick, and how many of these there may be
 
 
 def learned_figure(learned: LearnedSensor) -> np.ndarray:
@@ -31,17 +32,21 @@ def learned_figure(learned: LearnedSensor) -> np.ndarray:
 
 def _bars(elevations: Sequence[float], residuals: Sequence[float]) -> np.ndarray:
     """(H', STRIP, 3) uint8: a line per beam at its elevation, beside a bar as long as its residual."""
-    height, left, right = 480, 90, STRIP - 60
+    height, left, right, edge = 480, 90, STRIP - 60, 12
     picture = Image.new("RGB", (STRIP, height), PAPER)
-    draw = ImageDraw.Draw(picture)
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(14)
     top, bottom = max(elevations) + 1, min(elevations) - 1
     longest = max(*residuals, 0.01)
+
+    def down(elevation: float) -> float:
+        return edge + (top - elevation) / (top - bottom) * (height - 2 * edge)
+
     for elevation, residual in zip(elevations, residuals, strict=True):
-        y = (top - elevation) / (top - bottom) * height
+        y = down(elevation)
         draw.line([(left, y), (left + 40, y)], fill=INK)
         draw.line([(left + 60, y), (left + 60 + residual / longest * (right - left - 60), y)], fill=BLOCKED, width=2)
-    step = max(round((top - bottom) / 8), 1)
-    for degrees in range(int(np.ceil(bottom)), int(top) + 1, step):
-        draw.text((20, (top - degrees) / (top - bottom) * height - 6), f"{degrees:+d}", fill=FAINT)
+    step = next((step for step in STEPS if (top - bottom) / step <= MOST), STEPS[-1])
+    for degrees in range(int(np.ceil(bottom / step)) * step, int(np.floor(top)) + 1, step):
+        draw.text((20, down(degrees)), f"{degrees:+d}" if degrees else "0", fill=FAINT, font=font, anchor="lm")
     draw.text((right - 60, 4), f"{longest:.3f} degrees", fill=FAINT)
     return np.asarray(picture)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.pictures.figure import GAP, Picture, colour_bar, panel
+from lidarsynth.pictures.figure import GAP, PAPER, Picture, class_legend, colour_bar, panel
 from lidarsynth.pictures.perspective import perspective
 from lidarsynth.pictures.render import bev, label_strip, range_strip, reflectance_strip
 
@@ -16,13 +16,14 @@ EXTENT = 32.0  # metres from the car to the left and right border of a view from
 
 
 def portrait(image: RangeImage) -> np.ndarray:
-    """(H', W', 3) uint8: strips of range, reflectance and, if known, class above a perspective view of the points, in
-    the colours of their classes, if known, else by height."""
+    """(H', W', 3) uint8: strips of range, reflectance and, if known, class with a legend, above a perspective view of
+    the points, in the colours of their classes, if known, else by height."""
     distance, reflectance = strips(image, image.sensor.max_range)
     rows: list[list[Picture]] = [[("range", distance)], [("reflectance", reflectance)]]
     by = "height" if image.label is None else "label"
     if image.label is not None:
-        rows.append([("class", _enlarged(label_strip(image, _rows(image)), image))])
+        rows += [[("class", _enlarged(label_strip(image, _rows(image)), image))]]
+        rows += [[("", class_legend([image], distance.shape[1]))]]
     return panel([*rows, [("points", perspective(image, size=(STRIP, STRIP * 9 // 16), by=by))]])
 
 
@@ -41,19 +42,27 @@ def _enlarged(strip: np.ndarray, image: RangeImage) -> np.ndarray:
 
 
 def before_and_after(images: Mapping[str, RangeImage], points: Mapping[str, Scan]) -> np.ndarray:
-    """(H', W', 3) uint8: a row of range and reflectance strips per caption, then all points in 3-D and from above.
+    """(H', W', 3) uint8: a row of range and reflectance strips per caption, then all points in 3-D and from above. A
+    reflectance that is 0 everywhere is none, and is not drawn.
 
     points  what to draw in 3-D instead of an image's own pixels, by caption
     """
     end = next(iter(images.values())).sensor.max_range
     both = {name: strips(image, end) for name, image in images.items()}
-    rows: list[list[Picture]] = [[(f"{n}: range", d), (f"{n}: reflectance", r)] for n, (d, r) in both.items()]
+    rows: list[list[Picture]] = [
+        [(f"{n}: range", d), (f"{n}: reflectance", r) if images[n].reflectance.any() else _nothing(n, r)]
+        for n, (d, r) in both.items()
+    ]
     rows.append([("", colour_bar("range", STRIP, end)), ("", colour_bar("reflectance", STRIP))])
     width = (2 * STRIP + GAP - GAP * (len(images) - 1)) // len(images)
     drawn = {name: points.get(name, image) for name, image in images.items()}
     rows.append([(f"{n}: {_count(p)} points", perspective(p, size=(width, width * 9 // 16))) for n, p in drawn.items()])
     rows.append([(f"{n}, from above", _ahead(p, width)) for n, p in drawn.items()])
     return panel(rows, width=2 * STRIP + GAP)
+
+
+def _nothing(name: str, strip: np.ndarray) -> Picture:
+    return f"{name}: no reflectance taken", np.full_like(strip, PAPER)
 
 
 def _ahead(points: Scan | RangeImage, width: int) -> np.ndarray:

@@ -17,9 +17,9 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import occupied, pixel_of_points, project
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, same_rays
-from lidarsynth.networks.device import usual_torch
+from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling, check_counts, whole
 from lidarsynth.systems.hub import push
@@ -54,7 +54,8 @@ class ScanModel(ABC):
     together: ClassVar[int] = 1  # scans that a CPU generates in hardly more time than one
 
     def to(self, device: str | torch.device) -> Self:
-        """The same model with its network on another device."""
+        """The same model with its network on another device. Raises ValueError for one that is not here."""
+        check_device(device)
         self.network.to(device)
         return self
 
@@ -145,7 +146,7 @@ class ScanModel(ABC):
                    model says
 
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
-        Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view.
+        Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view or known.
         """
         how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision)
         scan = noted(self, scan, filling=True)
@@ -251,11 +252,10 @@ class ScanModel(ABC):
         how = self.resolved(how)
         if known is not None or isinstance(scan, RangeImage):
             image = self.image_of(scan)
-            return self.fill(image, known_pixels(image, known), how, on_step)
+            known = known_pixels(image, known)
+            return self.fill(check_seen(image.keep(known), int(image.mask.sum())), known, how, on_step)
         pixels = pixel_of_points(scan, self.sensor, self.experiment.data.projection)
-        image = project(scan, self.sensor, self.experiment.data.projection, pixels=pixels)
-        if not image.mask.any():
-            raise ValueError(f"expected points within {self.sensor.name}'s view, found none of {len(scan)} points")
+        image = check_seen(project(scan, self.sensor, self.experiment.data.projection, pixels=pixels), len(scan))
         # Nothing is to be put before a point, at whatever range.
         filled = self.fill(image, image.mask | occupied(scan, self.sensor, pixels), how, on_step)
         return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))

@@ -15,6 +15,7 @@ from lidarsynth.training.task import Task
 
 VALIDATION_SEED = 1_000_003  # of streets that are never trained on
 IMAGES = 16
+FEWEST = 8  # of the beams, one in so many is the least that a completion is judged from
 
 
 class Monitor:
@@ -45,9 +46,10 @@ class Monitor:
 
 
 def _spread(experiment: Experiment, source: str | Path) -> list[RangeImage]:
-    """At most IMAGES images from everywhere in a cache, or as many streets."""
+    """At most IMAGES images from everywhere in a cache, or as many streets; none of which a few beams show nothing."""
     images = open_images(source, experiment, VALIDATION_SEED)
     if isinstance(images, Streets):
         return images.take(images.indices(0, IMAGES))
     count = min(IMAGES, len(images))
-    return images.take([i * len(images) // count for i in range(count)])
+    chosen = images.take([i * len(images) // count for i in range(count)])
+    return [image for image in chosen if image.mask[::FEWEST].any()] or chosen

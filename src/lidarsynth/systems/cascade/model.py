@@ -86,7 +86,11 @@ class CascadeModel(AnySensorModel):
     layouts: int = CHOICE
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
-    together: ClassVar[int] = 16
+
+    @property
+    def together(self) -> int:
+        """Scans that a CPU draws at once: fewer, where several layouts are drawn of each."""
+        return block(sampling(self.network, None, None), self.layouts if self.network.judge is not None else 1)
 
     def at_precision(self, word: str) -> CascadeModel:
         """The same model, its fill at `fp32`, `bf16`, or `auto`: bf16 where the processor multiplies it itself."""
@@ -169,7 +173,8 @@ class CascadeModel(AnySensorModel):
 
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
-        rng, lit = generators(how.seed, 1), bool(image.reflectance[known].any())
+        image = image.keep(known)  # on a blocked ray too, which is told as empty
+        rng, lit = generators(how.seed, 1), bool(image.reflectance.any())
         own = replace(self, response=response_of(image, known), grain=SPECKLE)
         known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
@@ -318,6 +323,7 @@ class CascadeModel(AnySensorModel):
 
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
+        image = image.keep(known)
         own, told = replace(self, response=response_of(image, known)), known | (self._blocked & ~image.mask)
         shades = own.response.even(image.reflectance)
         pixels = known_of(image.range[None], shades[None], told[None], True, padded(self.sensor))
