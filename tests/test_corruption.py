@@ -1,11 +1,13 @@
 """Corruptions: the right pixels are known, the same ones for the same seed, and a wrong recipe is named."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lidarsynth.lidar.corruption import CORRUPTIONS, corrupt
+from lidarsynth.cli.main import main
+from lidarsynth.lidar.corruption import CORRUPTIONS, check_recipe, corrupt
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
 
@@ -131,3 +133,17 @@ def test_every_corruption_has_defaults_that_leave_and_lose_pixels(street):
     for name in CORRUPTIONS:
         known = corrupt(street, name)
         assert 0 < known.sum() < known.size, name
+
+
+def test_a_recipe_is_checked_before_any_scan_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """One line of the whole folder, not one of each scan."""
+    for i in range(3):
+        (tmp_path / f"{i}.bin").write_bytes(b"not read")
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(tmp_path), "--corrupt", "beams:4+rain", "--out", str(tmp_path / "o")])
+    said = capsys.readouterr().err
+    assert (
+        said == "lidarsynth: expected a corruption of beams, points, sector, region, found 'rain' in 'beams:4+rain'\n"
+    )
+    assert not (tmp_path / "o").exists()
+    assert check_recipe("beams:4 + sector:90:180") == [("beams", [4.0]), ("sector", [90.0, 180.0])]

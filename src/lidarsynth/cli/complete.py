@@ -49,12 +49,15 @@ def complete(
     With --corrupt a part of the scan is hidden first. The file then holds what the rest was filled to, and the errors
     of the hidden pixels are printed beside those of interpolation.
     """
+    from lidarsynth.lidar.corruption import check_recipe
     from lidarsynth.systems.filling import Filling
     from lidarsynth.verbs.batch import Job
     from lidarsynth.verbs.description import errors_table, mean_table
 
     at_least(1, {"steps": steps, "resamples": resamples})
     at_least(0, {"seed": seed})
+    if corrupt is not None:
+        check_recipe(corrupt)
     how = Filling(method, steps, resamples, seed=seed, precision=precision)
     job = Job(
         "complete",

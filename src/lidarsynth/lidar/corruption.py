@@ -100,6 +100,14 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
         raise ValueError(f"expected a range image, such as project gives, found a {type(image).__name__}")
     rng = np.random.default_rng(seed)
     known = np.ones(image.shape, bool)
+    for name, values in check_recipe(recipe):
+        known &= CORRUPTIONS[name](image, rng, *values)
+    return known
+
+
+def check_recipe(recipe: str) -> list[tuple[str, list[float]]]:
+    """Name and numbers of each part of a recipe. Raises ValueError that names the part it could not read."""
+    parts = []
     for part in recipe.split("+"):
         name, *numbers = part.strip().split(":")
         if name not in CORRUPTIONS:
@@ -113,5 +121,5 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
         takes = len(signature(CORRUPTIONS[name]).parameters) - 2  # after image and rng
         if len(values) > takes:
             raise ValueError(f"{name} expects at most {takes} numbers, found {len(values)} in {part!r}")
-        known &= CORRUPTIONS[name](image, rng, *values)
-    return known
+        parts.append((name, values))
+    return parts
