@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from lidarsynth.lidar.semantic_kitti import CLASSES
 
+SIGMA, CUTOFF = 1.0, 1.0  # pixels, of the window's Gaussian; metres, weighted by one minus it: as published
+
 
 def knn_labels(
     image_range: np.ndarray | Tensor,
@@ -20,17 +22,14 @@ def knn_labels(
     distance: np.ndarray | Tensor,
     k: int = 5,
     search: int = 5,
-    sigma: float = 1.0,
-    cutoff: float = 1.0,
-    classes: int = len(CLASSES),
 ) -> Tensor:
-    """(N,) int64 class 1 to classes - 1 of every point of a scan, by its k nearest pixels (RangeNet++ section III-E).
+    """(N,) int64 class 1 to 19 of every point of a scan, by its k nearest pixels (RangeNet++ section III-E).
 
     image_range   (H, W) metres, negative where empty
     image_label   (H, W) classes as predicted
     row, column   (N,) pixel of each point
     distance      (N,) metres, range of each point
-    search        odd side of the window; `cutoff` in metres, farther pixels have no vote
+    search        odd side of the window; of its pixels, those farther than CUTOFF have no vote
 
     Raises ValueError when k exceeds the window or the window has no middle.
     """
@@ -40,8 +39,8 @@ def knn_labels(
     near = _windows(ranges, search)[:, pixel]
     near = torch.where(near < 0, torch.inf, near)
     near[search**2 // 2] = own.float()
-    weighted = (near - own.float()).abs() * _inverse_gaussian(search, sigma).view(-1, 1).to(near)
-    return _vote(weighted, _windows(labels, search)[:, pixel], k, cutoff, 1, classes)
+    weighted = (near - own.float()).abs() * _inverse_gaussian(search).view(-1, 1).to(near)
+    return _vote(weighted, _windows(labels, search)[:, pixel], k, 1)
 
 
 def smooth_labels(
@@ -49,9 +48,6 @@ def smooth_labels(
     image_label: np.ndarray | Tensor,
     k: int = 3,
     search: int = 3,
-    sigma: float = 1.0,
-    cutoff: float = 1.0,
-    classes: int = len(CLASSES),
 ) -> Tensor:
     """(H, W) int64 classes by the k nearest pixels, R2DM's version of `knn_labels` for images; 0 may win.
 
@@ -64,9 +60,9 @@ def smooth_labels(
     near = _windows(ranges, search)
     near = torch.where(near < 0, torch.inf, near)
     difference = (near - ranges.view(1, -1)).abs().view(-1, 1, height, width)
-    kernel = _inverse_gaussian(search, sigma)[None, None].to(near)
+    kernel = _inverse_gaussian(search)[None, None].to(near)
     weighted = nn.functional.conv2d(difference, kernel, padding=(search - 1) // 2).view(-1, height * width)
-    return _vote(weighted, _windows(labels, search), k, cutoff, 0, classes).view(height, width)
+    return _vote(weighted, _windows(labels, search), k, 0).view(height, width)
 
 
 def _check_window(k: int, search: int) -> None:
@@ -74,10 +70,10 @@ def _check_window(k: int, search: int) -> None:
         raise ValueError(f"expected an odd window and k within its pixels, found search {search} and k {k}")
 
 
-def _inverse_gaussian(size: int, sigma: float) -> Tensor:
+def _inverse_gaussian(size: int) -> Tensor:
     """(size, size) one minus the Gaussian window of sum 1."""
     axis = torch.arange(size, dtype=torch.float32) - (size - 1) / 2
-    window = torch.exp(-(axis[:, None] ** 2 + axis**2) / (2 * sigma**2))
+    window = torch.exp(-(axis[:, None] ** 2 + axis**2) / (2 * SIGMA**2))
     return 1 - window / window.sum()
 
 
@@ -86,10 +82,11 @@ def _windows(image: Tensor, size: int) -> Tensor:
     return nn.functional.unfold(image[None, None].float(), size, padding=(size - 1) // 2)[0]
 
 
-def _vote(distance: Tensor, labels: Tensor, k: int, cutoff: float, first: int, classes: int) -> Tensor:
-    """(P,) the label most frequent among the k nearest candidates (S, P) within `cutoff`, from class `first` on."""
+def _vote(distance: Tensor, labels: Tensor, k: int, first: int) -> Tensor:
+    """(P,) the label most frequent among the k nearest candidates (S, P) within CUTOFF, from class `first` on."""
+    classes = len(CLASSES)
     nearest, index = distance.topk(k, dim=0, largest=False)
     near = labels.long().gather(0, index)
-    near = torch.where(nearest > cutoff, classes, near)  # one class more, which has no vote
+    near = torch.where(nearest > CUTOFF, classes, near)  # one class more, which has no vote
     votes = nn.functional.one_hot(near, classes + 1).sum(0)
     return votes[:, first:classes].argmax(1) + first
