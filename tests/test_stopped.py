@@ -144,3 +144,35 @@ def test_what_a_process_cannot_begin_with_is_said_in_a_line(tmp_path: Path, caps
         main([*words, "--workers", "2"])
     error = capsys.readouterr().err
     assert "expected a sensor of hdl-64e" in error and error.count("\n") == 1
+
+
+LET_GO = """
+import multiprocessing, socket, sys, time
+from multiprocessing import resource_sharer
+from lidarsynth.training.examples import _leave_endings
+
+def reads_ahead(lines):
+    _leave_endings(0)
+    resource_sharer.DupFd(sys.stdin.fileno())
+    lines.put(resource_sharer._resource_sharer._address)
+    time.sleep(60)
+
+context = multiprocessing.get_context("fork")
+lines = context.Queue()
+worker = context.Process(target=reads_ahead, args=(lines,), daemon=True)
+worker.start()
+address = lines.get()
+for linger in (False, True):  # as a process that ends in good order, and as one that is gone
+    with socket.socket(socket.AF_UNIX) as one:
+        one.connect(address)
+        if linger:
+            one.recv(4)
+time.sleep(0.5)
+worker.kill()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a socket of Unix")
+def test_a_process_that_reads_ahead_does_not_mind_who_lets_go():
+    done = subprocess.run([sys.executable, "-c", LET_GO], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stderr == ""

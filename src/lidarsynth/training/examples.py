@@ -12,6 +12,7 @@ from itertools import product
 from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import torch
@@ -163,7 +164,7 @@ def load_batches(
             sampler=product(range(first, examples.experiment.training.steps), parts),
             num_workers=workers,
             pin_memory=pinned,
-            worker_init_fn=_ignore_signals if workers else None,
+            worker_init_fn=_leave_endings if workers else None,
             prefetch_factor=4 if workers else None,
             generator=torch.Generator(),  # leaves the global one alone
         )
@@ -185,9 +186,16 @@ def _end(processes: set[BaseProcess]) -> None:
             process.kill()
 
 
-def _ignore_signals(worker: int) -> None:
+def _leave_endings(worker: int) -> None:
     # a stop is for the main process, which saves first and then ends its workers
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
+    sys.excepthook = _say_unless_left
     if sys.platform == "linux":  # they hold the run's lock, and would for seconds where the main process is killed
         ctypes.CDLL(None).prctl(PARENT_DEATH, signal.SIGKILL)
+
+
+def _say_unless_left(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    # the thread that hands batches over says here that the main process let go of one, as it does where it ends
+    if not isinstance(error, ConnectionError | EOFError):
+        sys.__excepthook__(kind, error, trace)
