@@ -2,6 +2,7 @@
 
 python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of real scans, against the best interpolation
     --returned: hidden pixels where the truth returned alone, empty ones in the result counting as 0 m
+    --rings, --transform: of a file of several sensors, which one, and into its frame, as `lidarsynth complete`
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
 python benchmarks/any_sensor.py floating SCAN...    new points where no surface is, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
@@ -22,11 +23,14 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import lidarsynth as ls
+from lidarsynth.lidar.frame import parse_transform
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import SHARING, VirtualStreets
+from lidarsynth.verbs.inputs import Reading, inputs_of
 
+AS_IT_IS = Reading()
 RIVALS = ("nearest", "bilinear", "bicubic")
 NEAR, FREE = 5.0, 1.25  # metres; a truth so many times as far, or none, proves a near point wrong
 FLOATING = (0.5, 0.03)  # metres, and share of its range, by which a point is off all that was measured
@@ -35,9 +39,9 @@ HELD_OUT = 777_001  # a seed that nothing was trained on
 loaded = cache(ls.load)
 
 
-def own_image(path: Path) -> RangeImage:
-    """A scan in the rays of the sensor that made it."""
-    scan = ls.read(path)
+def own_image(path: Path, reading: Reading = AS_IT_IS) -> RangeImage:
+    """A scan, of a capture the first one, in the rays of the sensor that made it."""
+    scan = next(inputs_of([path], reading).stream()).read().scan
     return loaded("nearest").suited_to(scan).image_of(scan)
 
 
@@ -63,11 +67,13 @@ def mean_errors(filled: RangeImage, image: RangeImage, hidden: np.ndarray) -> np
     return np.array([np.abs(a - b)[hidden].mean() for a, b in pairs])
 
 
-def errors(paths: Sequence[Path], models: Sequence[str], returned: bool = False) -> Iterator[str]:
+def errors(
+    paths: Sequence[Path], models: Sequence[str], returned: bool = False, reading: Reading = AS_IT_IS
+) -> Iterator[str]:
     """Metres / reflectance of each, and of the last model against the best of the interpolations."""
     yield "| scan, beams kept | " + " | ".join((*RIVALS, *models)) + " | against the best |"
     yield "|---" * (len(RIVALS) + len(models) + 2) + "|"
-    for image, name in ((own_image(path), path.name) for path in paths):
+    for image, name in ((own_image(path, reading), path.name) for path in paths):
         for step in (2, 4):
             known = every(image, step)
             hidden = ~known & (image.mask | (not returned))
@@ -122,7 +128,7 @@ def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
     mask, elevations = hdl64e.hidden(kitti), np.asarray(kitti.elevations)
     yield "| scan | model | empty where KITTI's car stands | truly so | elsewhere in these beams | truly so |"
     yield "|---" * 6 + "|"
-    for image, name in ((own_image(path), path.name) for path in paths):
+    for image, name in ((own_image(path, reading), path.name) for path in paths):
         row = np.abs(np.asarray(image.sensor.elevations)[:, None] - elevations).argmin(1)
         column = (np.arange(image.shape[1]) * kitti.width / image.shape[1]).astype(int)
         car, known = mask[np.ix_(row, column)], every(image, 4)
@@ -199,8 +205,11 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=["default"])
     parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--returned", action="store_true")
+    parser.add_argument("--rings", help="such as 32-63")
+    parser.add_argument("--transform", type=parse_transform, help="x:y:z:roll:pitch:yaw")
     args = parser.parse_args()
-    REPORTS["errors"] = partial(errors, returned=args.returned)
+    rings = None if args.rings is None else tuple(map(int, args.rings.split("-")))
+    REPORTS["errors"] = partial(errors, returned=args.returned, reading=Reading(transform=args.transform, rings=rings))
     if args.what == "responses":
         lines = responses()
     else:

@@ -1,12 +1,13 @@
 """How real `realise` makes perfect scans: which rays it drops, how bright the others are, what street-1 says of them.
 
 python benchmarks/realise.py --streets 64 [--sensor hdl-64e-kitti] [--model default]     held-out worlds, cast perfectly
-python benchmarks/realise.py --real FOLDER [--model default]           real scans of HDL-64E, their holes filled first
+python benchmarks/realise.py --real FOLDER [--model default]           real scans of HDL-64E, their holes closed first
 
-The perfect scan of a street is what its rays meet; that of a real scan is its completion by the same model. Both are
-judged against what the sensor really reported. Beside it: nothing dropped, as many rays dropped at random, and in each
-beam as many as the truth drops there (cf. the frequency maps of DUSty v2), and with --inversion what a GAN drops whose
-image is that scan (DUSty v2, WACV 2023); these get the mean reflectance of the truth. --picture draws the first three.
+The perfect scan of a street is what its rays meet; that of a real scan has, in holes below or between returns, surfaces
+as far as the fill of the same model says (`observing.closed`). Both are judged against what the sensor really reported.
+Beside it: nothing dropped, as many rays dropped at random, and in each beam as many as the truth drops there (cf. the
+frequency maps of DUSty v2), and with --inversion what a GAN drops whose image is that scan (DUSty v2, WACV 2023); these
+get the mean reflectance of the truth. --picture draws the first three.
 Columns:
 
 dropped          share of the perfect scan's rays that do not return
@@ -35,10 +36,12 @@ from lidarsynth.files.formats import read
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.pictures.figure import panel
 from lidarsynth.pictures.render import reflectance_strip, save_png
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.observing import closed
 from lidarsynth.systems.gan.model import GanModel
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.segmentation.training import confusion
@@ -56,12 +59,13 @@ def street_pairs(sensor: Sensor, count: int) -> Iterator[Pair]:
 
 
 def real_pairs(folder: Path, sensor: Sensor, model: ScanModel) -> Iterator[Pair]:
-    """Real scans of the sensor, their holes filled where the model says that a ray returns."""
+    """Real scans of the sensor, their holes closed where something must be."""
+    network = model.network
+    assert isinstance(network, Cascade)
     for path in sorted([*folder.glob("*.bin"), *folder.glob("*.npz")]):
         seen = real_image(path, sensor)
         if seen is not None:
-            perfect = model.complete(seen)
-            yield replace(perfect, reflectance=np.zeros_like(perfect.reflectance), xyz=None), replace(seen, xyz=None)
+            yield closed(network.surest, seen), replace(seen, xyz=None)
 
 
 def real_image(path: Path, sensor: Sensor) -> RangeImage | None:

@@ -19,7 +19,7 @@ from lidarsynth.networks.coarse_unet import CoarseUNet
 from lidarsynth.networks.fill_unet import NOISES, OUTPUTS, FillUNet, draw_noise
 from lidarsynth.systems.cascade.examples import CascadeBatch, Crops, Seen, seen
 from lidarsynth.systems.cascade.model import CascadeModel
-from lidarsynth.systems.cascade.observing import ObserverObjective, on_surface
+from lidarsynth.systems.cascade.observing import ObserverObjective, before_something, closed, on_surface
 
 SENSOR = SENSORS["vlp-16"].resized(width=512)
 WIDTHS = (16, 16, 16, 16)
@@ -64,16 +64,39 @@ def test_what_is_seen_is_as_the_sensor_reports_it():
         assert np.isin(values, image.reflectance).all() and len(values) > 50
 
 
-def test_holes_are_closed_where_a_return_is_expected_and_cast_surfaces_are_taken_as_they_are():
+def test_holes_are_closed_before_surfaces_and_cast_ones_are_taken_as_they_are():
     batch = batch_of([image_of(), image_of(surface=True)])
-    for logit, all_closed in ((5.0, True), (-5.0, False)):
+    for logit in (5.0, -5.0):  # whether a return is expected there says nothing: simulators' surfaces all return
         known, lit = ObserverObjective(fill(), fill(logit), shining=False)._surfaces(batch.seen)
         real, street = known.metres[0, 0, :16], known.metres[1, 0, :16]
         measured = batch.seen.metres[0, 0, :16]
         assert_close(real[measured > 0], measured[measured > 0])
-        assert bool((real[measured == 0] > 0).all()) == all_closed
+        assert (real[:, 8:-8] > 0).all() and not (real[:, (0, -1)][measured[:, (0, -1)] == 0] > 0).any()
         assert (street == batch.seen.surface[1, 0, :16]).all() and (street > 9 / 1.2).all()
         assert not known.told.any() and (known.reflectance == 0).all() and lit.flatten().tolist() == [1, 0]
+
+
+def test_a_surface_is_below_a_return_or_between_two_and_the_sky_is_not():
+    returned = torch.zeros(1, 1, 8, 90, dtype=torch.bool)
+    returned[..., 3, 20] = True
+    returned[..., 1, (2, 6, 40, 88)] = True
+    step = torch.full((1, 1, 1, 1), np.radians(0.7))  # REACH is four of them
+    part = before_something(returned, step)[0, 0]
+    turn = before_something(torch.cat([returned, returned[..., :6]], -1), step, turn=90)[0, 0]
+    assert (turn[:, 90:] == turn[:, :6]).all()
+    for found in (part, turn[:, :90]):
+        assert not found[0].any() and found[4:, 20].all() and found[1:, (2, 6, 40, 88)].all() and found[1, 2:7].all()
+        assert not found[:, 21:40].any() and not found[2, 3:6].any()
+    assert turn[1, [88, 89, 0, 1, 2]].all() and not part[1, [89, 0, 1]].any()
+
+
+def test_a_recorded_scan_closed_has_its_returns_and_no_sky():
+    image = image_of()
+    image = image.keep(np.broadcast_to(np.arange(16)[:, None] >= 4, image.shape))
+    before = fill(-5.0)
+    found = closed(before, image)
+    assert (found.range[image.mask] == image.range[image.mask]).all() and not found.mask[:4].any()
+    assert found.mask[4:].all() and (found.reflectance == 0).all() and found.sensor == image.sensor
 
 
 @pytest.mark.parametrize("shining", [False, True])

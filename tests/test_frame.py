@@ -13,8 +13,9 @@ from lidarsynth.lidar.crowding import stand_of_beams
 from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed, turns_left
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
+from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import INVERTED, SENSORS, get_sensor
 from lidarsynth.lidar.view import misfit
 from lidarsynth.verbs.inputs import read_transform
 
@@ -28,7 +29,7 @@ MOVES = {
 
 def street(name: str, rings: bool = True) -> Scan:
     """A road between walls that are not straight, as a sensor sees it without noise."""
-    sensor = SENSORS[name].resized(width=512)
+    sensor = get_sensor(name).resized(width=512)
     rays = sensor.directions()
     rng = np.random.default_rng(0)
     wall = np.repeat(rng.uniform(5, 25, 64), 8)[None] / np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-6)
@@ -94,6 +95,23 @@ def test_beams_that_look_alike_either_way_up_are_told_by_their_times():
     assert check_frame(over).faults == ("upside down",)
     np.testing.assert_allclose(check_frame(over).transform, np.diag([1, -1, -1, 1]), atol=1e-6)
     assert not turns_left(over.xyz, None) and not turns_left(over.xyz, np.random.default_rng(0).random(len(over)))
+
+
+@pytest.mark.parametrize("name", INVERTED)
+def test_a_sensor_that_hangs_upside_down_has_no_fault_in_a_frame_whose_z_is_up(name: str):
+    scan = street(name)
+    assert check_frame(scan).warning() is None
+    shifted = check_frame(moved(scan, parse_transform("1.4:0:1.5:0:0:0")))
+    np.testing.assert_allclose(shifted.transform[:3, :3], np.eye(3))
+    assert shifted.faults == ("with the sensor 1.40 m ahead of and 1.50 m above the origin",)
+
+
+@pytest.mark.parametrize("name", INVERTED)
+def test_a_sensor_that_hangs_upside_down_is_hinted_at_in_its_own_frame(name: str):
+    over = moved(street(name), parse_transform("0:0:0:180:0:0"))
+    frame = check_frame(over)
+    assert frame.faults == () and "hangs upside down" in str(frame.warning())
+    assert check_frame(moved(over, frame.transform)).warning() is None
 
 
 def test_points_that_a_named_sensor_could_not_see():
@@ -239,3 +257,11 @@ def test_a_sweep_in_the_vehicles_frame_is_raised_and_ahead(shared: Path):
     frame = check_frame(read(shared / "scans" / "other" / "argoverse2_2xvlp32c.feather"))
     assert re.search("1.3. m ahead of and 1.[56]. m above the origin", str(frame.warning()))
     np.testing.assert_allclose(frame.transform[:3, 3], [-1.35, 0, -1.56], atol=0.05)
+
+
+def test_the_second_sensor_of_a_sweep_hangs_upside_down(shared: Path):
+    pytest.importorskip("pyarrow", reason="pyarrow comes with the extra `data`")
+    scan = read(shared / "scans" / "other" / "argoverse2_2xvlp32c.feather", rings=(32, 63))
+    frame = check_frame(scan)
+    assert re.search("1.3. m ahead of and 1.5. m above the origin", str(frame.warning()))
+    assert recognise(moved(scan, frame.transform))[0] == "vlp-32c-inverted"

@@ -10,7 +10,7 @@ from lidarsynth.files.formats import read
 from lidarsynth.lidar.own_beams import own_beams, stray_rings
 from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 
 
@@ -44,6 +44,17 @@ def test_a_sensor_without_rings_is_recognised_by_its_points(name: str):
     shuffled = scan[np.random.default_rng(1).permutation(len(scan))]
     assert rings_in_order(shuffled.xyz) is None
     assert recognise(shuffled)[0] == name
+
+
+@pytest.mark.parametrize("name", INVERTED)
+def test_a_sensor_that_hangs_upside_down_is_recognised_where_the_ground_is_below(name: str):
+    for rings in (True, False):
+        scan = turn(get_sensor(name), rings=rings)
+        assert recognise(scan)[0] == name
+        over = Scan(scan.xyz * np.float32([1, -1, -1]), scan.reflectance, ring=scan.ring)
+        assert recognise(over)[0] == name.removesuffix("-inverted"), "in its own frame"
+    upright = turn(SENSORS[name.removesuffix("-inverted")])
+    assert recognise(Scan(upright.xyz * np.float32([1, -1, -1]), ring=upright.ring))[0] is None, "the ground is above"
 
 
 def shuffled_turn(elevations: np.ndarray) -> Scan:

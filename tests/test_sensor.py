@@ -1,12 +1,13 @@
 """Sensors: their rays, their own files, and one clear line for each thing that can be wrong in such a file."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from lidarsynth.lidar.sensor import SENSORS, Sensor, from_dict, get_sensor, read_sensor
+from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, from_dict, get_sensor, read_sensor
 
 
 def test_the_grid_of_r2dm_equals_the_reference(fixture_tensors):
@@ -81,6 +82,28 @@ def test_resized_sensors_keep_evenly_spaced_beams_of_their_own():
     assert sensor.rows([5, 9]).elevations == (sensor.elevations[5], sensor.elevations[9])
     with pytest.raises(ValueError, match="sensor hdl-64e-kitti: height must divide its 64 beams, got 24"):
         sensor.resized(24)
+
+
+@pytest.mark.parametrize("name", [name for name in SENSORS if not SENSORS[name].edges])
+def test_a_sensor_that_hangs_upside_down_sees_its_own_rays_turned_over(name):
+    sensor = replace(SENSORS[name], blocked=((2, 3, 5),), dimness=tuple(range(SENSORS[name].height)))
+    over = sensor.inverted()
+    metres = np.random.default_rng(0).uniform(5, 9, (sensor.height, sensor.width)).astype(np.float32)
+    turned = sensor.points(metres)[::-1] * np.float32([1, 1, -1])
+    np.testing.assert_allclose(over.points(metres[::-1]), turned, atol=2e-5)
+    assert (over.blocked_rays() == sensor.blocked_rays()[::-1]).all() and over.dimness == sensor.dimness[::-1]
+    assert over.mount == sensor.mount and over.name == f"{name}-inverted"
+
+
+def test_rows_between_edges_are_between_the_same_edges_turned_over():
+    sensor = SENSORS["hdl-64e"]
+    over = sensor.inverted().elevations
+    assert over[-1] == pytest.approx(-sensor.elevations[1]) and over[0] == pytest.approx(25), "its last row ends there"
+
+
+def test_words_of_sensors_that_hang_upside_down_are_known():
+    for name, sensor in INVERTED.items():
+        assert get_sensor(name) is sensor and sensor.elevations != get_sensor(name.removesuffix("-inverted")).elevations
 
 
 @pytest.mark.parametrize("name", SENSORS)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.lidar.ground import levels
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import GRIDS, INVERTED, SENSORS, Sensor
 
 FAR = 3.0  # metres: nearer points show the beam's origin off the sensor's centre more than its elevation
 UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by this much (HDL-64E units do)
@@ -22,10 +23,11 @@ POINTWISE = 0.25
 
 
 def recognise(
-    scan: Scan, path: str | Path | None = None, among: Mapping[str, Sensor] = SENSORS
+    scan: Scan, path: str | Path | None = None, among: Mapping[str, Sensor] | None = None
 ) -> tuple[str | None, str]:
-    """The name in SENSORS, or `among` others, of the sensor that took the scan, or None, and the reason in words, one
-    line.
+    """The word (`get_sensor`) of the sensor that took the scan, or None, and the reason in words, one line.
+
+    among  sensors by their names; None = SENSORS, and those of INVERTED, by their rings, where the ground is below
 
     Rings come from `scan.ring`, else from the order of the points (KITTI's files hold one ring after the other). A scan
     of at least nine tenths of a sensor's beams matches it beam by beam within half a degree; one of fewer beams must
@@ -36,14 +38,22 @@ def recognise(
     if len(scan) < 100:
         return None, f"{where}expected at least 100 points to tell the sensor, found {len(scan)}: name it with --sensor"
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
-    told = ring is not None and ring.min() < ring.max()
-    name, reason = _by_rings(scan.xyz, ring, among) if told else _by_points(scan.xyz, among)  # type: ignore[arg-type]
+    told, known = ring is not None and ring.min() < ring.max(), SENSORS if among is None else among
+    name, reason = _by_rings(scan.xyz, ring, known) if told else _by_points(scan.xyz, known)  # type: ignore[arg-type]
     if name is None and told and scan.ring is None:  # the order may miscount them
-        name, other = _by_points(scan.xyz, among)
+        name, other = _by_points(scan.xyz, known)
+        reason = reason if name is None else other
+    if name is None and told and among is None and _ground_below(scan.xyz):
+        name, other = _by_rings(scan.xyz, ring, INVERTED, whole=True)  # type: ignore[arg-type]
         reason = reason if name is None else other
     if name is None:
-        reason = f"expected the beams of {', '.join(among)}, found {reason}: name the sensor with --sensor"
+        reason = f"expected the beams of {', '.join(known)}, found {reason}: name the sensor with --sensor"
     return name, where + reason
+
+
+def _ground_below(xyz: np.ndarray) -> bool:
+    below, above = levels(xyz)
+    return below.share > above.share
 
 
 def lies_on(scan: Scan, sensor: Sensor) -> bool:
@@ -52,10 +62,14 @@ def lies_on(scan: Scan, sensor: Sensor) -> bool:
 
 
 def same_kind(name: str, other: str) -> bool:
-    """Whether two names are of one kind of sensor: `hdl-64e-kitti` is an `hdl-64e`, whose beams are where they are, and
-    so is `hdl-64e-kitti/16`, some of its rows."""
-    one, two = (word.partition("/")[0].removesuffix("-kitti") for word in (name, other))
-    return one == two
+    """Whether two names are of one kind of sensor: `hdl-64e-kitti` is an `hdl-64e`, whose beams are where they are, so
+    is `hdl-64e-kitti/16`, some of its rows, and so are the words of GRIDS."""
+    one, two = (word.partition("/")[0] for word in (name, other))
+    return _unit(one) == _unit(two)
+
+
+def _unit(name: str) -> str:
+    return "hdl-64e" if name in GRIDS else name.removesuffix("-kitti")
 
 
 def elevations_of(xyz: np.ndarray) -> np.ndarray:

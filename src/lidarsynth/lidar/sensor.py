@@ -185,6 +185,19 @@ class Sensor:
         name = f"{self.name}x{times}"
         return replace(self, name=name, elevations=elevations, offsets=offsets, blocked=blocked, dimness=dimness)
 
+    def inverted(self) -> Sensor:
+        """The sensor hung upside down, as `vlp-32c-inverted`, in a frame whose z is up; its mount stays."""
+        edge = 2 * self.elevations[-1] - self.elevations[-2] if self.height > 1 else self.elevations[-1]
+        lower = (*self.elevations[1:], edge) if self.edges else self.elevations
+        return replace(
+            self,
+            name=f"{self.name}-inverted",
+            elevations=tuple(-angle for angle in reversed(lower)),
+            offsets=tuple(-height for height in reversed(self.offsets)),
+            blocked=tuple((self.height - 1 - row, first, last) for row, first, last in self.blocked),
+            dimness=self.dimness[::-1],
+        )
+
     def to_dict(self) -> dict:
         """Plain lists and numbers, the inverse of `from_dict`."""
         return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self).items()}
@@ -300,6 +313,22 @@ _PANDAR64 = (
     -2.365, -2.536, -2.7, -2.873, -3.04, -3.21, -3.375, -3.548, -3.712, -3.884, -4.05, -4.221, -4.385, -4.558, -4.72,
     -4.892, -5.057, -5.229, -5.391, -5.565, -5.726, -5.898, -6.061, -7.063, -8.059, -9.06, -9.885, -11.032, -12.006,
     -12.974, -13.93, -18.889, -24.897)
+# Mean elevation of each ring seen from the origin, by which two published programs (R2DM, MIT licence; DUSty v2) take
+# KITTI raw; points are right by some decimetres at most, for beams do not leave the origin.
+_KITTI_R2DM = (
+    2.90162, 2.54083, 2.27962, 1.83844, 1.55523, 1.16427, 0.88214, 0.52491, 0.18024, -0.22164, -0.51342, -0.84005,
+    -1.21335, -1.54248, -1.85859, -2.21252, -2.51131, -2.88695, -3.16274, -3.52275, -3.82383, -4.15652, -4.49065,
+    -4.81113, -5.18361, -5.50163, -5.80751, -6.08353, -6.46669, -6.81343, -7.04612, -7.42565, -8.14426, -8.67671,
+    -9.14223, -9.54695, -10.02562, -10.62382, -11.13217, -11.57026, -12.01626, -12.45456, -12.98524, -13.49978,
+    -14.09703, -14.53316, -15.02585, -15.37694, -15.99905, -16.48761, -17.08481, -17.57168, -18.11292, -18.54721,
+    -18.99521, -19.5292, -20.03568, -20.62812, -21.06324, -21.53968, -21.95052, -22.55158, -23.13041, -23.65538)
+_KITTI_DUSTY = (
+    2.92417, 2.56362, 2.30553, 1.86052, 1.5817, 1.18698, 0.90566, 0.54685, 0.20168, -0.2026, -0.49617, -0.82739,
+    -1.20354, -1.53463, -1.8548, -2.20995, -2.51212, -2.88786, -3.1652, -3.52427, -3.82604, -4.15805, -4.494,
+    -4.8142, -5.18621, -5.50451, -5.81035, -6.08754, -6.471, -6.81606, -7.04945, -7.42939, -8.14602, -8.67877,
+    -9.14401, -9.54978, -10.02893, -10.62573, -11.13397, -11.57268, -12.01824, -12.45659, -12.98849, -13.49946,
+    -14.09428, -14.5328, -15.02323, -15.39975, -16.01936, -16.53949, -17.10779, -17.57404, -18.05543, -18.47396,
+    -18.92452, -19.46386, -19.98226, -20.5682, -21.04203, -21.46202, -21.90455, -22.51957, -23.01244, -23.52954)
 # fmt: on
 
 SENSORS: dict[str, Sensor] = {
@@ -315,20 +344,34 @@ SENSORS: dict[str, Sensor] = {
 }
 
 
+# Those whose beams are others when they hang upside down, as under a drone or in a rack on a roof.
+INVERTED = {sensor.name: sensor for sensor in (SENSORS[n].inverted() for n in ("hdl-32e", "vlp-32c", "pandar64"))}
+# What published programs take KITTI's images for, and no scan is recognised as: mean beams, and R2DM's grid as LiDARGen
+# has it, which limits no range (an HDL-64E measures 0.9 to 120 m) but judges its points from 0.5 m on.
+GRIDS = {
+    "hdl-64e-r2dm": Sensor("hdl-64e-r2dm", _KITTI_R2DM, 1024, 1.45, 80.0),
+    "hdl-64e-dusty": Sensor("hdl-64e-dusty", _KITTI_DUSTY, 1024, 1.45, 80.0),
+    "hdl-64e-lidargen": replace(SENSORS["hdl-64e"], name="hdl-64e-lidargen", min_range=0.5, max_range=130.0),
+}
+WORDS = SENSORS | INVERTED | GRIDS
+
+
 def same_rays(one: Sensor, other: Sensor) -> bool:
     """Whether both have the same beams and columns, whatever their names, limits and mounting."""
     return all(getattr(one, name) == getattr(other, name) for name in ("elevations", "width", "offsets", "edges"))
 
 
 def get_sensor(name: str | Sensor) -> Sensor:
-    """A sensor by its word (`hdl-64e`, ...) or from the path of a `.toml` / `.json` file, or itself. Raises
-    ValueError."""
+    """A sensor by its word (`hdl-64e`, `vlp-32c-inverted`, ...), from the path of a `.toml` / `.json` file, or itself.
+
+    Raises ValueError.
+    """
     if isinstance(name, Sensor):
         return name
     if not isinstance(name, str | Path):
         raise ValueError(f"expected a sensor or its word, found a {type(name).__name__}")
-    if (name := str(name)) in SENSORS:
-        return SENSORS[name]
+    if (name := str(name)) in WORDS:
+        return WORDS[name]
     if Path(name).suffix in (".toml", ".json"):
         return read_sensor(name)
     raise ValueError(f"expected a sensor of {', '.join(SENSORS)} or a .toml/.json sensor file, found {name!r}")

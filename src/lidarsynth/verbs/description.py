@@ -12,7 +12,7 @@ from lidarsynth.experiment.folder import RECORD
 from lidarsynth.experiment.presets import PRESETS
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
-from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.systems.table import build_network, system_of
 from lidarsynth.verbs.file_kinds import file_lines, moves
@@ -30,7 +30,7 @@ def describe(what: str, reading: Reading | None = None) -> str:
         return _table(str(path), lines)
     if moves(reading):
         raise ValueError(f"{what}: expected a scan to move or take rings of, found a word, a sensor or a model")
-    if what in SENSORS or (path.suffix in (".toml", ".json") and path.name != RECORD):
+    if what in WORDS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
     if what in PRESETS and what not in shipped() and not path.is_dir():
         experiment = PRESETS[what]()

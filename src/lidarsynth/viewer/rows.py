@@ -9,7 +9,7 @@ import numpy as np
 from lidarsynth.lidar.projection import row_of_points
 from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import get_sensor
 
 EVEN = 64  # rows of a scan that tells nothing of its beams
 WIDTHS = (512, 1024, 2048, 4096)  # columns that a strip may have
@@ -41,7 +41,7 @@ def rows_of(scan: Scan) -> Rows:
         return _rows(ring, height, origin)
     name = recognise(scan)[0]
     if name is not None:
-        sensor = SENSORS[name]
+        sensor = get_sensor(name)
         return _rows(row_of_points(scan, sensor, "spherical"), sensor.height, f"beams of {name}, recognised")
     return _rows(_even(scan), EVEN, "rows by elevation, as the scan does not tell its beams")
 
