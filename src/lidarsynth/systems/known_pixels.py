@@ -55,7 +55,7 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
 
 
 def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
-    """The filled image with every known pixel replaced by its measurement, bit by bit."""
+    """The filled image with every known pixel replaced by its measurement, bit by bit, of the sensor that measured."""
     measured = known & image.mask
     mask = np.where(known, image.mask, filled.mask)
     reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
@@ -65,7 +65,7 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
         range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
         reflectance=np.where(mask, reflectance, 0).astype(np.float32),
         mask=mask,
-        sensor=filled.sensor,
+        sensor=image.sensor,
         label=None if filled.label is None else np.where(mask, filled.label, 0),
         xyz=points,
         confidence=sure,

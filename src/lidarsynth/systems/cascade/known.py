@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.lidar.ground import standing_height
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
@@ -18,6 +20,7 @@ from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 
 ANSWERS = 0.02  # of the rays of a beam
 FEW = 3  # beams that may be apart by chance
+ANOTHER, STEP, LOWEST = 0.2, 0.05, 0.2  # share of a mount by which another is told; metres
 
 
 def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
@@ -33,6 +36,15 @@ def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit:
     ranges = part(np.where(returned, metres, 0).astype(np.float32), 0)
     shades = part(np.where(returned & lit, reflectance, 0).astype(np.float32), 0)
     return Known(ranges, shades, part(told, True), part(returned, False), part(returned & lit, False))
+
+
+def standing(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Sensor:
+    """The sensor as high above the road as the returns of an image, known (H, W) bool, tell it stands, to 5 cm; itself
+    where they do not, or where that is within a fifth."""
+    height = standing_height(sensor.points(image.range)[known & image.mask])
+    if height is None or abs(np.log(max(height, LOWEST) / max(sensor.mount, LOWEST))) < np.log(1 + ANOTHER):
+        return sensor
+    return replace(sensor, mount=round(max(height, LOWEST) / STEP) * STEP)
 
 
 @lru_cache(maxsize=2)  # every scan of a folder asks for the same

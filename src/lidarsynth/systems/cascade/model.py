@@ -45,7 +45,7 @@ from lidarsynth.systems.cascade.images import (
     textured,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, unanswered
+from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
@@ -175,18 +175,18 @@ class CascadeModel(AnySensorModel):
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
         image = image.keep(known)  # on a blocked ray too, which is told as empty
         rng, lit = generators(how.seed, 1), bool(image.reflectance.any())
-        own = replace(self, response=response_of(image, known), grain=SPECKLE)
+        own = replace(self._as_found(image, known), grain=SPECKLE)
         known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
             grid_of(self.sensor)  # refuses those that are smaller
-            dim, rays_at = own.response.unevenness(self.sensor), partial(own._grid_rays, count=1)
-            parts = Told(metres, reflectance, told), self.sensor, dim, rays_at, rng, how, on_step
+            dim, rays_at = own.response.unevenness(own.sensor), partial(own._grid_rays, count=1)
+            parts = Told(metres, reflectance, told), own.sensor, dim, rays_at, rng, how, on_step
             metres, reflectance, told = with_holes_drawn(self.network, *parts)
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
-            rays, fill = own.response.told(rays_told(self.sensor)), self.network.surest
+            rays, fill = own.response.told(rays_told(own.sensor)), self.network.surest
             with torch.autocast(self._device.type, torch.bfloat16, enabled=self.precision == "bf16"):
                 response = tried(own.response, fill, image, known, reflectance, rays, self.tuned)
             own = replace(own, response=response)
@@ -225,8 +225,7 @@ class CascadeModel(AnySensorModel):
         if not sparse.mask.any():
             raise ValueError(f"expected points within {own.name}'s view, found none of {len(scan)} points")
         beams, dense, every = denser(own, beam_step(sparse), times)
-        if beams != own:
-            sparse = self.into(beams).image_of(scan)
+        sparse = sparse if beams == own else self.into(beams).image_of(scan)
         model = self.into(dense)
         image, known = spread(sparse, dense, every)
         filled = model.fill(image, known, how, on_step)
@@ -245,20 +244,19 @@ class CascadeModel(AnySensorModel):
         image = project(scan, model.sensor, projection).keep(~model._blocked)
         if not image.mask.any():
             raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
+        model = replace(model, sensor=standing(model.sensor, image, image.mask))
         answer = model._answers(unanswered(image, padded(model.sensor)), generators(seed, 1), surely=image.range[None])
         return observed(scan, image, answer[0], projection)
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`, with the classes of its pixels."""
-        scan, projection = as_scan(scan), self.experiment.data.projection
-        model = self.with_labels()
+        scan, projection, model = as_scan(scan), self.experiment.data.projection, self.with_labels()
         model = model.suited_to(scan) if sensor is None else model.into(sensor)
         pixels = pixel_of_points(scan, model.sensor, projection)
         image = project(scan, model.sensor, projection, pixels=pixels)
         if not image.mask.any():
             raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
-        model = replace(model, response=response_of(image, image.mask))
-        (image,) = model._named([image], least)
+        (image,) = model._as_found(image, image.mask)._named([image], least)
         return replace(image, completed=replace(scan, label=class_of_points(scan.xyz, image, pixels)))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
@@ -324,9 +322,9 @@ class CascadeModel(AnySensorModel):
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         image = image.keep(known)
-        own, told = replace(self, response=response_of(image, known)), known | (self._blocked & ~image.mask)
-        shades = own.response.even(image.reflectance)
-        pixels = known_of(image.range[None], shades[None], told[None], True, padded(self.sensor))
+        own, told = self._as_found(image, known), known | (self._blocked & ~image.mask)
+        metres, shades = image.range[None], own.response.even(image.reflectance)[None]
+        pixels = known_of(metres, shades, told[None], True, padded(self.sensor))
         filled, rays = own._network(pixels, None, doubt=True)
         return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
 
@@ -388,6 +386,10 @@ class CascadeModel(AnySensorModel):
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             fill = self.network.fill if classify or rng is not None else self.network.surest
             return fill(known, rays, noise.to(device), classify, doubt, reach, lost, bend), rays
+
+    def _as_found(self, image: RangeImage, known: np.ndarray) -> CascadeModel:
+        """With what the known returns tell of the sensor: how high it stands, and how it reports reflectance."""
+        return replace(self, sensor=standing(self.sensor, image, known), response=response_of(image, known))
 
     @property
     def _blocked(self) -> np.ndarray:

@@ -72,8 +72,8 @@ class ObserverObjective(nn.Module):
 
 @torch.inference_mode()
 def closed(fill: FillUNet, image: RangeImage) -> RangeImage:
-    """What the rays of a recorded image meet, as a simulator would cast it: in holes that `before_something` finds as far
-    as the fill says, on other rays where they returned from. Without reflectance."""
+    """What the rays of a recorded image meet, as a simulator would cast it: in holes that `before_something` finds as
+    far as the fill says, on other rays where they returned from. Without reflectance."""
     height, width = image.shape
     rays, size, device = rays_told(image.sensor), padded(image.sensor), next(fill.parameters()).device
     told = image.mask | (rays.blocked[0, 0, :height, :width] > 0).numpy()
