@@ -441,6 +441,44 @@ def test_a_cache_of_kitti_raw_is_the_papers(scan64: bytes, fixture_tensors, tmp_
     assert ((x_0[0] == -1) == (expected[0] == -1))[kept].all()
 
 
+def kitti_of(scan64: bytes, root: Path) -> Path:
+    """A root with that scan as the first of KITTI's raw training drives."""
+    folder = root / "2011_10_03" / "2011_10_03_drive_0027_sync" / "velodyne_points" / "data"
+    folder.mkdir(parents=True)
+    (folder / "0000000000.bin").write_bytes(scan64)
+    return root
+
+
+def test_a_cache_of_dusty_keeps_the_columns_of_its_program(scan64: bytes, tmp_path: Path):
+    """Nearest resizing takes columns 0, 4, 8 of 2048, and nearest-exact, R2DM's, 2, 6, 10."""
+    root, table = kitti_of(scan64, tmp_path), np.frombuffer(scan64, "<f4").reshape(-1, 4)
+    wide = project(Scan(table[:, :3], table[:, 3]), "hdl-64e-dusty", "unfolding", 2048)
+    for word, mode in (("kitti-dusty", "nearest"), ("kitti-r2dm", "nearest-exact")):
+        main(["data", word, str(root), str(tmp_path / word)])
+        image = CachedImages(tmp_path / word)[0]
+        expected = torch.nn.functional.interpolate(torch.from_numpy(wide.range)[None, None], (64, 512), mode=mode)
+        np.testing.assert_allclose(image.range, expected[0, 0], atol=0.00101)
+        assert image.sensor.name == f"hdl-64e-{word.removeprefix('kitti-')}"
+    small = thin(wide, 16, 512, "nearest")
+    np.testing.assert_array_equal(small.range, wide.range[::4, ::4])
+    with pytest.raises(ValueError, match=r"expected a resizing of nearest-exact, nearest, found 'bilinear'"):
+        thin(wide, width=512, resizing="bilinear")
+
+
+def test_a_cache_of_lidargen_is_of_its_drives_and_without_limits(scan64: bytes, tmp_path: Path):
+    """Its program trains on all names without 0000_sync and 0001_sync, and drops no return for its range."""
+    for drive in (0, 2, 3):
+        folder = tmp_path / f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data"
+        folder.mkdir(parents=True)
+        (folder / "0000000000.bin").write_bytes(scan64)
+    main(["data", "kitti360-lidargen", str(tmp_path), str(tmp_path / "cache")])
+    images = CachedImages(tmp_path / "cache")
+    assert [images.name(i).sequence[-9:] for i in range(len(images))] == ["0002_sync", "0003_sync"]
+    assert images[0].range.max() > 80 and 0 < images[0].range[images[0].mask].min() < 1.45
+    main(["data", "kitti360-lidargen", str(tmp_path), str(tmp_path / "test"), "--split", "test"])
+    assert CachedImages(tmp_path / "test").name(0).sequence[-9:] == "0000_sync"
+
+
 def test_real_beams_keep_their_angles_when_thinned():
     beams = SENSORS["hdl-64e-kitti"]
     rows = np.broadcast_to(np.arange(64, dtype=np.float32)[:, None], (64, 1024))

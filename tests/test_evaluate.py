@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import re
 import signal
 from collections.abc import Callable
@@ -18,14 +19,16 @@ from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation import evaluate as evaluation
+from lidarsynth.evaluation.features import gated
 from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.pairs import Pairs
+from lidarsynth.evaluation.protocol import Sets
 from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING, STREET_1
 from lidarsynth.evaluation.report import Result
-from lidarsynth.evaluation.statistics import load_statistics
+from lidarsynth.evaluation.statistics import Statistics, load_statistics
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import project, thin
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.verbs.learned_sensor import sensor_toml
@@ -300,6 +303,54 @@ def test_protocols_choose_the_images_that_their_programs_choose():
     assert chosen.bev == {*range(10), *range(20, 30)}
     samples = accumulation.select(LIDARGEN, "samples", [str(i) for i in range(2000)])
     assert samples.features == set(range(1100)) and len(samples.bev) == 2000
+
+
+def test_the_shuffle_of_real_scans_is_of_the_published_order():
+    """R2DM numbers KITTI-360 by its training drives, then 0 and 2; the paths of a folder begin with 0."""
+    read = [f"2013_05_28_drive_{drive:04d}_sync/{i}" for drive in (3, 4, 5, 6, 7, 9, 10, 0, 2) for i in range(9)]
+    order = list(range(81))
+    random.Random(0).shuffle(order)
+    published = {read[i] for i in order[:20]}
+    for names in (read, sorted(read), [f"root/{name}.bin" for name in sorted(read)]):
+        chosen = accumulation.select(replace(R2DM, real_bev=20), "real", names)
+        assert {names[i].removeprefix("root/").removesuffix(".bin") for i in chosen.bev} == published
+    raw = [f"2011_09_26_drive_{drive:04d}_sync/0" for drive in (3, 2, 0, 1)]
+    assert accumulation.select(replace(R2DM, real_bev=3), "real", raw).bev == {0, 2, 1}, "another set stays as it is"
+
+
+def test_dusty_judges_ranges_along_rays_and_takes_the_columns_of_its_program(scan64: bytes):
+    """Its points are made of inverse depth, of real scans too, and both limits count."""
+    table = np.frombuffer(scan64, "<f4").reshape(-1, 4)
+    scan, sensor = Scan(table[:, :3], table[:, 3]), replace(ls.get_sensor(DUSTY.sensor), width=512)
+    real = as_image(scan, sensor, DUSTY.projection, True, DUSTY.resizing)
+    wide = project(scan, sensor, "unfolding", 2048)
+    np.testing.assert_array_equal(real.range, wide.range[:, ::4])
+    assert real.xyz is not None
+    seen = Statistics(replace(DUSTY, networks=(), sets=Sets(points=64)), sensor, "real")
+    bare = Statistics(seen.protocol, sensor, "real")
+    seen.update([real], [True], [True], [True])
+    bare.update([replace(real, xyz=None)], [True], [True], [True])
+    np.testing.assert_array_equal(seen.sets(), bare.sets())
+    nearest = np.where(np.arange(512) % 2 == 0, np.float32(1.45), np.float32(80)) * np.ones((64, 1), np.float32)
+    limits = RangeImage(nearest, np.zeros_like(nearest), nearest > 0, sensor)
+    assert gated(limits, DUSTY, "samples").all()
+
+
+@pytest.mark.parametrize(
+    ("word", "protocol", "projection"),
+    [
+        ("hdl-64e", R2DM, "spherical"),
+        ("hdl-64e-r2dm", R2DM, "unfolding"),
+        ("hdl-64e-dusty", DUSTY, "unfolding"),
+        ("hdl-64e-lidargen", LIDARGEN, "spherical"),
+        ("hdl-64e-lidargen", R2DM, "auto"),
+        ("hdl-64e-kitti", R2DM, "auto"),
+    ],
+)
+def test_scans_are_drawn_as_the_program_of_the_samples_draws_them(word: str, protocol, projection: str):
+    """Of a turn of 62 rings too, which `auto` would draw by elevation, and mean beams have none of their own."""
+    run = evaluation._Run(protocol, None, 1, "cpu", None)
+    assert run.projection(replace(ls.get_sensor(word), width=512)) == projection
 
 
 def test_a_reference_without_the_protocols_sequences_is_told():

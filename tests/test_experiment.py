@@ -3,6 +3,7 @@
 import json
 from dataclasses import FrozenInstanceError, replace
 
+import numpy as np
 import pytest
 import torch
 from networks import trained
@@ -11,7 +12,7 @@ from lidarsynth.experiment.folder import read_experiment, save
 from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Data, Training, from_dict, with_fields
 from lidarsynth.experiment.sensor import build_sensor
-from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.sensor import SENSORS, get_sensor
 from lidarsynth.systems.diffusion.build import build_denoiser
 from lidarsynth.systems.table import build_network
 from lidarsynth.systems.table import load_folder as load
@@ -207,8 +208,30 @@ def test_a_failed_save_leaves_the_old_model(tmp_path, monkeypatch):
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
-def test_info_of_kitti_raw_names_the_sensor_that_training_takes():
-    """Scan unfolding gives KITTI's own beams, and R2DM's even grid has none of them."""
+@pytest.mark.parametrize(
+    ("word", "source"),
+    [
+        ("r2dm-kitti-raw", "kitti-r2dm"),
+        *((word, "kitti-dusty") for word in ("vanilla-gan", "dusty-v1", "dusty-v2")),
+        ("lidargen", "kitti360-lidargen"),
+    ],
+)
+def test_presets_of_published_systems_learn_from_the_images_of_their_programs(word: str, source: str):
     from lidarsynth.data.sources import SOURCES
 
-    assert preset("r2dm-kitti-raw").data.sensor == SOURCES["kitti"].sensor == "hdl-64e-kitti"
+    data, own = preset(word).data, SOURCES[source]
+    assert (data.sensor, data.projection, data.width) == (own.sensor, own.projection, own.width)
+    assert own.resizing == ("nearest" if source == "kitti-dusty" else "nearest-exact")
+
+
+@pytest.mark.parametrize(
+    ("word", "fixture", "key"),
+    [
+        ("hdl-64e-r2dm", "r2dm/unfolding_angles", "kitti_raw.elevation_rad"),
+        ("hdl-64e-dusty", "gan_coords", "table_elevation_64"),
+    ],
+)
+def test_mean_beams_are_those_of_the_published_tables(fixture_tensors, word: str, fixture: str, key: str):
+    published = np.degrees(fixture_tensors(fixture)[key].double().numpy())
+    np.testing.assert_allclose(get_sensor(word).elevations, published, atol=1e-5)
+    assert word not in SENSORS, "what is in SENSORS is recognised, and streets are drawn of it"

@@ -295,6 +295,16 @@ def test_official_weights_say_what_the_reference_says(fixture_tensors, tmp_path:
     assert torch.equal(again.image, out.image), "angles are saved too"
 
 
+def test_the_released_angles_have_a_word(fixture_tensors, reference: Path, tmp_path: Path):
+    table = json.loads((reference / "facts" / "gans_state_dict_shapes.json").read_text())["wacv23/vanilla.G"]
+    state = {key: torch.zeros(()).expand(entry["shape"]) for key, entry in table.items()}  # a file of few bytes
+    angle = fixture_tensors("gan_coords")["angle_64x512"]
+    for name, moved, sensor in (("released", 0.0, "hdl-64e-dusty"), ("other", 1e-3, "other")):
+        angle = angle + torch.tensor([moved, 0.0])[:, None, None]
+        torch.save({"step": 1, "angle": angle, "G": state, "D": {}, "G_ema": state}, tmp_path / f"{name}.pth")
+        assert build_sensor(read_official(tmp_path / f"{name}.pth")[0]).name == sensor
+
+
 @pytest.mark.parametrize(("name", "word"), [("gan_iros21_vanilla", "vanilla-gan"), ("gan_iros21_dusty1", "dusty-v1")])
 @torch.no_grad()
 def test_the_first_release_is_read_too(fixture_tensors, tmp_path: Path, name: str, word: str):

@@ -25,6 +25,7 @@ from lidarsynth.diffusion.schedule import ve
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Score, from_dict, with_fields
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.depth import decode, encode, from_x_0, to_x_0
@@ -134,6 +135,8 @@ def test_the_range_code_is_lidargens(scan64, fixture_tensors):
     image = project(Scan(points[:, :3], points[:, 3]), everything, "spherical")
     assert_close((to_x_0(image, "log-63m") + 1) / 2, expected, atol=3e-5, rtol=0)
     assert (expected[0] == 1).any(), "what is farther than 63 m"
+    own = project(Scan(points[:, :3], points[:, 3]), build_sensor(preset("lidargen")), "spherical")
+    assert_close((to_x_0(own, "log-63m") + 1) / 2, expected, atol=3e-5, rtol=0)
 
 
 def test_the_range_code_does_not_depend_on_the_sensor():

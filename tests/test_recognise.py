@@ -8,9 +8,9 @@ import pytest
 
 from lidarsynth.files.formats import read
 from lidarsynth.lidar.own_beams import own_beams, stray_rings
-from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
+from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order, same_kind
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import GRIDS, INVERTED, SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 
 
@@ -229,3 +229,10 @@ def test_the_points_of_an_unnamed_scan_lie_on_the_table_of_the_hdl_32e(shared: P
     elevation = elevations_of(read(shared / "scans" / "other" / "fast_gicp_251370668.pcd").xyz)
     table = np.array(SENSORS["hdl-32e"].elevations)
     assert np.abs(elevation[:, None] - table).min(axis=1).max() < 0.01
+
+
+def test_what_published_programs_take_an_image_for_is_no_other_sensor():
+    """So no warning that a network of DUSty's knows another sensor, of KITTI's scans; and scans are of units alone."""
+    for word in GRIDS:
+        assert same_kind(word, "hdl-64e-kitti") and same_kind(f"{word}/32", "hdl-64e") and word not in SENSORS
+        assert not same_kind(word, "hdl-32e")

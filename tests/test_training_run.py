@@ -249,6 +249,8 @@ def test_resolve_takes_the_sensor_of_the_images(cache: Path, tmp_path: Path):
     assert (data.height, data.width) == (32, 128) and isinstance(data.sensor, dict) and data.sensor["name"] == "mine"
     with pytest.raises(ValueError, match="expected images of 16 x 64, found 32 x 128"):
         resolve("tiny", ("data.height=16",), data=tmp_path / "own")
+    sized = resolve("tiny", ("data.height=32", "data.width=128"), data=tmp_path / "own").data
+    assert sized == data, "a size that fits is no choice of a sensor either"
     turned = resolve("tiny", ("data.roll=true",), data=tmp_path / "own").data
     assert turned.roll and turned.height == 32, "an augmentation is no choice of a sensor"
     with pytest.raises(ValueError, match=r"expected group\.field=value"):

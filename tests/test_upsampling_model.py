@@ -93,6 +93,15 @@ def test_scaled_says_what_is_no_return():
     torch.testing.assert_close(scaled(metres, replace(group, keras=True)), torch.tensor([0.0, 0.2, 0.8, 0.0]))
 
 
+@pytest.mark.parametrize(("keras", "nothing"), [(False, 1.0), (True, 0.0)])
+def test_what_is_too_near_is_0_and_no_gap(keras: bool, nothing: float):
+    """In both published programs; a gap is as far as it goes in ILN's repository."""
+    group = replace(preset("lidar-sr").upsampling, keras=keras, min_range=3.0)
+    metres = torch.tensor([0.0, 0.01, 2.9, 3.0, 20.0, 81.0])
+    torch.testing.assert_close(scaled(metres, group), torch.tensor([nothing, 0.0, 0.0, 0.03, 0.2, nothing]))
+    assert preset("lidar-sr-keras").upsampling.min_range == 2, "metres, as its program"
+
+
 # ---------------------------------------------------------------- completion
 
 
@@ -338,7 +347,7 @@ def test_official_lidar_sr_is_recognised_and_answers_as_stored(fixture_tensors, 
         assert_close(model.network(stored["input"]), stored["output"], atol=1e-5, rtol=0)
     group, sensor = model.experiment.upsampling, model.sensor
     assert group is not None and (group.factor, group.spread, group.norm, group.max_range) == ((4, 1), True, 90, 70)
-    assert (sensor.height, sensor.width, sensor.min_range, sensor.max_range) == (64, 64, 2, 70)
+    assert (sensor.height, sensor.width, sensor.max_range, group.min_range) == (64, 64, 70, 2)
     np.testing.assert_allclose(sensor.elevations[:61:4], np.degrees(np.linspace(0.29, -0.29, 16)), atol=1e-5)
     torch.save(official("lsr", {k: v for k, v in weights.items() if not k.startswith("up_scale")}), tmp_path / "x.pth")
     with pytest.raises(ValueError, match=r"x.pth: expected LiDAR-SR with 2, 3, 4 up-scaling layers, found 0"):
@@ -347,6 +356,30 @@ def test_official_lidar_sr_is_recognised_and_answers_as_stored(fixture_tensors, 
     weights = {k.removeprefix("state_dict."): v for k, v in wide.items() if k.startswith("state_dict.")}
     torch.save(official("lsr", weights), tmp_path / "wide.pth")
     assert lidarsynth.load(tmp_path / "wide.pth").sensor.width == 128
+
+
+@torch.no_grad()
+def test_official_iln_is_shown_returns_that_are_too_near(tmp_path, monkeypatch):
+    """Its program makes 0 of them, in the image that is filled and in one of another sensor's beams."""
+    torch.manual_seed(2)
+    torch.save(official("iln", ILN().state_dict()), tmp_path / "iln.pth")
+    model, seen = lidarsynth.load(tmp_path / "iln.pth"), []
+    encode = ILN.encode
+    monkeypatch.setattr(ILN, "encode", lambda self, low: (seen.append(low), encode(self, low))[1])
+    sensor_in = replace(model.sensor.rows(range(0, 64, 4)), name="16", min_range=2.0)
+    radius = np.where(np.arange(64) < 32, 20.0, 1.5)  # metres; 1.5 on one side
+    flat = (sensor_in.directions() * radius[:, None]).reshape(-1, 3).astype(np.float32)
+    near, far = 2 * 0.0 - 1, 2 * 20 / 90 - 1
+    upsampled = model.upsample(Scan(flat), sensor_in)
+    known = np.zeros((64, 64), bool)
+    known[::4] = True
+    dense = Scan((model.sensor.directions() * radius[:, None]).reshape(-1, 3).astype(np.float32))
+    completed = model.complete(dense, known)
+    for low in seen:
+        np.testing.assert_allclose(low[0, 0], np.broadcast_to(np.where(radius > 2, far, near), (16, 64)), atol=1e-6)
+    assert len(seen) == 2
+    for image in (upsampled, completed):
+        assert not (image.mask & (image.range < 2))[1::4].any(), "and nothing so near is an answer"
 
 
 @pytest.mark.parametrize(("name", "network"), [("iln", lambda: ILN(2)), ("liif_lidar", LIIF)])

@@ -16,6 +16,7 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Data, Model
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.systems.diffusion.official_r2dm import experiment_of
 from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.weights import load as weights
 from lidarsynth.weights.download import cache_folder, download
@@ -124,6 +125,18 @@ def test_measured_angles_of_a_checkpoint_become_its_sensor(edited, fixture_tenso
     away = np.degrees(np.abs(sensor.ray_angles() - found))
     assert away[0].max() < 1e-5
     assert away[1].max() < 0.51 * 360 / 2048 * 1.05  # the subsampled column lies half a fine step off the centre
+
+
+def test_the_published_angles_of_kitti_raw_have_a_word(tiny, tmp_path, fixture_tensors):
+    """So that real scans are drawn and thinned for what they are judged with, as for its own training."""
+    table = fixture_tensors("r2dm/unfolding_angles")
+    for word in ("kitti_raw", "kitti_360"):
+        elevation, azimuth = table[f"{word}.elevation_rad"], table[f"{word}.azimuth_rad"][2::4]
+        coords = torch.stack(torch.broadcast_tensors(elevation[:, None], azimuth[None]))[None]
+        checkpoint = torch.load(tiny, weights_only=True)
+        checkpoint["cfg"]["data"] |= {"resolution": (64, 512), "projection": "unfolding-2048"}
+        sensor = experiment_of(checkpoint, coords, "mine").data.sensor
+        assert sensor == "hdl-64e-r2dm" if word == "kitti_raw" else sensor["name"] == "mine"
 
 
 def test_the_even_grid_of_any_height_is_exact(tiny, tmp_path):

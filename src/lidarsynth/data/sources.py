@@ -16,13 +16,14 @@ from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import Frames, Reader, choose, stamped
 from lidarsynth.data.index import INDEX, REPORT, read_index, report
 from lidarsynth.data.kitti import kitti
-from lidarsynth.data.kitti360 import kitti360
+from lidarsynth.data.kitti360 import kitti360, kitti360_lidargen
 from lidarsynth.data.nuscenes import NuScenes, nuscenes
 from lidarsynth.data.street_caches import begins_alike
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import PROJECTIONS, columns_of, project_thinned
 from lidarsynth.lidar.recognition import recognise, same_kind
-from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.scan import RangeImage, with_points
+from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.streets.edition import EDITION
 
 __all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "prepare", "scan_files", "summary"]
@@ -32,7 +33,8 @@ __all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", 
 class Source:
     """A data set: its reader (root, split) -> Reader, and what its images are unless said otherwise.
 
-    sensor  None = recognised from the first scan
+    sensor    None = recognised from the first scan
+    resizing  which columns stay of wider drawings, as in `projection.thin`
     """
 
     reader: Callable[[Path, str], Reader]
@@ -40,11 +42,16 @@ class Source:
     sensor: str | None
     projection: str
     width: int
+    resizing: str = "nearest-exact"
 
 
 SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses the data set
     "kitti360": Source(kitti360, "train", "hdl-64e", "spherical", 1024),
     "kitti": Source(kitti, "train", "hdl-64e-kitti", "unfolding", 512),
+    # images on which the presets of published systems learned: r2dm-kitti-raw, DUSty's and the vanilla GAN's, lidargen
+    "kitti-r2dm": Source(kitti, "train", "hdl-64e-r2dm", "unfolding", 512),
+    "kitti-dusty": Source(kitti, "train", "hdl-64e-dusty", "unfolding", 512, "nearest"),
+    "kitti360-lidargen": Source(kitti360_lidargen, "train", "hdl-64e-lidargen", "spherical", 1024),
     "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
     "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
     "files": Source(lambda root, split: _files(root, split), "all", None, "auto", 1024),
@@ -62,9 +69,10 @@ class Projected:
     sensor: Sensor
     projection: str
     columns: int
+    resizing: str = "nearest-exact"
 
     def __call__(self, i: int) -> RangeImage:
-        return project_thinned(self.reader[i], self.sensor, self.projection, self.columns)
+        return project_thinned(with_points(self.reader[i]), self.sensor, self.projection, self.columns, self.resizing)
 
 
 def prepare(
@@ -132,7 +140,7 @@ def cache_source(
     reader = _reader(name, Path(root), split, intensity)
     word = sensor or own.sensor or _recognised(reader)
     spec, columns = _sensor(word, width), columns_of(projection, width, get_sensor(word).width)
-    image = Projected(reader, spec, projection, columns)
+    image = Projected(reader, spec, projection, columns, own.resizing)
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
     source |= {} if intensity == "auto" else {"intensity": intensity}
     source |= {"root": str(Path(root).resolve()), "missing": list(reader.missing)}
@@ -171,7 +179,7 @@ def _width(given: int | None, sensor: str | None, source: int) -> int:
     """The given width, else that of a sensor of the user's own, else the source's."""
     if given is not None:
         return given
-    return source if sensor is None or sensor in SENSORS else get_sensor(sensor).width
+    return source if sensor is None or sensor in WORDS else get_sensor(sensor).width
 
 
 def _files(root: Path, split: str, intensity: str = "auto") -> Frames:
@@ -233,12 +241,12 @@ def summary(folder: str | Path) -> str:
     """What a cache holds, in one line: images, sequences, and what was skipped or is missing."""
     told = report(read_index(folder))
     sequences, skipped, missing = (len(told[key]) for key in ("sequences", "skipped", "missing"))
-    text = f"{told['stored']} images"
+    text = plural(told["stored"], "image")
     if sequences:
-        text += f" of {sequences} sequence{'s' if sequences > 1 else ''}"
+        text += f" of {plural(sequences, 'sequence')}"
     text += f" in {folder}/"
     if skipped:
-        text += f", {skipped} broken scan{'s' if skipped > 1 else ''} skipped (named in {Path(folder) / REPORT})"
+        text += f", {plural(skipped, 'broken scan')} skipped (named in {Path(folder) / REPORT})"
     if missing:
         text += f"; not found: {', '.join(told['missing'][:5])}{', ...' if missing > 5 else ''}"
     return text

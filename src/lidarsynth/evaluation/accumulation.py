@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 from torch import nn
 
 from lidarsynth.data.cache import sha256
+from lidarsynth.data.kitti360 import SPLITS
 from lidarsynth.evaluation.image_sets import ImageSet
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Network
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
@@ -144,6 +145,7 @@ def select(
         of_protocol = [i for i, name in enumerate(names) if any(part in name for part in sequences)]
         numbers = of_protocol or list(range(len(names)))
         if limit is not None:
+            numbers.sort(key=lambda i: _place(names[i]))
             random.Random(0).shuffle(numbers)  # as R2DM and LiDARGen order their real scans
             numbers = numbers[: samples if limit == 0 else limit]
         chosen.append(frozenset(numbers))
@@ -153,6 +155,14 @@ def select(
             random.Random(0).shuffle(matched)
         return Selection(chosen[0], chosen[1], frozenset(matched[: protocol.clouds.real]))
     return Selection(chosen[0], chosen[1], _spread(protocol, range(len(names))))
+
+
+def _place(name: str) -> int:
+    """Where R2DM's data set has the drive of a scan of KITTI-360: training drives first, then 0 and 2. Its program
+    shuffles numbers by this order, and a folder's paths have another; what is of no such drive stays as it is, last."""
+    return next(
+        (k for k, drive in enumerate(SPLITS["all"]) if f"2013_05_28_drive_{drive:04d}_" in name), len(SPLITS["all"])
+    )
 
 
 def _spread(protocol: EvaluationProtocol, numbers: range) -> frozenset[int]:
@@ -201,7 +211,8 @@ def gather(
             scans = [images.points(i, empty.sensor, clouds, empty.role == "real") for i in batch]
             statistics.update_clouds(scans, features, bev, sets)
         else:
-            arrays = [images.image(i, empty.sensor, projection, resize=empty.role == "real") for i in batch]
+            real, resizing = empty.role == "real", empty.protocol.resizing
+            arrays = [images.image(i, empty.sensor, projection, real, resizing) for i in batch]
             statistics.update(arrays, features, bev, sets)
         if on_images:
             on_images(empty.role, start + len(batch), len(numbers))

@@ -30,7 +30,7 @@ from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import GRIDS, Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.networks.device import check_device
@@ -123,6 +123,12 @@ class _Run:
         told = unused_sensor(named, judged, drawn) + unlike_sensors(sides, drawn)
         return told + tensors_taken(sides, drawn, named) + unlike_metres(sides)
 
+    def projection(self, sensor: Sensor) -> str:
+        """Of points: the protocol's into images of its own sensor; by rings into those that published programs take."""
+        if sensor.name == self.protocol.sensor:
+            return self.protocol.projection
+        return "unfolding" if sensor.name in GRIDS and not sensor.edges else "auto"
+
     def networks(self, sensor: Sensor) -> Loaded:
         return load_networks(self.protocol, sensor.width, self.device, self.on_images)
 
@@ -145,7 +151,8 @@ class _Run:
                 points = ([of.points(i, sensor, clouds, of is truth) for i in numbers] for of in (judged, truth))
                 pairs.update_points(*points)
             else:
-                batch = ([of.image(i, sensor, projection, of is truth) for i in numbers] for of in (judged, truth))
+                sides, resizing = (judged, truth), self.protocol.resizing
+                batch = ([of.image(i, sensor, projection, of is truth, resizing) for i in numbers] for of in sides)
                 pairs.update(*batch)
             if self.on_images:
                 self.on_images("pairs", numbers.stop, len(judged))
@@ -181,10 +188,8 @@ class _Run:
                 return load_statistics(kept, self.protocol)[0], kept
         unfinished = kept.with_name(f"unfinished-{kept.name}") if kept else None
         empty = Statistics(self.protocol, sensor, role, loaded.networks, loaded.weights)
-        projection = self.protocol.projection if sensor.name == self.protocol.sensor else "auto"
-        statistics = gather(
-            images, numbers, chosen, empty, projection, unfinished, self.batch_size, self.on_images
-        )  # fmt: skip
+        drawn = self.projection(sensor)
+        statistics = gather(images, numbers, chosen, empty, drawn, unfinished, self.batch_size, self.on_images)
         if kept and role == "real":
             try:
                 save_statistics(kept, statistics, {"source": images.source})

@@ -50,13 +50,16 @@ class ImageSet:
     def __len__(self) -> int:
         return len(self.names)
 
-    def image(self, i: int, sensor: Sensor, projection: str, resize: bool = False) -> RangeImage:
+    def image(
+        self, i: int, sensor: Sensor, projection: str, resize: bool = False, resizing: str = "nearest-exact"
+    ) -> RangeImage:
         """Image i in the sensor's size, its empty pixels 0; points are projected, larger images thinned where `resize`.
 
+        resizing  as in `projection.thin`
         Raises ValueError that begins with the image's name.
         """
         try:
-            return as_image(judged(self.item(i)), sensor, projection, resize)
+            return as_image(judged(self.item(i)), sensor, projection, resize, resizing)
         except ValueError as error:
             raise self._named(i, error) from None
 
@@ -207,17 +210,19 @@ def emptied(image: RangeImage) -> RangeImage:
     return image.keep(image.mask) if any(layer[~image.mask].any() for layer in layers) else image
 
 
-def as_image(item: Item, sensor: Sensor, projection: str, resize: bool = False) -> RangeImage:
+def as_image(
+    item: Item, sensor: Sensor, projection: str, resize: bool = False, resizing: str = "nearest-exact"
+) -> RangeImage:
     """Any stored form as a range image of the sensor's size. Raises ValueError for another size, NaN, other shapes."""
     size = (sensor.height, sensor.width)
     if isinstance(item, Scan):
-        return project_thinned(item, sensor, projection)
+        return project_thinned(item, sensor, projection, resizing=resizing)
     if isinstance(item, Tensor):
         return from_tensor(item, sensor)
     if item.shape != size and not (resize and _divides(size, item.shape)):
         raise ValueError(f"expected images of one size, {size[0]} x {size[1]}, found one of {item.shape[0]} x "
                          f"{item.shape[1]}")  # fmt: skip
-    return item if item.shape == size else thin(item, *size)
+    return item if item.shape == size else thin(item, *size, resizing)
 
 
 def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> np.ndarray:

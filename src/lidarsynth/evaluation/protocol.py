@@ -82,7 +82,7 @@ class EvaluationProtocol:
 
     sensor, height, width  the images; scans without an image are projected into these
     near, far              metres, strict: pixels outside count as empty, on the sides `gated`
-    resizing               how larger reference images come to the samples' size
+    resizing               how larger reference images come to the samples' size, a word of `projection.thin`
     samples, samples_bev   the first so many, sorted by name, are judged by features and by BEV; None = all
     real, real_bev         so many, after `Random(0).shuffle`; None = all, 0 = as many as samples
     sequences, sequences_bev  parts of the names of the reference's sequences; () = all
@@ -90,6 +90,7 @@ class EvaluationProtocol:
     subsets, subset_size   of the polynomial MMD, k(x, y) = (x.y / D + 1)^3
     keep                   features of at most so many images stay for that MMD, those of the BEV; and histograms
     measured               real x, y, z are those of the measured points, not of their pixels' rays
+    rays                   x, y, z are those of their pixels' rays, where points are known too
     sets                   scans as small sets of points, or None
     clouds                 scans as lists of points, or None; images, gates and projection are then not of account
     pairs                  sample i is compared with reference i
@@ -122,6 +123,7 @@ class EvaluationProtocol:
     keep: int = 10_000
     beam_step: float = 0.5  # metres, bins of the range histogram per beam
     measured: bool = False
+    rays: bool = False
     sets: Sets | None = None
     clouds: Clouds | None = None
     pairs: bool = False

@@ -57,11 +57,12 @@ R2DM = EvaluationProtocol(
 
 LIDARGEN = EvaluationProtocol(
     "lidargen-2022",
-    1,
+    2,
     "Zyrianov et al., ECCV 2022, and the official evaluation programs",
     (_FRD, *_BEV_ROWS),
     (RANGENET_53,),
     Bev(),
+    sensor="hdl-64e-lidargen",
     gated=("samples",),
     samples=1100,
     samples_bev=None,
@@ -76,7 +77,8 @@ LIDARGEN = EvaluationProtocol(
         "for the FRD samples are gated, turned into points and drawn again, and their first point is lost; the real "
         "scan's first point is not known in an image and stays",
         "no epsilon on the covariance: the official program adds 1e-6 only where its root is not finite",
-        "real scans come within their sensor's limits (1.45 to 80 m of hdl-64e), the official program has none",
+        "real scans come within their sensor's limits, the official program has none: those of hdl-64e-lidargen are "
+        "0.5 to 130 m, of R2DM's hdl-64e 1.45 to 80 m",
     ),
 )
 
@@ -88,19 +90,23 @@ _DUSTY_ROWS = (
 )
 DUSTY = EvaluationProtocol(
     "dusty-2023",
-    1,
+    2,
     "Nakashima et al., WACV 2023, test script",
     (_FPD, Row("KPD", "kernel", KERNEL, "pointnet"), *_DUSTY_ROWS),
     (POINTNET,),
-    sensor="hdl-64e-kitti",
+    sensor="hdl-64e-dusty",
     width=512,
     projection="unfolding",
-    near=1.45,
-    far=80.0,
+    near=1.4499,  # both limits, 1.45 and 80 m, count
+    far=80.0001,
+    resizing="nearest",
     samples=50_000,
+    rays=True,
     sets=Sets(),
     absent=(("SWD", "sliced Wasserstein distance of Laplacian pyramids is not here"),),
     notes=(
+        "points are those of pixels' rays, of real scans too: an image's range along the mean beams of hdl-64e-dusty; "
+        "real scans keep columns 4k of 2048",
         "the reference of FPD and KPD is the training set, that of JSD, COV, MMD and 1-NNA the test set: run it twice",
         "KPD takes its subsets from at most 10,000 images per side",
         "JSD, COV, MMD and 1-NNA: 2,048 images evenly spaced, 2,048 farthest points of each; the earth mover's "

@@ -139,10 +139,13 @@ class Statistics:
         if self.protocol.reproject and self.role == "samples":
             images = [drawn_again(image, gated(image, self.protocol, "samples")) for image in images]
         masks = np.stack([gated(image, self.protocol, self.role) for image in images])
-        xyz = np.stack([image.points() for image in images]) * masks[..., None]
+        xyz = np.stack([self._points(image) for image in images]) * masks[..., None]
         for kind, network in self.networks.items():
             record = self.protocol.network(kind)
             self.add_features(kind, features(network, images, xyz, masks, record.features if record else 0), keep)
+
+    def _points(self, image: RangeImage) -> np.ndarray:
+        return image.sensor.points(image.range) if self.protocol.rays else image.points()
 
     def add_features(self, kind: str, values: Array, keep: Iterable[bool]) -> None:
         """Take in features (B, D) of a network that ran elsewhere. Raises ValueError for NaN or another D."""
@@ -159,7 +162,7 @@ class Statistics:
             return
         masks = np.stack([gated(image, self.protocol, "bev") for image in images])
         if self.bev:
-            xyz = np.stack([image.points() for image in images]) * masks[..., None]
+            xyz = np.stack([self._points(image) for image in images]) * masks[..., None]
             self.bev.update(xyz.reshape(len(images), -1, 3))
         if self.beams:
             self.beams.update(np.stack([image.range for image in images]), masks)
@@ -173,7 +176,7 @@ class Statistics:
         if not sets:
             return
         for image in images:
-            xyz = (image.points() * gated(image, self.protocol, self.role)[..., None]).reshape(-1, 3) / sets.scale
+            xyz = (self._points(image) * gated(image, self.protocol, self.role)[..., None]).reshape(-1, 3) / sets.scale
             chosen = xyz[farthest_points(xyz, sets.points, sets.clear)]
             self._sets.append(torch.from_numpy(chosen.astype(np.float32))[None])
 
@@ -318,8 +321,9 @@ def definition(protocol: EvaluationProtocol) -> str:
     fields = asdict(protocol)
     for text in ("source", "notes", "absent", "rows"):  # what is said and shown, not what is gathered
         del fields[text]
-    if protocol.clouds is None:  # so that protocols from before it keep their hash
-        del fields["clouds"]
+    for name in ("clouds", "rays"):  # so that protocols from before them keep their hash
+        if not fields[name]:
+            del fields[name]
     fields["measures"] = sorted({row.measure for row in protocol.rows})
     return f"v{protocol.version} {sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:16]}"
 

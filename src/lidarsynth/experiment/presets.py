@@ -61,14 +61,14 @@ def r2dm_h() -> Experiment:
 
 def r2dm_kitti_raw() -> Experiment:
     """The paper's KITTI-Raw model: scan unfolding at 64x2048, subsampled to 64x512. 31,098,498 parameters."""
-    return Experiment("r2dm-kitti-raw", data=Data(sensor="hdl-64e-kitti", projection="unfolding", width=512))
+    return Experiment("r2dm-kitti-raw", data=Data(sensor="hdl-64e-r2dm", projection="unfolding", width=512))
 
 
 def lidargen() -> Experiment:
     """LiDARGen as published (Zyrianov et al. 2022), with 29,694,082 parameters; sampled in 232 x 5 steps and one."""
     return Experiment(
         "lidargen",
-        data=Data(codec="log-63m"),
+        data=Data(sensor="hdl-64e-lidargen", codec="log-63m"),
         model=Model(network="refinenet", base_channels=128),
         diffusion=Diffusion(schedule="ve", kind="score", clip=False, gamma=None, mean_weight=False),
         training=Training(
@@ -104,9 +104,9 @@ def vanilla_gan() -> Experiment:
     return Experiment(
         "vanilla-gan",
         data=Data(
-            sensor="hdl-64e-kitti",
+            sensor="hdl-64e-dusty",
             projection="unfolding",
-            width=512,  # of 2048, as R2DM's KITTI-Raw
+            width=512,  # of 2048, columns 4k
             codec="inverse",
             reflectance=False,
         ),
@@ -141,7 +141,7 @@ def tiny_gan() -> Experiment:
     return replace(
         full,
         name="tiny-gan",
-        data=replace(full.data, projection="auto", height=32, width=64),
+        data=replace(full.data, sensor="hdl-64e-kitti", projection="auto", height=32, width=64),
         model=replace(full.model, base_channels=4),
         training=replace(full.training, steps=20, batch_size=4, ema_half_life=20),
         adversarial=Adversarial(

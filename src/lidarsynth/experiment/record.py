@@ -103,6 +103,7 @@ class Upsampling:
     spread: bool = False  # LiDAR-SR's rows reach from the first known row to the last (official weights)
     norm: float = within(100.0, 1e-6)  # the range that is 1
     max_range: float = within(80.0, 0)  # farther is no return
+    min_range: float = within(0.0, 0)  # nearer is shown as 0, which is no return with `keras`, and is no answer
     noise: float = within(0.0, 0)  # standard deviation of what training adds to ranges
     keras: bool = False  # LiDAR-SR's original program: no return is 0 and not 1, dropout of single values
     passes: int = within(50, 1, 100_000)  # of LiDAR-SR under Monte-Carlo dropout

@@ -26,10 +26,12 @@ def lidar_sr() -> Experiment:
 
 
 def lidar_sr_keras() -> Experiment:
-    """LiDAR-SR's own Keras program: noise on ranges, no return as 0, a rate that falls with 1 / (1 + 1e-5 step)."""
+    """LiDAR-SR's own Keras program: noise on ranges, no return and what is nearer than 2 m as 0, a rate that falls with
+    1 / (1 + 1e-5 step)."""
     start = lidar_sr()
     training = replace(start.training, steps=100_000, batch_size=32, decay="inverse")
-    return replace(start, name="lidar-sr-keras", training=training, upsampling=Upsampling(noise=0.03, keras=True))
+    upsampling = Upsampling(noise=0.03, keras=True, min_range=2.0)
+    return replace(start, name="lidar-sr-keras", training=training, upsampling=upsampling)
 
 
 def lidar_sr_tiny() -> Experiment:

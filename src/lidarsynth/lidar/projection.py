@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 
 PROJECTIONS = ("auto", "spherical", "unfolding")
+RESIZINGS = ("nearest-exact", "nearest")
 # Rows by the order of points are wrong where more than this share of at most so many points lies on other beams, and
 # points lie on beams, within this share of the usual spacing; those of scans put straight for motion do not.
 OTHERS, SOME, ON_BEAM = 0.1, 10_000, 0.08
@@ -51,16 +52,23 @@ def columns_of(method: str, width: int, own: int) -> int:
     return width if width >= min(own, 1024) else 2048 if method == "unfolding" else 1024
 
 
-def project_thinned(scan: Scan, sensor: Sensor, method: str = "auto", columns: int | None = None) -> RangeImage:
+def project_thinned(
+    scan: Scan,
+    sensor: Sensor,
+    method: str = "auto",
+    columns: int | None = None,
+    resizing: str = "nearest-exact",
+) -> RangeImage:
     """`project` as the published programs make their data sets: drawn at `columns`, of which the sensor's are kept.
 
     columns   None = `columns_of`, for a scan of more points than the sensor has pixels; others are images already, or
               of a sensor of so few columns
+    resizing  which are kept, as in `thin`
     Raises ValueError as `project` does.
     """
-    own = SENSORS.get(sensor.name, sensor).width if len(scan) > sensor.height * sensor.width else sensor.width
+    own = WORDS.get(sensor.name, sensor).width if len(scan) > sensor.height * sensor.width else sensor.width
     wide = columns_of(method, sensor.width, own) if columns is None else columns
-    return thin(project(scan, sensor, method, wide), width=sensor.width)
+    return thin(project(scan, sensor, method, wide), width=sensor.width, resizing=resizing)
 
 
 def occupied(scan: Scan, sensor: Sensor, pixels: Pixels) -> np.ndarray:
@@ -74,26 +82,33 @@ def occupied(scan: Scan, sensor: Sensor, pixels: Pixels) -> np.ndarray:
     return hit
 
 
-def thin(image: RangeImage, height: int | None = None, width: int | None = None) -> RangeImage:
+def thin(
+    image: RangeImage, height: int | None = None, width: int | None = None, resizing: str = "nearest-exact"
+) -> RangeImage:
     """The image at fewer columns and rows, every pixel one of the old ones: ray-drop stays ray-drop, nothing is mixed.
 
-    Columns are those of nearest-exact resizing, 4k + 2 from 2048 to 512 (R2DM's KITTI-Raw). So are the rows of a grid
-    of pixel edges (`sensor.edges`); of real beams they are the ones that `Sensor.resized` keeps, each with its angle.
+    resizing  a word of torch: `nearest-exact` keeps columns 4k + 2 from 2048 to 512 (R2DM's KITTI-Raw), `nearest` 4k
+              (DUSty's). So are the rows of a grid of pixel edges (`sensor.edges`); of real beams they are the ones that
+              `Sensor.resized` keeps, each with its angle
+    Raises ValueError for another word.
     """
     height, width = height or image.shape[0], width or image.shape[1]
     sensor = image.sensor.resized(height, width)
-    rows = _nearest_exact(image.shape[0], height)
+    rows = _kept(image.shape[0], height, resizing)
     if not image.sensor.edges:
         rows = np.arange(0, image.shape[0], image.shape[0] // height)
-    grid = np.ix_(rows, _nearest_exact(image.shape[1], width))
+    grid = np.ix_(rows, _kept(image.shape[1], width, resizing))
     label = None if image.label is None else image.label[grid]
     xyz = None if image.xyz is None else image.xyz[grid]
     return RangeImage(image.range[grid], image.reflectance[grid], image.mask[grid], sensor, label, xyz)
 
 
-def _nearest_exact(size: int, smaller: int) -> np.ndarray:
-    """(smaller,) which of `size` pixels lies under the centre of each new pixel: floor((i + 1/2) size / smaller)."""
-    return (2 * np.arange(smaller) + 1) * size // (2 * smaller)
+def _kept(size: int, smaller: int, resizing: str) -> np.ndarray:
+    """(smaller,) which of `size` pixels stay: floor((i + 1/2) size / smaller), under the centre of each new pixel, for
+    `nearest-exact`; floor(i size / smaller), under its edge, for `nearest`."""
+    if resizing not in RESIZINGS:
+        raise ValueError(f"expected a resizing of {', '.join(RESIZINGS)}, found {resizing!r}")
+    return (2 * np.arange(smaller) + (resizing == "nearest-exact")) * size // (2 * smaller)
 
 
 def _length(*axes: np.ndarray) -> np.ndarray:

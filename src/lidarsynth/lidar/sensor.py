@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -346,14 +347,16 @@ SENSORS: dict[str, Sensor] = {
 
 # Those whose beams are others when they hang upside down, as under a drone or in a rack on a roof.
 INVERTED = {sensor.name: sensor for sensor in (SENSORS[n].inverted() for n in ("hdl-32e", "vlp-32c", "pandar64"))}
-# What published programs take KITTI's images for, and no scan is recognised as: mean beams, and R2DM's grid as LiDARGen
-# has it, which limits no range (an HDL-64E measures 0.9 to 120 m) but judges its points from 0.5 m on.
+# What published programs take KITTI's images for, and no scan is recognised as: mean beams, the limits of DUSty's first
+# release, and R2DM's grid as LiDARGen has it: no return is dropped (an HDL-64E's are of 0.9 to 120 m), and points are
+# judged from 0.5 m on.
 GRIDS = {
     "hdl-64e-r2dm": Sensor("hdl-64e-r2dm", _KITTI_R2DM, 1024, 1.45, 80.0),
     "hdl-64e-dusty": Sensor("hdl-64e-dusty", _KITTI_DUSTY, 1024, 1.45, 80.0),
+    "hdl-64e-iros21": replace(SENSORS["hdl-64e-kitti"], name="hdl-64e-iros21", min_range=0.9, max_range=120.0),
     "hdl-64e-lidargen": replace(SENSORS["hdl-64e"], name="hdl-64e-lidargen", min_range=0.5, max_range=130.0),
 }
-WORDS = SENSORS | INVERTED | GRIDS
+WORDS = ChainMap(SENSORS, INVERTED, GRIDS)  # what `get_sensor` takes, also of what is put into SENSORS from outside
 
 
 def same_rays(one: Sensor, other: Sensor) -> bool:

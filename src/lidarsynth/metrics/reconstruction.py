@@ -1,4 +1,4 @@
-"""How far a completed scan is from the measured one: pixel by pixel, point by point, voxel by voxel, class by class."""
+"""How far a completed scan is from the measured one: pixel by pixel, point by point, class by class."""
 
 from __future__ import annotations
 

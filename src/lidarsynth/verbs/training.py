@@ -24,7 +24,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.depth import CODECS
 from lidarsynth.lidar.projection import PROJECTIONS
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import WORDS
 from lidarsynth.pictures.figure import compare
 from lidarsynth.systems.table import SYSTEMS, build_network, system_of, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
@@ -88,12 +88,11 @@ def _for_images(experiment: Experiment, data: str | Path, chosen: set[str]) -> E
         experiment = with_fields(experiment, {"data.projection": drawn})
     found, expected = images.sensor, build_sensor(experiment)
     shape, (height, width) = (found.height, found.width), (expected.height, expected.width)
-    own = bool(chosen & {"data.sensor", "data.height", "data.width"})
-    if own and shape != (height, width):
+    if chosen & {"data.sensor", "data.height", "data.width"} and shape != (height, width):
         raise ValueError(f"{data}: expected images of {height} x {width}, found {shape[0]} x {shape[1]}")
-    if own or found == expected:
+    if "data.sensor" in chosen or found == expected:
         return experiment
-    words = [w for w, s in SENSORS.items() if s.height % found.height == 0 and s.resized(*shape) == found]
+    words = [w for w, s in WORDS.items() if s.height % found.height == 0 and s.resized(*shape) == found]
     sensor = words[0] if words else found.to_dict()
     return with_fields(experiment, {"data.sensor": sensor, "data.height": shape[0], "data.width": shape[1]})
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lidarsynth.experiment.record import Card, Data, Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.sensor import get_sensor
 
 # Field of an official cfg -> field of our Experiment. What is not here (workers, saving, ...) does not matter.
 FIELDS: dict[str, str] = {
@@ -93,7 +94,8 @@ def _sensor(coords: Tensor, name: str) -> str | dict:
     """The sensor whose ray angles are the checkpoint's `coords` (1, 2, H, W): a word, or a table for another grid.
 
     R2DM's own grid is exact at any height. Measured angles (scan unfolding) become beams at their exact elevations with
-    evenly spaced columns, an eighth of a pixel (64 x 512) or a quarter (64 x 1024) from those of the checkpoint.
+    evenly spaced columns, an eighth of a pixel (64 x 512) or a quarter (64 x 1024) from those of the checkpoint; those
+    of KITTI raw have a word.
     """
     height, width = coords.shape[2:]
     elevation, azimuth = np.degrees(coords[0].double().numpy())
@@ -107,5 +109,8 @@ def _sensor(coords: Tensor, name: str) -> str | dict:
         return grid.name
     if not np.all(np.diff(rows) < 0):
         raise ValueError(f"expected model.coords with elevations that fall from row to row, found {rows[:4]} degrees")
+    raw = get_sensor("hdl-64e-r2dm")
+    if len(rows) == raw.height and shift >= 0.25 and np.allclose(rows, raw.elevations, rtol=0, atol=1e-4):
+        return raw.name
     limits = {"min_range": grid.min_range, "max_range": grid.max_range, "mount": grid.mount}
     return {"name": name, "elevations": rows.tolist(), "width": width, "edges": bool(shift < 0.25), **limits}

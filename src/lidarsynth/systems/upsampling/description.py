@@ -27,6 +27,7 @@ def _shown(experiment: Experiment) -> dict[str, str]:
     group, height = experiment.upsampling or Upsampling(), experiment.data.height
     rows = f"{height // group.factor[0]} to {height} rows (beams:{group.factor[0]}:{group.first})"
     range_ = f"1 is {group.norm:g} m, up to {group.max_range:g} m, no return is {0 if group.keras else 1}"
+    range_ += f", nearer than {group.min_range:g} m is 0" if group.min_range else ""
     if experiment.model.network != "lidar-sr":
         return {"upsampling": f"{rows}, and any other known beams and rays; {range_}"}
     answer = f"mean of {group.passes} passes under dropout, empty where they vary by more than {group.threshold:.0%}"

@@ -113,7 +113,8 @@ class UpsamplingModel(ScanModel):
         """
         if sensor_in.height < 2:
             raise ValueError(f"{self.experiment.name}: expected a sensor with at least 2 beams, found {sensor_in.name}")
-        low = project(scan, sensor_in, "auto", width=self._columns(sensor_in)).range
+        seen = replace(sensor_in, min_range=0.0) if self._group.min_range else sensor_in  # near returns are no gaps
+        low = project(scan, seen, "auto", width=self._columns(sensor_in)).range
         row = places(self.sensor.elevations, sensor_in.elevations)
         column = (np.arange(self.sensor.width) + 0.5) / self.sensor.width * low.shape[1] - 0.5
         if isinstance(self.network, LidarSR):
@@ -189,14 +190,19 @@ class UpsamplingModel(ScanModel):
 
     def _image(self, distance: np.ndarray) -> RangeImage:
         """Ranges (H, W) in metres as an image, empty beyond the limits."""
-        mask = (distance > self.sensor.min_range) & (distance < min(self.sensor.max_range, self._group.max_range))
+        near, far = max(self.sensor.min_range, self._group.min_range), min(self.sensor.max_range, self._group.max_range)
+        mask = (distance > near) & (distance < far)
         return RangeImage((distance * mask).astype(np.float32), np.zeros(mask.shape, np.float32), mask, self.sensor)
 
 
 def scaled(distance: Tensor, group: Upsampling) -> Tensor:
-    """Ranges in metres, 0 where nothing returned -> what LiDAR-SR sees: over `norm`, no return as 1, or 0 (Keras)."""
+    """Ranges in metres, 0 where nothing returned -> what LiDAR-SR sees: over `norm`, no return as 1, or 0 (Keras).
+
+    Returns nearer than `min_range` are 0, as in both published programs.
+    """
     returned = (distance > 0) & (distance <= min(group.max_range, group.norm))
-    return torch.where(returned, distance / group.norm, 0.0 if group.keras else 1.0)
+    code = torch.where(distance < group.min_range, 0.0, distance / group.norm)
+    return torch.where(returned, code, 0.0 if group.keras else 1.0)
 
 
 def places(elevations: Sequence[float] | np.ndarray, beams: Sequence[float] | np.ndarray) -> np.ndarray:

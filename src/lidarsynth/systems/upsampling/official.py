@@ -79,7 +79,8 @@ def _with_sensor(experiment: Experiment, group: Upsampling, told: object, name: 
     if not isinstance(told, Mapping) or not all(isinstance(told.get(f), (int, float)) for f in FIELDS):
         raise ValueError(f"expected lidar_in with the numbers {', '.join(FIELDS)}, found {told!r:.80}")
     channels, columns = int(told["channels"]), int(told["points_per_ring"])
-    rows, group = group.factor[0], replace(group, norm=float(told["norm_r"]), max_range=float(told["max_r"]))
+    limits = {"norm": float(told["norm_r"]), "max_range": float(told["max_r"]), "min_range": float(told["min_r"])}
+    rows, group = group.factor[0], replace(group, **limits)
     if experiment.model.network != "lidar-sr":
         rows = max(1, ROWS // channels)
         group = replace(group, factor=(rows, 1))
@@ -89,7 +90,7 @@ def _with_sensor(experiment: Experiment, group: Upsampling, told: object, name: 
         "name": name,
         "elevations": (top - step * np.arange(channels * rows)).round(6).tolist(),
         "width": columns * group.factor[1],
-        "min_range": float(told["min_r"]),
+        "min_range": 0.0,  # nearer returns are seen, as 0: `group.min_range`
         "max_range": float(told["max_r"]),
     }
     height, width = channels * rows, columns * group.factor[1]
