@@ -6,7 +6,7 @@ python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of re
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
 python benchmarks/any_sensor.py floating SCAN...    new points where no surface is, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
-python benchmarks/any_sensor.py dense [--sensor vlp-16] [--mount 0.5]   held-out streets in four times as many beams
+python benchmarks/any_sensor.py dense [--sensor vlp-16] [--mount 0.5] [--tilt 8 0]   held-out streets, four times the beams
 python benchmarks/any_sensor.py responses           reflectance of held-out streets, reported in ways never trained on
 Each takes --models (words or folders).
 """
@@ -14,10 +14,11 @@ Each takes --models (words or folders).
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -140,13 +141,13 @@ def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
             yield f"| {name} | {word} | {shares} |"
 
 
-def dense(name: str, models: Sequence[str], mount: float | None = None, count: int = 24) -> Iterator[str]:
+def dense(name: str, models: Sequence[str], stance: Mapping[str, Any], count: int = 24) -> Iterator[str]:
     """Streets that nothing was trained on, cast in four times the beams of a sensor; its own ones are known.
 
-    mount  metres above the road that it is, and nobody is told
+    stance  its mount and tilt, of which nobody is told
     """
     sensor = ls.get_sensor(name).denser(4)
-    reader = SyntheticStreets(HELD_OUT, 1 << 20, replace(sensor, mount=sensor.mount if mount is None else mount))
+    reader = SyntheticStreets(HELD_OUT, 1 << 20, replace(sensor, **stance))
     totals = {word: np.zeros(2) for word in (*RIVALS, *models)}
     for image in (replace(reader.image(16 * i + 5), sensor=sensor) for i in range(count)):
         known = every(image, 4)
@@ -209,13 +210,15 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=["default"])
     parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--mount", type=float)
+    parser.add_argument("--tilt", type=float, nargs=2, help="pitch and roll, degrees")
     parser.add_argument("--returned", action="store_true")
     parser.add_argument("--rings", help="such as 32-63")
     parser.add_argument("--transform", type=parse_transform, help="x:y:z:roll:pitch:yaw")
     args = parser.parse_args()
     rings = None if args.rings is None else tuple(map(int, args.rings.split("-")))
     REPORTS["errors"] = partial(errors, returned=args.returned, reading=Reading(transform=args.transform, rings=rings))
-    others = {"responses": responses, "dense": partial(dense, args.sensor, args.models, args.mount)}
+    stance = {name: value for name, value in (("mount", args.mount), ("tilt", args.tilt)) if value is not None}
+    others = {"responses": responses, "dense": partial(dense, args.sensor, args.models, stance)}
     for line in others[args.what]() if args.what in others else REPORTS[args.what](args.scans, args.models):
         print(line, flush=True)
 

@@ -166,11 +166,11 @@ def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):
     words = [str(tmp_path / "in"), "--sensor", "hdl-32e", "--no-picture", "--out", str(tmp_path / "o")]
     main(["project", *words])
     said = capsys.readouterr()
-    assert "1 bags or captures beside scan files were passed over: drive.bag" in said.err and "1 scans" in said.out
+    assert "1 bag or capture beside scan files was passed over: drive.bag" in said.err and "1 scan in" in said.out
     write(tmp_path / "in" / "c.pcd", ringed(scan))
     (tmp_path / "in" / "b.pcd").write_bytes(b"no points")
     main(["sensor", str(tmp_path / "in"), "--out", str(tmp_path / "s.toml"), "--no-picture"])
-    assert "1 that could not be read were left out, the first: " in capsys.readouterr().err
+    assert "1 that could not be read was left out, the first: " in capsys.readouterr().err
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "a.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")
     with pytest.raises(SystemExit, match="2"):

@@ -1,5 +1,6 @@
 """Bags written by their libraries' own writers, in other layouts than ours, read as they are and come back whole."""
 
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -260,6 +261,55 @@ def test_the_parts_of_a_bag_are_read_in_the_order_of_their_times(summary: bool, 
     for number in (6, 2, 3, 0, 5, 4, 1):
         np.testing.assert_allclose(series[number].scan.xyz[0], first + shift[number], rtol=1e-5)
     assert list(series.names) == [f"/points {t}.000 s" for t in true]
+
+
+def test_databases_are_read_in_the_order_of_their_times(tmp_path: Path):
+    """Three files of one bag that its metadata names in another order, two of which overlap."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store, times = typestore("cdr"), {0: [100, 101, 103], 1: [102, 104], 10: [109, 110]}
+    for part, seconds in times.items():
+        with Writer(tmp_path / f"p{part}", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            points = writer.add_connection("/points", POINTS, typestore=store)
+            for at in seconds:
+                data = store.serialize_cdr(message(store, table(at, False), at, False, False), POINTS)
+                writer.write(points, at * 10**9, data)
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for part in times:
+        next((tmp_path / f"p{part}").glob("*.db3")).rename(folder / f"drive_{part}.db3")
+    told = (tmp_path / "p0" / "metadata.yaml").read_text()
+    told = told.replace("- p0.db3", "- drive_10.db3\n  - drive_0.db3\n  - drive_1.db3")
+    assert "drive_10" in told
+    (folder / "metadata.yaml").write_text(told)
+    with open_bag(folder) as bag:
+        true = [100, 101, 102, 103, 104, 109, 110]
+        assert [m.time // 10**9 for m in bag.messages(frozenset(["/points"]))] == true
+        assert [m.time // 10**9 for m in bag.messages(start=103 * 10**9)] == true[3:]
+        assert [cloud.stamp // 10**9 - 100 for cloud in bag.clouds("/points") if isinstance(cloud, Cloud)] == true
+
+
+def test_parts_without_metadata_are_read_by_their_numbers(tmp_path: Path):
+    """Bags of their own then, 2 before 10."""
+    for number in (10, 2, 1):
+        clouds_at(tmp_path / f"drive_{number}.mcap", [100 + number])
+    for paths in ([tmp_path], [tmp_path / "drive_*.mcap"]):
+        assert [item.name for item in inputs_of(paths).stream()] == [f"drive_{n}/000000" for n in (1, 2, 10)]
+
+
+def test_a_full_disk_is_no_broken_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    path = clouds_at(tmp_path / "in.mcap", [100])
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mcap.writer.Writer.add_message", full)
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(path), "--out", str(tmp_path / "out.mcap"), "--model", "bilinear", "--sensor", "vlp-16"])
+    assert "out.mcap: expected room to write, found: No space left" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["in.mcap"]
 
 
 def test_a_bag_is_told_by_its_ending_in_any_case(tmp_path: Path):

@@ -1,6 +1,7 @@
 """Many scans: which are read, what is written, skipped, failed and told; in parts and in processes."""
 
 import errno
+import fcntl
 import json
 import multiprocessing
 import time
@@ -92,7 +93,7 @@ def test_what_is_there_is_skipped(scans: Path, tmp_path: Path, capsys: pytest.Ca
     first = {name: (tmp_path / "o" / name).stat().st_mtime_ns for name in ("000.npz", "001.npz")}
     (tmp_path / "o" / "001.npz").unlink()
     main(["project", str(scans / "d2"), *out, "--skip-existing"])
-    assert "1 scans in" in capsys.readouterr().out and told(tmp_path / "o")["skipped"] == 1
+    assert "1 scan in" in capsys.readouterr().out and told(tmp_path / "o")["skipped"] == 1
     assert (tmp_path / "o" / "000.npz").stat().st_mtime_ns == first["000.npz"]
     main(["project", str(scans / "d2"), *out, "--skip-existing"])
     assert told(tmp_path / "o")["skipped"] == 2
@@ -454,12 +455,68 @@ def test_a_second_run_into_a_folder_is_refused_and_touches_nothing(
         main(words)
     assert "expected a folder that nobody else writes to, found another run at work" in capsys.readouterr().err
     assert names(place) == [at_work]
-    with only_writer(place, "run"):  # by a shard that is at work beside others
+    with only_writer(place, "run", shared=True):  # by a shard that is at work beside others
         main([*words, "--shard", "1/2"])
-    shard = told(place, "report-1-of-2.json")
-    (place / "report-1-of-2.json").write_text(json.dumps({"unfinished": True} | shard))
-    main(words)
-    assert at_work in names(place)
-    (place / "report-1-of-2.json").write_text(json.dumps(shard))
+        assert at_work in names(place)
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+    with only_writer(place, "run"), pytest.raises(SystemExit, match="2"):
+        main([*words, "--shard", "1/2"])
+    assert capsys.readouterr().err.count("found another run at work") == 2 and at_work in names(place)
     main(words)
     assert at_work not in names(place)
+
+
+def test_a_whole_run_takes_over_from_shards_and_says_so(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    place = tmp_path / "o"
+    words = ["project", str(scans / "d2"), "--out", str(place), *WORDS]
+    main([*words, "--shard", "1/2", "--width", "256"])
+    rows = told(place, "report-1-of-2.json")["scans"]
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--width", "512", "--skip-existing"])
+    assert "report-1-of-2.json: expected scans made as they are asked for now" in capsys.readouterr().err
+    main([*words, "--width", "256", "--skip-existing"])
+    assert "report.json: of all scans now, in place of report-1-of-2.json, of shards" in capsys.readouterr().err
+    assert names(place) == ["000.npz", "001.npz", "report.json"] and rows[0] in told(place)["scans"]
+    assert len(told(place)["scans"]) == 2
+    main([*words, "--width", "256", "--shard", "2/2"])  # as they are asked for: they may come from either
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--width", "512", "--shard", "1/2"])
+    assert "found those of a whole run of other settings: width 512 for 256; name an" in capsys.readouterr().err
+    main([*words, "--width", "512"])
+    assert names(place) == ["000.npz", "001.npz", "report.json"] and "mixed" not in told(place)
+
+
+def test_a_whole_run_that_is_killed_among_shards_of_another_recipe_is_mixed(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    words = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS]
+    for part in ("1/2", "2/2"):
+        main([*words, "--shard", part, "--width", "256"])
+    (tmp_path / "o" / "report.json").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        with pytest.raises(SystemExit, match="130"):
+            main([*words, "--width", "512"])
+    assert told(tmp_path / "o")["unfinished"] and told(tmp_path / "o")["mixed"]
+
+
+def test_where_nobody_knows_of_locks_a_whole_run_waits_for_shards(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words, report = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS], "report-1-of-2.json"
+    main([*words, "--shard", "1/2"])
+    shard = told(tmp_path / "o", report)
+    (tmp_path / "o" / report).write_text(json.dumps({"unfinished": True} | shard))
+
+    def refuse(file: object, kind: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert f"{report}: expected shards that are done, found one at work, or killed" in capsys.readouterr().err
+    (tmp_path / "o" / report).write_text(json.dumps(shard))
+    main(words)

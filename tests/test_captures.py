@@ -204,8 +204,11 @@ def test_a_real_ouster_capture(shared: Path):
     assert (sensor.height, sensor.width, sensor.elevations[0]) == (64, 1024, 16.46)
 
 
-def blocks(order: str, option: bytes, packets: list[tuple[int, bytes]], longest: int = 0) -> bytes:
-    """A pcapng of one interface with an option if_tsresol; each packet (ticks, frame), or a simple one where -1."""
+def blocks(
+    order: str, option: bytes, packets: list[tuple[int, bytes]], longest: int = 0, start: int | None = None
+) -> bytes:
+    """A pcapng of one interface with an option if_tsresol, and if_tsoffset where it has a start; each packet (ticks,
+    frame), or a simple one where -1."""
 
     def block(kind: int, body: bytes) -> bytes:
         body += b"\0" * (-len(body) % 4)
@@ -213,6 +216,7 @@ def blocks(order: str, option: bytes, packets: list[tuple[int, bytes]], longest:
 
     options = struct.pack(order + "HH", 2, 3) + b"eth\0"  # its name, before
     options += struct.pack(order + "HH", 9, len(option)) + option + b"\0" * (-len(option) % 4) if option else b""
+    options += struct.pack(order + "HHq", 14, 8, start) if start is not None else b""
     parts = [block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1)),
              block(1, struct.pack(order + "HHI", 1, 0, longest) + options + b"\0\0\0\0")]  # fmt: skip
     for ticks, frame in packets:
@@ -235,6 +239,15 @@ def test_times_of_a_capture_are_in_the_ticks_of_its_clock(order: str, option: by
     found = list(datagrams(tmp_path / "c.pcapng"))
     assert [(d.port, d.payload) for d in found] == [(1, b"one"), (2, b"two")]
     assert [d.time for d in found] == [start * 10**9 + 250_000_000] * 2, "a simple packet has that of the one before"
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("option", [b"", b"\x09"])
+@pytest.mark.parametrize("start", [1_700_000_000, -3])
+def test_a_clock_may_count_from_another_second_than_that_of_1970(start: int, option: bytes, order: str, tmp_path: Path):
+    ticks = 5 * (10**9 if option else 10**6)
+    (tmp_path / "c.pcapng").write_bytes(blocks(order, option, [(ticks, udp(b"one", 1))], start=start))
+    assert [d.time for d in datagrams(tmp_path / "c.pcapng")] == [(5 + start) * 10**9]
 
 
 def test_simple_packets_of_a_capture(tmp_path: Path):

@@ -20,7 +20,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.calibration import held_out, judged, right
 from lidarsynth.systems.cascade.confidence import confidence, fitted, reliability, signals
 from lidarsynth.systems.cascade.model import CascadeModel
-from lidarsynth.verbs.inputs import message_fields
+from lidarsynth.verbs.inputs import Loaded, message_fields
 
 SENSOR = ls.Sensor("small", tuple(np.linspace(5, -25, 32).tolist()), 256, 0.5, 120.0)
 
@@ -156,7 +156,7 @@ def test_bags_get_a_column_of_confidences(model: CascadeModel, street: RangeImag
     given = {"x": sparse.xyz[:, 0], "y": sparse.xyz[:, 1], "z": sparse.xyz[:, 2]}
     numbered = replace(sparse, extra={PLACE: np.arange(1, len(sparse) + 1)})
     filled = model.into(SENSOR).complete(numbered).to_scan()
-    columns = message_fields(filled, given)
+    columns = message_fields(filled, Loaded(sparse, given, 0))
     np.testing.assert_array_equal(columns["confidence"], filled.extra["confidence"])
     assert columns["confidence"].dtype == np.float32 and (columns["confidence"][columns["new"] == 0] == 1).all()
 

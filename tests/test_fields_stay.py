@@ -16,7 +16,7 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.unseen import caution, widest_gap
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.verbs.batch import Result
-from lidarsynth.verbs.inputs import message_fields
+from lidarsynth.verbs.inputs import Loaded, message_fields
 
 
 @pytest.fixture(scope="module")
@@ -127,14 +127,16 @@ def test_centimetres_are_no_metres(tmp_path: Path):
         read(tmp_path / "cm.npy")
 
 
-def test_new_points_of_a_message_have_the_ring_of_the_nearest_beam():
+def test_new_points_of_a_message_have_the_ring_of_the_nearest_beam_and_its_scale():
     """Rows 0, 4 and 8 of a denser image are the message's rings 2, 1 and 0."""
     given = {"x": np.float32([9, 9, 9]), "y": np.zeros(3, np.float32), "z": np.float32([1, 0, -1]),
-             "ring": np.uint8([2, 1, 0])}  # fmt: skip
+             "ring": np.uint8([2, 1, 0]), "intensity": np.uint16([7, 8, 9])}  # fmt: skip
     xyz = np.stack([given[axis] for axis in "xyz"], 1)
     extra = {PLACE: np.array([1, 2, 3, 0, 0, 0]), "new": np.array([0, 1, 0, 1, 1, 1], np.uint8)}
-    filled = Scan(np.concatenate([xyz, xyz + 1]), ring=np.array([0, 4, 8, 1, 5, 7]), extra=extra)
-    fields = message_fields(filled, given)
+    light = np.float32([0, 0, 0, 0.25, 0.5, 1])
+    filled = Scan(np.concatenate([xyz, xyz + 1]), light, ring=np.array([0, 4, 8, 1, 5, 7]), extra=extra)
+    fields = message_fields(filled, Loaded(filled, given, 0, scale=65535))
+    np.testing.assert_array_equal(fields["intensity"], [7, 8, 9, 16383, 32767, 65535])
     np.testing.assert_array_equal(fields["ring"], [2, 1, 0, 2, 1, 0])
     np.testing.assert_array_equal(fields["new"], filled.extra["new"])  # one had been filled in before
     np.testing.assert_array_equal(fields["x"][:3], given["x"])

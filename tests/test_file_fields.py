@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from full_scan import N, full_scan, same
 
-from lidarsynth.files.fields import NAMES, FileError, reflectance_from, rings_from_top, seconds_from
+from lidarsynth.files.fields import MAX_METRES, NAMES, FileError, reflectance_from, rings_from_top, seconds_from
 from lidarsynth.files.formats import read, read_with_report, write
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
@@ -160,10 +160,30 @@ def test_labels_of_another_data_set_are_left_out(scan: Scan, tmp_path: Path):
     assert read(tmp_path / "scan.pcd").label is None
 
 
-def test_files_without_points_are_said_to_have_none(tmp_path: Path):
-    np.save(tmp_path / "empty.npy", np.zeros((0, 3), np.float32))
-    with pytest.raises(FileError, match=r"expected 1 to 10000000 points of one turn, found 0$"):
-        read(tmp_path / "empty.npy", intensity="none")
+def test_times_of_which_some_are_unknown_are_kept_once(scan: Scan, tmp_path: Path):
+    time = np.where(np.arange(N) % 7 == 0, np.nan, scan.time)
+    write(tmp_path / "scan.ply", replace(scan, time=time))
+    again = read(tmp_path / "scan.ply")
+    np.testing.assert_array_equal(again.time, time)
+    assert not again.extra
+
+
+def test_float32_holds_what_a_turn_may_hold_and_maps_are_told(tmp_path: Path):
+    """UTM and the like would be off by centimetres in float32; they are refused, whatever type they are of."""
+    edge = np.nextafter(np.float32(MAX_METRES), np.float32(0))
+    assert np.spacing(edge) / 2 < 1e-3
+    table = np.ones((9, 4)) * [100, 5, 1, 0.5] + [[500_000, 5_400_000, 0, 0]]
+    for kind in (np.float64, np.float32):
+        np.save(tmp_path / "utm.npy", table.astype(kind))
+        with pytest.raises(FileError, match=r"at most 10000, found a coordinate of 5.4e\+06, as of a map: subtract"):
+            read(tmp_path / "utm.npy")
+    table[:, :3] = np.random.default_rng(0).normal(0, 20_000, (9, 3))
+    np.save(tmp_path / "mm.npy", table)
+    with pytest.raises(FileError, match=r"at most 10000, found a coordinate of .*: are they millimetres\?$"):
+        read(tmp_path / "mm.npy")
+
+
+def test_arrays_of_more_dimensions_are_no_columns(tmp_path: Path):
     np.savez(tmp_path / "grid.npz", **{axis: np.ones((4, 5)) for axis in "xyz"})
     with pytest.raises(FileError, match=r"points of one turn, found an array \(4, 5\)$"):
         read(tmp_path / "grid.npz", intensity="none")

@@ -163,6 +163,14 @@ def test_npz_of_columns_and_structured_npy(scan: Scan, tmp_path: Path):
     check(read(tmp_path / "scan.npy"), scan)
 
 
+def test_a_pose_beside_one_table_is_no_other(scan: Scan, tmp_path: Path):
+    np.savez(tmp_path / "scan.npz", pose=np.eye(4), points=scan.xyz, intensity=scan.reflectance)
+    same(read(tmp_path / "scan.npz"), scan, ("xyz", "reflectance"))
+    few = np.random.default_rng(0).random((4, 4)).astype(np.float32)
+    np.savez(tmp_path / "few.npz", few)
+    np.testing.assert_array_equal(read(tmp_path / "few.npz").xyz, few[:, :3])
+
+
 @pytest.mark.parametrize("name", ["points", "data", "arr_0"])
 def test_npz_of_one_table(name: str, scan: Scan, tmp_path: Path):
     table = np.column_stack([scan.xyz, scan.reflectance])

@@ -122,6 +122,13 @@ def test_two_writers_never_hold_one_folder_and_no_locks_is_no_obstacle(tmp_path,
     with only_writer(tmp_path, "work"):
         pass
 
+    with only_writer(tmp_path, "work", shared=True) as one:
+        with only_writer(tmp_path, "work", shared=True) as two:
+            assert one and two
+        with pytest.raises(ValueError, match="another work at work"), only_writer(tmp_path, "work"):
+            pass
+    assert not (tmp_path / LOCK).exists(), "the last one takes it away"
+
     def refuse(file, kind):
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -100,7 +100,7 @@ def test_encoding_is_the_inverse():
     ("change", "words"),
     [
         ({"width": 51}, "expected 1632 bytes"),
-        ({"width": 0}, "1 to"),
+        ({"width": 10**7 + 1}, "at most 10000000 points"),
         ({"point_step": 10}, "within the 10 bytes"),
         ({"row_step": 100}, "row_step"),
     ],

@@ -11,12 +11,13 @@ from networks import tiny_cascade
 from test_cascade import SMALL, perfect
 
 from lidarsynth.cli.main import main
-from lidarsynth.files.fields import PLACE, scan_from_fields
+from lidarsynth.files.fields import PLACE, full_scale, scan_from_fields
 from lidarsynth.files.formats import read, write, write_labels
 from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 from lidarsynth.weights.load import load
 
@@ -134,8 +135,6 @@ def test_labels_that_do_not_fit_are_named(place: Path, capsys: pytest.CaptureFix
 
 def test_bags_keep_their_columns(place: Path):
     pytest.importorskip("rosbags")
-    from lidarsynth.verbs.inputs import Reading, inputs_of
-
     scan = perfect(SMALL)
     fields = write_bag_of(scan, Path("sim.mcap"), 2)
     main(["realise", "sim.mcap", "--out", "real.mcap", "--model", "model", "--sensor", "own.toml"])
@@ -159,9 +158,24 @@ def test_the_scale_of_a_message_is_that_which_it_was_read_by(full: int):
     light[3] = {1: 1.5, 255: 300}.get(full, full)
     given = {"intensity": light, **dict(zip("xyz", xyz.T, strict=True))}
     scan, _ = scan_from_fields({**given, PLACE: np.arange(1, 4001)})
-    back = realised_fields(scan, given)["intensity"]
+    back = realised_fields(scan, Loaded(scan, given, 0, full_scale(given)))["intensity"]
     np.testing.assert_allclose(back[2:], light[1::2][2:], rtol=1e-6)
     assert back[0] == 0 and back[1] == full
+
+
+@pytest.mark.parametrize(("intensity", "full"), [("auto", 255), ("byte", 255), ("uint16", 65535), ("none", 255)])
+def test_a_bag_of_a_forced_scale_is_written_in_it(intensity: str, full: float, place: Path):
+    """Intensities of 100: of 255, unless someone knows that the sensor counts to 65535."""
+    pytest.importorskip("rosbags")
+    scan = perfect(SMALL)
+    write_bag_of(scan, Path("sim.mcap"), 1)
+    words = ["--model", "model", "--sensor", "own.toml", "--intensity", intensity]
+    main(["realise", "sim.mcap", "--out", "real.mcap", *words])
+    main(["realise", "sim.mcap", "--out", "real", "--no-picture", *words])
+    (given,) = [item.read().given for item in inputs_of([Path("real.mcap")], Reading("none")).stream()]
+    light = read("real/sim/000000.ply", "unit").reflectance
+    assert light.max() > 0
+    np.testing.assert_allclose(given["intensity"], light * full, rtol=1e-6)
 
 
 def test_a_model_that_cannot_is_refused_before_any_work(place: Path, capsys: pytest.CaptureFixture[str]):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lidarsynth as ls
-from lidarsynth.lidar.ground import standing_height
+from lidarsynth.lidar.ground import stance
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.streets.reader import SyntheticStreets
@@ -17,10 +17,11 @@ from lidarsynth.systems.cascade.known import standing
 PLACES = (0, 16, 32, 48)  # of worlds of their own
 
 
-def street(name: str, mount: float, place: int) -> RangeImage:
-    """As seen from another height than the sensor's own, of which nothing is said."""
+def street(name: str, mount: float, place: int, tilt: tuple[float, float] = (0.0, 0.0)) -> RangeImage:
+    """As seen from another height than the sensor's own, or tilted, of which nothing is said."""
     sensor = SENSORS[name]
-    return replace(SyntheticStreets(4321, 64, replace(sensor, mount=mount)).image(place), sensor=sensor)
+    seen = SyntheticStreets(4321, 64, replace(sensor, mount=mount, tilt=tilt))
+    return replace(seen.image(place), sensor=sensor)
 
 
 def every(image: RangeImage, step: int) -> np.ndarray:
@@ -34,11 +35,11 @@ def every(image: RangeImage, step: int) -> np.ndarray:
 def test_the_ground_tells_how_high_a_sensor_stands(name: str, mount: float):
     for place in PLACES:
         image = street(name, mount, place)
-        found = standing_height(image.sensor.points(image.range)[image.mask])
+        found = stance(image.sensor.points(image.range)[image.mask])
         if found is None:  # two of a VLP-16's beams meet the road within 25 m
             assert (name, mount) == ("vlp-16", 3.2) and standing(image.sensor, image, image.mask) is image.sensor
             continue
-        assert found == pytest.approx(mount, abs=0.12)
+        assert found[0] == pytest.approx(mount, abs=0.12) and max(map(abs, found[1:])) < 2.1
         assert standing(image.sensor, image, image.mask).mount == pytest.approx(mount, abs=0.12)
 
 
@@ -49,32 +50,41 @@ def test_a_mount_that_is_about_right_stays(mount: float):
         assert standing(image.sensor, image, every(image, step)) is image.sensor
 
 
+@pytest.mark.parametrize("tilt", [(8.0, 0.0), (0.0, 15.0), (-10.0, 5.0)])
+def test_the_ground_tells_how_a_sensor_is_tilted(tilt: tuple[float, float]):
+    for place in PLACES:
+        image = street("os1-64", 1.73, place, tilt)
+        for step in (1, 2):
+            found = standing(image.sensor, image, every(image, step))
+            assert found.mount == 1.73 and found.tilt == pytest.approx(tilt, abs=2)
+        told = replace(image.sensor, tilt=tilt)
+        assert standing(told, image, image.mask) is told, "as it is told"
+
+
 def test_where_no_ground_is_seen_a_mount_stays():
     image = street("os1-64", 0.5, 0)
     assert standing(image.sensor, image, every(image, 64)) is image.sensor, "one beam"
     assert standing(image.sensor, image, every(image, 1) & (np.arange(64) < 24)[:, None]) is image.sensor, "the sky"
-    assert standing_height(np.zeros((0, 3), np.float32)) is None
+    assert stance(np.zeros((0, 3), np.float32)) is None
     wall = np.stack([np.full(500, 5.0), np.linspace(-20, 20, 500), np.linspace(-1, 3, 500)], 1).astype(np.float32)
-    assert standing_height(wall) is None
+    assert stance(wall) is None
 
 
-def test_a_robots_scan_is_filled_as_if_its_mount_were_told():
-    model, errors = ls.load("default"), {0.5: 0.0, 1.73: 0.0}
+@pytest.mark.parametrize(("mount", "tilt", "untold"), [(0.5, (0.0, 0.0), 1.1), (1.73, (8.0, 0.0), 1.09)])
+def test_a_robots_scan_is_filled_as_if_it_were_told(mount: float, tilt: tuple[float, float], untold: float):
+    model, errors = ls.load("default"), np.zeros(2)
     for place in PLACES[:2]:
-        image = street("os1-64", 0.5, place)
+        image = street("os1-64", mount, place, tilt)
         known = every(image, 4)
-        for mount in errors:
-            own = model.into(replace(image.sensor, mount=mount))
-            filled = own.complete(replace(image, sensor=own.sensor).keep(known), known)
-            assert filled.sensor == own.sensor
-            errors[mount] += float(np.abs(filled.range - image.range)[~known].mean())
-    assert errors[1.73] < 1.02 * errors[0.5], "by 1.73 m it was 1.1"
+        for k, sensor in enumerate((replace(image.sensor, mount=mount, tilt=tilt), image.sensor)):
+            filled = model.into(sensor).complete(replace(image, sensor=sensor).keep(known), known)
+            assert filled.sensor == sensor
+            errors[k] += np.abs(filled.range - image.range)[~known].mean()
+    assert errors[1] < 1.02 * errors[0], f"it was {untold}"
 
 
 def test_its_classes_go_by_it_too():
     model, image = ls.load("default"), street("os1-64", 0.5, 16)
     scan = image.to_scan()
-    told, found = (
-        model.label(scan, sensor=replace(image.sensor, mount=m)).label for m in (0.5, image.sensor.mount)
-    )
+    told, found = (model.label(scan, sensor=replace(image.sensor, mount=m)).label for m in (0.5, image.sensor.mount))
     assert (told == found).mean() > 0.97, "by its own mount 0.91"

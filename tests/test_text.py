@@ -16,6 +16,7 @@ ROWS = "1 2 3 0.5\n4 5 6 0.25\n"
         "x,y,z,intensity\n1,2,3,0.5\n4,5,6,0.25\n",
         "\ufeffX;Y;Z;Intensity\n1;2;3;0.5\n4;5;6;0.25\n",
         '"Points:0","Points:1","Points:2","intensity"\n1,2,3,0.5\n4,5,6,0.25\n',
+        '"intensity","Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2"\n0.5,1,2,3\n0.25,4,5,6\n',
         "//X Y Z Scalar_Intensity\n" + ROWS,
         "# made by hand\n# x y z intensity\n" + ROWS,
         "2\n" + ROWS,

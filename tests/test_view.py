@@ -434,7 +434,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "broken.npy: expected" in refused(capsys, str(tmp_path / "broken.npy"))
     write(tmp_path / "others" / "b.npy", turn())
     write(tmp_path / "others" / "c.npy", turn())
-    assert "others: expected 1 scans to compare" in refused(capsys, a, "--with", str(tmp_path / "others"))
+    assert "others: expected 1 scan to compare" in refused(capsys, a, "--with", str(tmp_path / "others"))
     assert "expected --port of at least 0" in refused(capsys, a, "--port", "-1")
     assert "expected a free port of 127.0.0.1, found 99999" in refused(capsys, a, "--port", "99999", "--no-browser")
     assert old.read_text() == "old"

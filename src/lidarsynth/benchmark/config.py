@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lidarsynth.experiment.record import from_dict
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.small_file import read_toml
 from lidarsynth.networks.interpolation import METHODS, RESIZED
 
@@ -131,7 +132,7 @@ def rows(methods: Sequence[AnyMethod]) -> list[tuple[str, AnyMethod]]:
             found.append((method.name, method))
             continue
         for steps in method.steps:
-            name = f"{method.name}, {steps} step{'s' if steps > 1 else ''}"
+            name = f"{method.name}, {plural(steps, 'step')}"
             found.append((method.name, replace(method, name=name, steps=steps)))
     return found
 

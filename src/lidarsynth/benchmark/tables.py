@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.evaluation.protocols import get_protocol
+from lidarsynth.lidar.plural import plural
 
 RANK: dict[
     str, Callable[[float], float]
@@ -65,7 +66,7 @@ def page(title: str, command: str, rows: Sequence[Row], protocols: Sequence[str]
         lines += ["", f"## {get_protocol(name).title}", "", *table(rows, columns), "", *notes(rows, columns, name)]
     most = max((row.count for row in rows), default=0)
     for count in sorted({row.count for row in rows if row.errors and row.count < most}):
-        lines += ["", f"## The first {count} scan{'s' if count > 1 else ''} only", ""]
+        lines += ["", f"## The first {plural(count, 'scan')} only", ""]
         lines += table([row for row in rows if row.errors], error_columns(rows, first=count), counted=False)
     return "\n".join(lines) + "\n"
 

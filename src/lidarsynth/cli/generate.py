@@ -8,6 +8,7 @@ from typing import Annotated
 
 from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, SensorWord, Source, arg
 from lidarsynth.cli.terminal import at_least, load_with_bar, say, scan_bar, step_bar
+from lidarsynth.lidar.plural import plural
 
 
 def generate(
@@ -57,4 +58,4 @@ def generate(
         else:
             with scan_bar("generate", sum(map(len, runs))) as on_scan:
                 new = sum(1 for _ in make(on_step=on_scan, workers=workers, source=source))
-    say(f"{out}/ has {count} scans, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")
+    say(f"{out}/ has {plural(count, 'scan')}, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from lidarsynth.cli.arguments import arg
 from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
+from lidarsynth.lidar.plural import plural, was
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -77,9 +78,9 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings))
     if inputs.passed:
         named = ", ".join(path.name for path in inputs.passed[:NAMED])
-        warn(
-            f"{len(inputs.passed)} bags or captures beside scan files were passed over: {named}; name them to read them"
-        )
+        count = len(inputs.passed)
+        what = "bag or capture" if count == 1 else "bags or captures"
+        warn(f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them")
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
@@ -141,7 +142,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         report_of,
         report_path,
         rows_before,
-        shards_at_work,
+        shard_reports,
         write_report,
     )
     from lidarsynth.verbs.output_files import works
@@ -151,9 +152,10 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
     stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside)
     first = next(stream, None)
     with _held(out, alone=shard[1] == 1):
+        replaced = shard_reports(out) if shard[1] == 1 else []
         model = _model(job) if first is not None or skipped else None
         settings = _settings(job, model, out, many, ending, intensity)
-        if shard[1] == 1 and not shards_at_work(out):  # whose files are half written, and which hold no lock
+        if shard[1] == 1:
             sweep(out, deep=True, token=TOKEN)
         count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
         results = _done(job, model, _again(first, stream), many, count, report, settings)
@@ -161,12 +163,17 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         if all(result.error is not None for result in results) and results:
             _refuse_all(results)
         out.mkdir(parents=True, exist_ok=True)
-        before = rows_before(report, skipped)
+        before = rows_before([*replaced, report], skipped)
         write_report(report, report_of(results, len(skipped), seconds, settings, before))
+        for path in replaced:
+            path.unlink(missing_ok=True)
         merged = merge_shards(out, shard[1])
     if merged is not None and is_mixed(merged):
         warn(f"{merged}: expected shards of one recipe, found several in report-*-of-{shard[1]}.json; make those of "
              "another anew, without --skip-existing")  # fmt: skip
+    if replaced:
+        warn(f"{report}: of all scans now, in place of {', '.join(path.name for path in replaced[:NAMED])}"
+             f"{', ...' if replaced[NAMED:] else ''}, of shards that were made here before")  # fmt: skip
     _summary(results, len(skipped), seconds, merged or report)
     return results
 
@@ -199,13 +206,17 @@ def _held(out: Path, alone: bool) -> Iterator[None]:
     """The folder, which nobody else writes to if `alone`; shards share it. One that is made for the lock, and stays
     empty, is taken away.
 
-    Raises ValueError where another process holds it.
+    Raises ValueError where another process holds it, and where nobody can know that none does.
     """
     from lidarsynth.files.lock import only_writer
+    from lidarsynth.verbs.batch_report import shards_at_work
 
-    made = [folder for folder in (out, *out.parents) if not folder.exists()] if alone else []
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
-        with only_writer(out, "run") if alone else nullcontext():
+        with only_writer(out, "run", shared=not alone) as locked:
+            if alone and not locked and (working := shards_at_work(out)):
+                raise ValueError(f"{working[0]}: expected shards that are done, found one at work, or killed: wait, or "
+                                 "remove it")  # fmt: skip
             yield
     finally:
         for folder in made:
@@ -217,13 +228,15 @@ def _settings(job: Job, model: ScanModel | None, out: Path, many: Many, ending: 
     """What the report says of the run. Raises ValueError where files that are there already would be gone on with, and
     were made in another way."""
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.batch_report import check_same
+    from lidarsynth.verbs.batch_report import check_no_other_whole, check_same, parse_shard
 
     reading = {"intensity": None if intensity == "auto" else intensity, "rings": many.rings, "topic": many.topic}
     recipe = job.recipe(None if model is None else fingerprint(model))
     recipe |= {name: word for name, word in reading.items() if word is not None}
     if many.skip_existing:
         check_same(out, recipe)
+    if parse_shard(many.shard)[1] > 1:
+        check_no_other_whole(out, recipe)
     settings = {"verb": job.verb, "model": job.model, "out": str(out), "format": ending, "workers": many.workers}
     return settings | ({"shard": many.shard} if many.shard else {}) | {"recipe": recipe}
 
@@ -233,13 +246,15 @@ def _begin(report: Path, settings: dict[str, Any], goes_on: bool) -> None:
 
     goes_on  with the scans that are there, which `check_same` found to be alike
     """
-    from lidarsynth.verbs.batch_report import same, unfinished, write_report
+    from lidarsynth.verbs.batch_report import same, shard_reports, unfinished, write_report
 
     recipe = settings["recipe"]
-    if same(report, recipe):
+    others = [] if "shard" in settings else shard_reports(report.parent)
+    if all(same(path, recipe) for path in (report, *others)):
         return
     report.parent.mkdir(parents=True, exist_ok=True)
-    mixed = report.exists() and not (goes_on and same(report, recipe, told=False))
+    there = [path for path in (report, *others) if path.exists()]
+    mixed = not all(goes_on and same(path, recipe, told=False) for path in there)
     write_report(report, unfinished(settings, mixed))
 
 
@@ -294,9 +309,10 @@ def _copied(path: Path, writer: BagWriter, many: Many) -> str:
 
 
 def _tell(result: Result, picture: bool) -> None:
+    from lidarsynth.files.fields import dropped_points
+
     if result.dropped:
-        kept = result.points[0]
-        say(f"{result.source}: {result.dropped} points without a return or not finite were dropped, {kept} stay")
+        say(f"{result.source}: {dropped_points(result.dropped)}, {result.points[0]} stay")
     if result.warning:
         warn(result.warning)
     if result.note:
@@ -324,8 +340,9 @@ def _summary(results: list[Result], skipped: int, seconds: float, where: Path) -
     if failed and failed[0] is results[0]:
         warn(_named(failed[0]))
     done = len(results) - len(failed)
-    text = f"{done} scans in {seconds:.1f} s" + (f", {done / seconds:.1f} a second" if done and seconds > 1 else "")
-    text += f"; {skipped} were there already" if skipped else ""
+    text = f"{plural(done, 'scan')} in {seconds:.1f} s"
+    text += f", {done / seconds:.1f} a second" if done and seconds > 1 else ""
+    text += f"; {skipped} {was(skipped)} there already" if skipped else ""
     text += f"; {len(failed)} failed: {', '.join(result.name for result in failed[:NAMED])}" if failed else ""
     text += ", ..." if len(failed) > NAMED else ""
     say(f"{text}; see {where}")

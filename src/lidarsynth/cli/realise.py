@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from lidarsynth.cli.arguments import Device, Picture, Positional, Seed, SensorWord, Source, arg
 from lidarsynth.cli.many import Many, work_through
@@ -17,6 +17,10 @@ def realise(
     model: Source = "default",
     seed: Seed = 0,
     device: Device = "cpu",
+    intensity: Annotated[
+        Literal["auto", "unit", "byte", "uint16", "none"],
+        arg(help="scale of a bag's intensities, in which those that it gets are written; none: as they seem to be."),
+    ] = "none",
     picture: Picture = True,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
@@ -31,4 +35,4 @@ def realise(
 
     at_least(0, {"seed": seed})
     job = Job("realise", model, device, Filling(seed=seed), sensor=sensor, picture=picture)
-    work_through(job, scans, out, many, "none")
+    work_through(job, scans, out, many, intensity)

@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 def read_scan(path: Path, intensity: str) -> Scan:
     """The scan of a file; says how many points were dropped. Raises ValueError."""
+    from lidarsynth.files.fields import dropped_points
     from lidarsynth.files.formats import read_with_report
 
     scan, dropped = read_with_report(path, intensity)
     if dropped:
-        say(f"{path}: {dropped} points without a return or not finite were dropped, {len(scan)} stay")
+        say(f"{path}: {dropped_points(dropped)}, {len(scan)} stay")
     return scan
 
 

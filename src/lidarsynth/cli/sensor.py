@@ -7,6 +7,7 @@ from typing import Annotated
 
 from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, arg
 from lidarsynth.cli.terminal import say, warn
+from lidarsynth.lidar.plural import plural, was
 
 
 def sensor(
@@ -38,12 +39,12 @@ def sensor(
     told = scans[0] if metadata is None and len(scans) == 1 else metadata
     if told is not None and (known := from_metadata(told, out.stem)) is not None:
         write_toml(out, sensor_toml(known, [f"from the metadata {told.name}"]))
-        say(f"wrote {out}: {known.height} beams, {known.width} columns")
+        say(f"wrote {out}: {plural(known.height, 'beam')}, {known.width} columns")
         return
     broken: list[str] = []
     learned = learn(inputs_of(scans, Reading(intensity, topic, metadata, rings=parse_rings(rings))), out.stem, broken)
     if broken:
-        warn(f"{len(broken)} that could not be read were left out, the first: {broken[0]}")
+        warn(f"{len(broken)} that could not be read {was(len(broken))} left out, the first: {broken[0]}")
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))
     say(summary(learned))
     for line in doubts(learned):

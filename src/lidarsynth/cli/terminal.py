@@ -7,6 +7,7 @@ import errno
 import io
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NoReturn
@@ -90,18 +91,24 @@ def counted(stored: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
 
 
 def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
-    """The steps of a training run as they are done, under a live line with losses and speed."""
+    """The steps of a training run as they are done, under a live line with losses and speed: times are those of steps,
+    without the pictures and checkpoints between them."""
     from tqdm import tqdm
 
-    bar = None
+    bar, asked = None, time.perf_counter()
     for progress in run:  # its first is where the run stands
         if progress.note:
             tqdm.write(f"lidarsynth: {progress.note}", file=sys.stderr)
-        bar = bar or tqdm(total=steps, initial=progress.step, unit="step", mininterval=max(0.5, _seconds()))
+        if bar is None:
+            bar = tqdm(total=steps, initial=progress.step, unit="step", mininterval=max(0.5, _seconds()))
+        elif not bar.disable:
+            between = max(time.perf_counter() - asked - progress.seconds, 0)
+            bar.start_t, bar.last_print_t = bar.start_t + between, bar.last_print_t + between
         losses = " ".join(f"{name} {value:.4f}" for name, value in progress.losses.items())
         bar.set_postfix_str(f"{losses} norm {progress.grad_norm:.2f} rate {progress.learning_rate:.1e}", refresh=False)
         bar.update(progress.step - bar.n)
         yield progress.step
+        asked = time.perf_counter()
     if bar is not None:
         bar.close()
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from lidarsynth.cli.arguments import Intensity, NoSeed, Positional, arg
 from lidarsynth.cli.terminal import at_least, say, warn
+from lidarsynth.lidar.plural import was
 
 if TYPE_CHECKING:
     from lidarsynth.viewer.server import Show
@@ -56,7 +57,7 @@ def view(
     broken: list[str] = []
     size = write_page(out, title, entries(series, broken))
     if broken:
-        warn(f"{len(broken)} that could not be read were left out, the first: {broken[0]}")
+        warn(f"{len(broken)} that could not be read {was(len(broken))} left out, the first: {broken[0]}")
     say(f"wrote {out}, {size / 1e6:.1f} MB: open it in any browser, without a network")
 
 

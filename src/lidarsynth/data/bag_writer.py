@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, naming, typestore
+from lidarsynth.data.bags import BROKEN, POINTS, Cloud, Message, Topic, library_errors, one_line, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
 from lidarsynth.lidar.whole_file import whole_file
@@ -33,25 +33,39 @@ class BagWriter:
         """A PointCloud2 with the cloud's stamp, frame and fields, recorded at its time."""
         if topic not in self.topics:
             self.topics[topic] = points_topic(topic, self.encoding)
-        self.put(self.topics[topic], cloud.time, message_of(cloud, self.encoding))
+        with _telling(self.path):
+            self.put(self.topics[topic], cloud.time, message_of(cloud, self.encoding))
 
     def copy(self, message: Message) -> None:
         """A message of another bag as it is. Raises FileError where this kind of file cannot hold it."""
         if self.path.suffix.lower() == ".bag" and message.topic.encoding != "ros1":
             raise FileError(f"{self.path}: expected messages of ROS 1 to copy into a .bag, found {message.topic.name} "
                             f"in {message.topic.encoding}; write a .mcap")  # fmt: skip
-        self.put(message.topic, message.time, message.data)
+        with _telling(self.path):
+            self.put(message.topic, message.time, message.data)
 
 
 @contextmanager
 def write_bag(path: str | Path) -> Iterator[BagWriter]:
-    """A new `.bag` or `.mcap`; it appears whole or not at all, over an old one of that name. Raises FileError."""
+    """A new `.bag` or `.mcap`; it appears whole or not at all, over an old one of that name. Raises FileError, and
+    OSError that names it where it cannot be written; what else the block raises passes as it is."""
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise FileError(f"{path}: expected a name that ends in {', '.join(FORMATS)} for a bag, found {path.suffix!r}")
     opened = {".bag": _bag, ".mcap": _mcap}[path.suffix.lower()]
-    with naming(path), whole_file(path) as scratch, opened(scratch) as put:
+    with whole_file(path) as scratch, opened(scratch) as put:
         yield BagWriter(path, FORMATS[path.suffix.lower()], put)
+
+
+@contextmanager
+def _telling(path: Path) -> Iterator[None]:
+    """Turns what a message makes a library raise into one line that names the bag; errors of the disk pass."""
+    try:
+        yield
+    except (FileError, OSError):
+        raise
+    except (*BROKEN, *library_errors()) as error:
+        raise FileError(f"{path}: expected a message that a bag can hold, found: {one_line(error)}") from None
 
 
 def points_topic(name: str, encoding: str) -> Topic:

@@ -10,6 +10,7 @@ import heapq
 import struct
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -147,7 +148,7 @@ def cloud_of(message: Message) -> Cloud:
     except FileError:
         raise
     except (*BROKEN, *library_errors()) as error:
-        raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {_line(error)}") from None
+        raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {one_line(error)}") from None
 
 
 _STORES: dict[str, Any] = {}  # encoding -> the types of that ROS; a second to build, so once
@@ -173,14 +174,30 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
     first = path.suffix.lower() == ".bag"
     with (Reader1 if first else Reader2)(path) as reader:
         topics = {c.id: _topic(c, "ros1" if first else "cdr") for c in reader.connections}
+        parts = _files_of(reader)
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             chosen = [c for c in reader.connections if not names or c.topic in names]
-            for connection, time, data in reader.messages(connections=chosen, start=start or None):  # type: ignore[arg-type]
+            each = (part.messages(chosen, start or None) for part in parts if chosen)
+            for connection, time, data in heapq.merge(*each, key=lambda message: message[1]):
                 yield Message(topics[connection.id], time, bytes(data))
 
         duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
         yield Bag(path, tuple(topics.values()), duration, messages)
+
+
+def _files_of(reader: Any) -> list[Any]:
+    """A reader of messages for each file of a ROS 2 folder, whose own reader goes by the order of the metadata, which
+    need not be that of the times; of anything else the reader itself."""
+    from rosbags.rosbag2 import Reader
+    from rosbags.rosbag2.reader import DirectoryReader
+
+    if not (isinstance(reader, Reader) and isinstance(reader.storage, DirectoryReader)):
+        return [reader]
+    parts = [copy(reader.storage) for _ in reader.storage.storages]
+    for part, storage in zip(parts, reader.storage.storages, strict=True):
+        part.storages = [storage]
+    return parts
 
 
 def _topic(connection: Any, encoding: str) -> Topic:
@@ -299,8 +316,9 @@ def naming(path: Path) -> Iterator[None]:
     except FileError:
         raise
     except (*BROKEN, *library_errors()) as error:
-        raise FileError(f"{path}: expected a bag of ROS 1 or ROS 2, or MCAP, found: {_line(error)}") from None
+        raise FileError(f"{path}: expected a bag of ROS 1 or ROS 2, or MCAP, found: {one_line(error)}") from None
 
 
-def _line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
+    """What an error says, in one line; its kind where it says nothing."""
     return " ".join(str(error).split())[:160] or type(error).__name__

@@ -14,7 +14,7 @@ MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1"
 NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
 INTERFACE, SIMPLE, ENHANCED = 1, 3, 6  # kinds of blocks of pcapng (draft-ietf-opsawg-pcapng)
-RESOLUTION = 9  # if_tsresol, an option of an interface
+RESOLUTION, OFFSET = 9, 14  # if_tsresol and if_tsoffset, options of an interface
 MAX_RECORD = 1 << 18
 ETHERNET, RAW_IP, LOOPBACK, LINUX = 1, (12, 101, 228), 0, 113  # link types (the tcpdump group's list)
 IPV4, UDP = 0x0800, 17
@@ -88,11 +88,12 @@ def _records(file: IO[bytes], order: str, nano: bool) -> Iterator[tuple[int, int
 
 class _Interface(NamedTuple):
     """What a capture was made from: its link type, the most bytes kept of a packet (0 = all), how often its clock
-    ticks in a second."""
+    ticks in a second, and the seconds since 1970 that it counts from."""
 
     link: int = ETHERNET
     longest: int = 0
     ticks: int = 10**6
+    start: int = 0
 
 
 def _blocks(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
@@ -115,7 +116,7 @@ def _blocks(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
         elif kind == ENHANCED and len(body) >= 20:
             which, high, low, length, _ = struct.unpack(order + "5I", body[:20])
             one = interfaces[which] if which < len(interfaces) else _Interface()
-            time = ((high << 32) | low) * 10**9 // one.ticks
+            time = one.start * 10**9 + ((high << 32) | low) * 10**9 // one.ticks
             yield time, one.link, body[20 : 20 + length]
         elif kind == SIMPLE and len(body) >= 4:
             one = interfaces[0] if interfaces else _Interface()
@@ -125,16 +126,18 @@ def _blocks(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
 
 def _interface(body: bytes, order: str) -> _Interface:
     link, _, longest = struct.unpack(order + "HHI", body[:8])
-    at = 8
+    at, ticks, start = 8, _Interface().ticks, 0
     while at + 4 <= len(body):
         option, length = struct.unpack(order + "HH", body[at : at + 4])
         if option == RESOLUTION and length == 1 and at + 4 < len(body):
             power = body[at + 4]
-            return _Interface(link, longest, 2 ** (power & 127) if power & 128 else 10**power)
+            ticks = 2 ** (power & 127) if power & 128 else 10**power
+        elif option == OFFSET and length == 8 and at + 12 <= len(body):
+            (start,) = struct.unpack(order + "q", body[at + 4 : at + 12])
         at += 4 + -(-length // 4) * 4
         if option == 0:  # the end of them
             break
-    return _Interface(link, longest)
+    return _Interface(link, longest, ticks, start)
 
 
 def _ip(frame: bytes, link: int) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from lidarsynth.data.frames import Frame, Frames
@@ -45,6 +46,11 @@ def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
     endings = (*(suffix for suffix in READERS if suffix not in NAMED_ONLY), *more)
     named = (path for path in root.rglob("*") if path.name.lower().endswith(endings))
     return sorted(path for path in named if not _beside(path.relative_to(root)) and path.is_file())
+
+
+def by_number(path: Path) -> tuple[str | int, ...]:
+    """What paths are sorted by where the numbers in their names count: part_2 before part_10."""
+    return tuple(int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", str(path)))
 
 
 def _beside(path: Path) -> bool:

@@ -136,15 +136,19 @@ def _npy_header(text: bytes) -> tuple[tuple[int, ...], np.dtype, bool]:
     return shape, dtype, bool(columns_first)
 
 
+POSES = ((3, 3), (3, 4), (4, 4))
+
+
 def read_npz(data: bytes) -> Fields:
     """Our own scan (xyz, reflectance, ring, time, label), our own range image (`image_of`), columns under the usual
-    names, or a single array of points under any name (`read_npy`) and what else there is of each of them. Arrays
-    (H, W, 3) and (H, W) are flattened."""
+    names, or a single array of points under any name (`read_npy`) and what else there is of each of them; beside it
+    matrices of the size of a pose are none. Arrays (H, W, 3) and (H, W) are flattened."""
     arrays = unzip(data)
     if "sensor" in arrays and "mask" in arrays:
         return scan_fields(image_of(arrays).to_scan())
     if "xyz" not in arrays:
         tables = [array for array in arrays.values() if array.ndim == 2 or array.dtype.names]
+        tables = [table for table in tables if table.shape not in POSES] if tables[1:] else tables
         if len(tables) != 1:
             return dict(arrays)
         points = fields_of(tables[0])

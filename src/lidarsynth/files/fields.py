@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from lidarsynth.lidar.plural import plural, was
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
 
@@ -13,7 +14,10 @@ Fields = dict[str, np.ndarray]  # what a format's reader returns: one (N,) array
 
 MAX_POINTS = 10_000_000  # one turn of the largest sensor is under a million points; more is a map or a lying header
 MAX_BYTES = 1 << 28  # of one file, and of one array packed in a file
-MAX_METRES = 10_000.0  # no LiDAR sees farther; beyond it the bytes are not coordinates, or coordinates of a map
+# No LiDAR sees farther; beyond it the bytes are not coordinates, or coordinates of a map. Up to here float32, which a
+# scan's are, is half a millimetre off at most.
+MAX_METRES = 10_000.0
+EARTH = 2e7  # metres; no coordinate of a map is greater
 MAX_RINGS = 1024
 LONGEST = 10.0  # seconds that a turn may last
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
@@ -21,9 +25,9 @@ SCALED = "reflectance by the format"  # a further field: intensities as 0-1, of 
 PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
 NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found wins; case does not matter
-    "x": ("x", "points:0", "//x"),
-    "y": ("y", "points:1"),
-    "z": ("z", "points:2"),
+    "x": ("x", "points:0", "points_m_xyz:0", "//x"),
+    "y": ("y", "points:1", "points_m_xyz:1"),
+    "z": ("z", "points:2", "points_m_xyz:2"),
     "reflectance": ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i", "scalar_intensity"),
     "ring": ("ring", "channel", "line", "laser", "laser_number", "laser_id", "scalar_ring"),
     "time": (
@@ -58,7 +62,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     """The scan of N columns, and how many points it lost.
 
     Points with a non-finite coordinate, or at exactly (0, 0, 0) (no return), are dropped and counted; an intensity that
-    is not finite is 0.
+    is not finite is 0. Columns of no point at all give a scan of none; of points that are all dropped there is no scan.
     `intensity`: see `reflectance_from`; "auto" takes the field SCALED where there is one. `rings`: see `on_rings`.
     Ring numbers that do not count from the top, and times that are no seconds, stay among the further fields as the
     file has them. Raises FileError (without the path) for anything that is not one LiDAR turn.
@@ -77,13 +81,14 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
         values = _numbers(fields[name], name)
     keep = _returned(x, y, z)
     values = values if np.isfinite(values[keep]).all() else np.where(np.isfinite(values), values, 0)
-    if not keep.any():
+    if len(keep) and not keep.any():
         raise FileError(f"expected at least one finite point away from the origin, found none in {len(x)}")
     dropped = int(len(keep) - keep.sum())
     kept = keep if dropped else slice(None)
     xyz = np.stack([x[kept], y[kept], z[kept]], axis=1)
-    if (far := max(float(xyz.max()), -float(xyz.min()))) > MAX_METRES:
-        raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}")
+    if (far := max(float(xyz.max(initial=0)), -float(xyz.min(initial=0)))) > MAX_METRES:
+        raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}"
+                        f"{_why_far(xyz, far)}")  # fmt: skip
     xyz = xyz.astype(np.float32, copy=False)
     check_metres(np.abs(xyz[::16]).max(axis=1))
     values = reflectance_from(values[kept], "unit" if intensity == "none" else intensity)
@@ -91,8 +96,9 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     classes = None if label is None else _training_classes(label)
     from_top = None if ring is None else rings_from_top(ring, xyz)
     seconds = None if time is None else seconds_from(time, find(fields, "time") in ("offset_ns", "offset_time"))
-    changed = [find(fields, name) for name, given, ours in (("ring", ring, from_top), ("time", time, seconds))
-               if given is not None and (given != ours).any()]  # fmt: skip
+    pairs = (("ring", ring, from_top), ("time", time, seconds))
+    told = [(name, given, ours) for name, given, ours in pairs if given is not None and ours is not None]
+    changed = [find(fields, name) for name, given, ours in told if not np.array_equal(given, ours, equal_nan=True)]
     kept_too = {key for key in changed if f"file_{key}" not in fields}
     taken = {find(fields, name) for name in NAMES if name != "label" or classes is not None} - kept_too | {SCALED}
     return Scan(
@@ -103,6 +109,19 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
         label=classes,
         extra={key: column[kept] for key, column in fields.items() if key not in taken and column.dtype.kind in "biuf"},
     ), dropped
+
+
+def _why_far(xyz: np.ndarray, far: float) -> str:
+    """What coordinates (N, 3) up to `far` may be instead of metres from a sensor, or nothing."""
+    away, wide = np.abs(xyz).min(axis=0), xyz.max(axis=0).astype(np.float64) - xyz.min(axis=0)
+    if far < EARTH and (away > np.maximum(wide, MAX_METRES)).any():
+        return ", as of a map: subtract where the sensor stood first"
+    return ": are they millimetres?" if far < 1000 * MAX_METRES else ""
+
+
+def dropped_points(count: int) -> str:
+    """What is said of points that `scan_from_fields` lost."""
+    return f"{plural(count, 'point')} without a return or not finite {was(count)} dropped"
 
 
 def _returned(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -135,7 +154,7 @@ def on_rings(fields: Fields, first: int, last: int) -> Fields:
 
 
 def _coordinates(fields: Fields) -> list[np.ndarray]:
-    """x, y, z, each (N,), after checking that N is at least 1 and the same for every field."""
+    """x, y, z, each (N,), after checking that N is the same for every field, and not too many for one turn."""
     names = [find(fields, axis) for axis in "xyz"]
     if missing := [axis for axis, name in zip("xyz", names, strict=True) if name is None]:
         raise FileError(f"expected the fields x, y, z, found no {', '.join(missing)} in {_listed(fields)}")
@@ -143,9 +162,9 @@ def _coordinates(fields: Fields) -> list[np.ndarray]:
         shapes = ", ".join(f"{key} {value.shape}" for key, value in list(fields.items())[:8])
         raise FileError(f"expected fields of one length, found {shapes}")
     columns = [_numbers(fields[name], name) for name in names if name is not None]
-    if columns[0].ndim != 1 or not 1 <= len(columns[0]) <= MAX_POINTS:
+    if columns[0].ndim != 1 or len(columns[0]) > MAX_POINTS:
         found = len(columns[0]) if columns[0].ndim == 1 else f"an array {columns[0].shape}"
-        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {found}")
+        raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {found}")
     return columns
 
 
@@ -168,6 +187,8 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
     are 0-1; what is above its scale is taken for the most there is. A scan of floats so dark that no point exceeds 1 of
     255 is the one case to force by hand. Raises FileError when the values do not fit the scale.
     """
+    if not len(values):
+        return np.zeros(0, np.float32)
     low, high = float(values.min()), float(values.max())
     if intensity == "auto":
         intensity = _scale_of(values, high)
@@ -180,12 +201,15 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
 
 
-def full_scale(fields: Fields) -> float:
-    """What a reflectance of 1 is in the intensities of N columns, as "auto" takes it. Raises FileError where there are
-    none, or no coordinates."""
+def full_scale(fields: Fields, intensity: str = "auto", rings: tuple[int, int] | None = None) -> float:
+    """What a reflectance of 1 is in the intensities of N columns, as `scan_from_fields` takes them; of those that are
+    not to be read ("none") as "auto" would, and 1 where there are none. Raises FileError without coordinates."""
+    if intensity in SCALES:
+        return SCALES[intensity]
+    fields = fields if rings is None else on_rings(fields, *rings)
     name = find(fields, "reflectance")
     if name is None:
-        raise FileError(f"expected an intensity field, found {_listed(fields)}")
+        return 1.0
     values = _numbers(fields[name], name)
     values = np.where(np.isfinite(values), values, 0)[_returned(*_coordinates(fields))]
     return SCALES[_scale_of(values, float(values.max(initial=0)))]
@@ -211,6 +235,8 @@ def rings_from_top(ring: np.ndarray, xyz: np.ndarray) -> np.ndarray:
     round, any other order (laser ids in firing order) becomes the rank by elevation. When turned, a count that just
     misses that of a known sensor (30 rings of 32) is taken as that sensor's, its top beams being empty.
     """
+    if not len(ring):
+        return np.zeros(0, np.int32)
     if not (np.isfinite(_numbers(ring, "ring")).all() and ring.min() >= 0 and ring.max() < MAX_RINGS):
         raise FileError(f"expected ring numbers of 0-{MAX_RINGS - 1}, found {ring.min():.4g} to {ring.max():.4g}")
     whole = ring.astype(np.int32)
@@ -248,6 +274,8 @@ def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
             if nanoseconds or (last <= 1e15 and last - first <= LONGEST):
                 return exact * (1e-9 if nanoseconds else 1.0)
             return (exact - first) / 10.0 ** _power(max(float(last - first), 1.0))
+    if not len(time):
+        return np.zeros(0)
     first = time.min()
     span = max(int(time.max()) - int(first), 1)
     return (time - first).astype(np.float64) / 10.0 ** (9 if nanoseconds else _power(span))

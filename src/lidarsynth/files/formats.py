@@ -69,6 +69,7 @@ def read_with_report(
 ) -> tuple[Scan, int]:
     """The scan, and how many of the file's points were dropped: not finite, or (0, 0, 0) where nothing returned.
 
+    A file that says of itself that it has no point gives a scan of none.
     intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" as the kind of file
                fixes it, else by type and range (`fields.reflectance_from`), "none" to read a file without intensity
                with reflectance 0
@@ -137,7 +138,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     a filled one `new` beside them in a `.new` file, a byte a point, and `confidence` in a `.confidence` file, a float32
     a point; such marks of another scan that would be taken for this one's are removed. The others hold ring, time,
     label and every further field too. The file appears whole or not at all: it is written beside its place, then
-    renamed. Raises FileError, also for anything else, such as an array.
+    renamed. Raises FileError, also for anything else, such as an array, and for a `.bin` of no point: it would be a
+    file of no byte, which `read` takes for one that was cut off.
     """
     path = Path(path)
     if not isinstance(scan, Scan | RangeImage):
@@ -148,6 +150,9 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     content = scan.to_scan() if isinstance(scan, RangeImage) and suffix != ".npz" else scan
     if path.is_dir():
         raise FileError(f"{path}: expected the name of a file to write, found a folder")
+    if isinstance(content, Scan) and suffix == ".bin" and not len(content):
+        raise FileError(f"{path}: expected points for .bin, whose file would be empty, found none: .npy, .npz, .pcd "
+                        "and .ply say so themselves")  # fmt: skip
     if isinstance(content, Scan) and suffix in BARE:  # before the file itself: where that stands, all is whole
         _without_marks(path, content)
         for name, kind in BESIDE.items():

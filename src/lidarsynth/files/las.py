@@ -32,7 +32,7 @@ def check_header(data: bytes) -> None:
         _check_chunks(data, start, count)
         _check_items(data, header, records, size)
     room = (len(data) - start) * (MAX_RATIO if kind & 0xC0 else 1)  # the two high bits mark LAZ
-    if not 1 <= count <= MAX_POINTS or count * size > room:
+    if count > MAX_POINTS or count * size > room:
         raise FileError(
             f"expected {count} points of {size} bytes in a LAS file, found {len(data) - start} bytes of points"
         )
@@ -47,7 +47,7 @@ def _check_chunks(data: bytes, start: int, count: int) -> None:
     if not start + 8 <= place <= len(data) - 8:
         raise FileError(f"expected a LAZ chunk table between {start + 8} and {len(data) - 8}, found it at {place}")
     chunks = struct.unpack_from("<I", data, place + 4)[0]
-    if chunks > count:
+    if chunks > max(count, 1):  # of no points there is one
         raise FileError(f"expected at most one LAZ chunk for each of {count} points, found {chunks}")
 
 

@@ -1,4 +1,4 @@
-"""One writer per folder: a lock that dies with its process, whatever kills it.
+"""One writer per folder, or several that share it: a lock that dies with its process, whatever kills it.
 
 flock(2) on a file `.lock`: the kernel lets go when the process ends, also after kill -9 or a power cut, so nothing is
 ever left to clean up. It holds on local file systems, and on NFS from Linux 2.6.12 and SMB from Linux 5.5 between
@@ -10,47 +10,59 @@ from __future__ import annotations
 
 import errno
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LOCK = ".lock"
+TRIES, SOON = 5, 0.05  # seconds between
 UNKNOWN = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems that have no locks
 
 
 @contextmanager
-def only_writer(folder: Path, work: str) -> Iterator[None]:
-    """Hold the folder, which is made if it is not there, for as long as the context lasts.
+def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]:
+    """Hold the folder, which is made if it is not there, for as long as the context lasts; gives whether there is a
+    lock, without which others may be there.
 
-    work  in words, such as "training", for the error
-    Raises ValueError where another process holds it.
+    work    in words, such as "training", for the error
+    shared  with others that share it
+    Raises ValueError where another process holds it, or, unless `shared`, any shares it.
     """
     try:
         import fcntl
     except ImportError:  # Windows
-        yield
+        yield False
         return
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     folder.mkdir(parents=True, exist_ok=True)
-    path, held = folder / LOCK, False
+    path, held, locked, tries = folder / LOCK, False, True, TRIES if shared else 1
     while not held:
-        with path.open("ab") as file:
+        with path.open("a+b") as file:  # NFS wants to read what is shared
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             except BlockingIOError:
+                tries -= 1
+                if tries:  # the last of those that shared it may be about to take the file away
+                    time.sleep(SOON)
+                    continue
                 raise ValueError(f"{folder}: expected a folder that nobody else writes to, found another {work} at "
                                  "work in it; name another folder, or wait") from None  # fmt: skip
             except OSError as error:
                 if error.errno not in UNKNOWN:
                     raise
+                locked = False
             # who held it before may have taken the file away after we opened it: then it is another one now
             held = _inode(path) == os.fstat(file.fileno()).st_ino
             if held:
                 try:
-                    yield
+                    yield locked
                 finally:
-                    path.unlink(missing_ok=True)
+                    with suppress(OSError):  # where others share it, the last one takes the file away
+                        if locked and shared:
+                            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        path.unlink(missing_ok=True)
 
 
 def _inode(path: Path) -> int | None:

@@ -14,6 +14,7 @@ from lidarsynth.files.whole_numbers import typed
 from lidarsynth.lidar.scan import Scan
 
 MAX_HEADER = 1 << 16
+SAME = 1e-4  # metres, radians: a sensor so near is at the origin
 TYPES = {"F4": "<f4", "F8": "<f8"} | {f"{t}{n}": f"<{t.lower()}{n}" for t in "IU" for n in (1, 2, 4, 8)}
 
 
@@ -42,8 +43,8 @@ class Header(NamedTuple):
 def read_pcd(data: bytes) -> Fields:
     """The scalar fields (COUNT 1) of a PCD file under their own names, each (N,) in the file's type.
 
-    Organised clouds are flattened row by row; rows that are beams become the field `ring`. Raises FileError when header
-    and data do not fit.
+    Organised clouds are flattened row by row; rows that are beams become the field `ring`. Points stay in the file's
+    frame, whatever its VIEWPOINT. Raises FileError when header and data do not fit.
     """
     header = read_header(data)
     columns = DECODERS[header.encoding](data[header.start :], header)
@@ -55,6 +56,32 @@ def read_pcd(data: bytes) -> Fields:
     if header.rows > 1 and (ring := rings_of_grid(fields, header.shape)) is not None:
         fields["ring"] = ring
     return fields
+
+
+def viewpoint(data: bytes) -> np.ndarray | None:
+    """(4, 4) from the sensor's frame into the one that VIEWPOINT tells its place in (x y z, then a quaternion w x y z),
+    or None where that is the origin, or no place.
+
+    The format does not say in which of the two frames the points are: PCL's viewer turns them by it, its normals take
+    them as they are. So `read_pcd` does. Raises FileError where there is no header.
+    """
+    words = _entries(data)[0].get("VIEWPOINT", [])
+    try:
+        place = np.array(words, np.float64)
+    except ValueError:
+        return None
+    length = np.linalg.norm(place[3:]) if place.shape == (7,) else 0.0
+    if not (np.isfinite(place).all() and length > 0):
+        return None
+    w, x, y, z = place[3:] / length
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = place[:3]
+    return None if np.allclose(matrix, np.eye(4), atol=SAME) else matrix
 
 
 def read_header(data: bytes) -> Header:
@@ -121,8 +148,8 @@ def _points(entries: dict[str, list[str]]) -> tuple[int, int]:
     if "WIDTH" in sizes and sizes["WIDTH"] * sizes.get("HEIGHT", 1) != points:
         raise FileError(f"expected WIDTH x HEIGHT = POINTS, found {sizes['WIDTH']} x {sizes.get('HEIGHT', 1)} "
                         f"and {points}")  # fmt: skip
-    if not 1 <= points <= MAX_POINTS:
-        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {points} in the PCD header")
+    if points > MAX_POINTS:
+        raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {points} in the PCD header")
     return points, max(sizes.get("HEIGHT", 1), 1)
 
 

@@ -50,8 +50,6 @@ def read_ply(data: bytes) -> Fields:
     vertex, before = elements[place], elements[:place]
     if vertex.has_list:
         raise FileError("expected one number per vertex property, found a list property in the element vertex")
-    if vertex.count == 0:
-        raise FileError("expected at least one vertex, found none")
     if len(set(vertex.names)) < len(vertex.names) or not vertex.names:
         raise FileError(f"expected distinct vertex properties, found {vertex.names[:8]}")
     if encoding == "ascii":

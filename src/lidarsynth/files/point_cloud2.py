@@ -63,8 +63,8 @@ def decode(message: PointCloud2) -> Fields:
 def _table(message: PointCloud2) -> np.ndarray:
     """(N,) structured view of the message's points."""
     height, width, step = int(message.height), int(message.width), int(message.point_step)
-    if not 1 <= height * width <= MAX_POINTS:
-        raise FileError(f"expected 1 to {MAX_POINTS} points of one turn, found {height} x {width}")
+    if not 0 <= height * width <= MAX_POINTS:
+        raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {height} x {width}")
     dtype = _dtype(message.fields, step, ">" if message.is_bigendian else "<")
     data = np.frombuffer(message.data, np.uint8)
     stride = int(message.row_step) or width * step  # some drivers leave it 0

@@ -8,6 +8,7 @@ import numpy as np
 
 from lidarsynth.files.fields import MAX_POINTS, NAMES, SCALED, Fields, FileError
 from lidarsynth.files.whole_numbers import exact
+from lidarsynth.lidar.plural import plural
 
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
@@ -34,7 +35,9 @@ def read_text(data: bytes) -> Fields:
         elif not (line.startswith(COMMENT) or (len(words) == 1 and words[0].isdecimal())) or start >= HEADER_LINES:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
     else:
-        raise FileError(f"expected lines of x y z and more numbers, found none in {len(lines)} lines")
+        if names is not None:  # and nothing else: a scan of no point
+            return {name: np.zeros(0) for name in names}
+        raise FileError(f"expected lines of x y z and more numbers, found none in {plural(len(lines), 'line')}")
     table, words = _table(lines[start:], separator)
     if names is not None and len(names) != table.shape[1]:
         raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")

@@ -155,6 +155,13 @@ def check_image(image: RangeImage) -> None:
                          "its scale")  # fmt: skip
 
 
+def with_points(scan: Scan, where: str = "") -> Scan:
+    """The scan. Raises ValueError, which begins with `where` it is from, where it holds no point."""
+    if not len(scan):
+        raise ValueError(f"{where}{': ' if where else ''}expected points, found a scan of none")
+    return scan
+
+
 def check_seen(image: RangeImage, count: int) -> RangeImage:
     """The image of `count` points. Raises ValueError where it has none of them."""
     if not image.mask.any():

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.lidar.learning import LearnedSensor
+from lidarsynth.lidar.plural import plural
 from lidarsynth.pictures.colours import viridis
 from lidarsynth.pictures.figure import FAINT, INK, PAPER, panel
 
@@ -23,7 +24,7 @@ def learned_figure(learned: LearnedSensor) -> np.ndarray:
     share[sensor.blocked_rays()] = BLOCKED
     tall = max(round(320 / sensor.height), 1)
     strip = Image.fromarray(np.repeat(share, tall, axis=0)).resize((STRIP, tall * sensor.height), Image.Resampling.BOX)
-    what = f"{sensor.name}: {sensor.height} beams, {sensor.width} columns, from {learned.scans} scans"
+    what = f"{sensor.name}: {sensor.height} beams, {sensor.width} columns, from {plural(learned.scans, 'scan')}"
     caption = "share of scans in which each ray returned (dark 0, bright 1; red: blocked)"
     beams = "each beam's elevation (left, degrees) and how far its points lie from it (bar, degrees)"
     bars = _bars(sensor.elevations, [ring.residual for ring in learned.rings])

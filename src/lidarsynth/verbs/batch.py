@@ -21,7 +21,7 @@ from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, with_points
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
@@ -35,6 +35,7 @@ from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, ups
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
+from lidarsynth.verbs.viewpoint import viewpoint_note
 
 THIN = 0.1  # of the usual points of a ring; fewer do not make it one more than a sensor's beams
 FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
@@ -171,13 +172,14 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     begun, warning = time.perf_counter(), None
     try:
         loaded = work.item.read()
+        with_points(loaded.scan, str(work.item.path))
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
-        warning = warning or _caution(loaded.scan, job, work)
+        warning = warning or _viewpoint_warning(job, work) or _caution(loaded.scan, job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
         cloud, beside = None, ()
         if work.target is None:
             points = _points(done, loaded, job.transform)
-            fields = FIELDS.get(job.verb, message_fields)(points, loaded.given)
+            fields = FIELDS.get(job.verb, message_fields)(points, loaded)
             cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields)
         else:
             beside = _store(work.target, work.item.path, done, loaded, job)
@@ -224,6 +226,12 @@ def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -
         return None
     text = model.stranger(scan, None if job.sensor is None else get_sensor(job.sensor))
     return text and f"{work.item.path}: {job.model} {text}; use --model default"
+
+
+def _viewpoint_warning(job: Job, work: Work) -> str | None:
+    """That a file puts the sensor elsewhere than at the origin, where nobody has said which frame the points are in."""
+    text = viewpoint_note(work.item.path) if work.check and job.transform is None else None
+    return text and f"{work.item.path}: {text}"
 
 
 def _caution(scan: Scan, job: Job, work: Work) -> str | None:

@@ -61,10 +61,25 @@ def is_mixed(path: Path) -> bool:
     return "mixed" in (_read(path) or {})
 
 
+def shard_reports(out: Path) -> list[Path]:
+    """Reports of the shards of a folder."""
+    return [path for path in sorted(out.glob("report-*-of-*.json")) if _read(path) is not None]
+
+
 def shards_at_work(out: Path) -> list[Path]:
     """Reports of those shards of a folder that are not done: at work, or killed."""
-    reports = {path: _read(path) for path in sorted(out.glob("report-*-of-*.json"))}
-    return [path for path, report in reports.items() if report is not None and "unfinished" in report]
+    return [path for path in shard_reports(out) if "unfinished" in (_read(path) or {})]
+
+
+def check_no_other_whole(out: Path, recipe: Mapping[str, Any]) -> None:
+    """Raises ValueError where a folder has the scans of a whole run of another recipe, among which a shard would put
+    its own. Those of other shards are told when they are merged."""
+    path = out / REPORT
+    report = _read(path) if path.is_file() else None
+    if report is not None and "shards" not in report["settings"] and not same(path, recipe, told=False):
+        unlike = ", ".join(f"{name} {now} for {was}" for name, (now, was) in _unlike(report, recipe).items())
+        raise ValueError(f"{path}: expected no scans beside those of shards, or such as are asked for now, found those "
+                         f"of a whole run of other settings: {unlike or 'several'}; name another --out")  # fmt: skip
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -92,11 +107,14 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)[:60]
 
 
-def rows_before(path: Path, skipped: Sequence[Path]) -> list[dict[str, Any]]:
-    """What a report that lies there says of the scans that were left out, by the files that were made of them."""
-    there = set(map(str, skipped))
-    rows = ((_read(path) if path.is_file() else None) or {}).get("scans", [])
-    return [row for row in rows if row.get("target") in there and "error" not in row]
+def rows_before(paths: Sequence[Path], skipped: Sequence[Path]) -> list[dict[str, Any]]:
+    """What reports that lie there, the last of which counts most, say of the scans that were left out, by the files
+    that were made of them."""
+    there, rows = set(map(str, skipped)), {}
+    for path in paths:
+        found = ((_read(path) if path.is_file() else None) or {}).get("scans", [])
+        rows |= {row["target"]: row for row in found if row.get("target") in there and "error" not in row}
+    return list(rows.values())
 
 
 def report_of(

@@ -12,6 +12,7 @@ from lidarsynth.experiment.folder import RECORD
 from lidarsynth.experiment.presets import PRESETS
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.systems.table import build_network, system_of
@@ -89,7 +90,7 @@ def errors_table(title: str, errors: Mapping[str, Errors]) -> str:
 def mean_table(tables: Sequence[Mapping[str, Errors]]) -> str:
     """`errors_table` of the mean over scans."""
     means = {name: mean_errors([table[name] for table in tables]) for name in tables[0]}
-    return errors_table(f"mean of {len(tables)} scans", means)
+    return errors_table(f"mean of {plural(len(tables), 'scan')}", means)
 
 
 def _table(title: str, lines: dict[str, str]) -> str:

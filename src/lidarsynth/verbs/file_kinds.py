@@ -11,19 +11,21 @@ import numpy as np
 
 from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag
 from lidarsynth.data.capture import datagrams, is_capture
-from lidarsynth.data.folder import scan_files
+from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
 from lidarsynth.lidar.frame import check_frame
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict
 from lidarsynth.verbs.inputs import Reading, has_scans, is_stream, moved
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
+from lidarsynth.verbs.viewpoint import viewpoint_note
 
 Lines = dict[str, str]
 LOOKED_AT = 400  # packets of a capture that are counted
@@ -55,7 +57,8 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
         if not (path / INDEX).exists():
             return _folder(path, reading)
     if path.name.lower().endswith(tuple(READERS)):
-        return _image(path) | _scan_file(path, reading)
+        placed = {} if moves(reading) or (note := viewpoint_note(path)) is None else {"viewpoint": note}
+        return _image(path) | _scan_file(path, reading) | placed
     if is_bag(path):
         return _bag(path, reading)
     if is_capture(path):
@@ -100,14 +103,17 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
     """Points, range, reflectance, fields, sensor and frame of a scan, moved as `reading` says."""
     if reading.transform is not None:
         scan = moved(scan, reading.transform)
+    own = [field for field in ("ring", "time", "label") if getattr(scan, field) is not None]
+    fields = " ".join(["x y z reflectance", *own, *(name for name in scan.extra if name not in own)])
+    if not len(scan):
+        return {"points": "0", "fields": fields}
     name, reason = recognise(scan)
     depth, light = np.linalg.norm(scan.xyz, axis=1), scan.reflectance
-    own = [field for field in ("ring", "time", "label") if getattr(scan, field) is not None]
     lines = {
         "points": f"{len(scan)}" + (f" ({dropped} without a return dropped)" if dropped else ""),
         "range": f"{depth.min():.2f} to {depth.max():.2f} m, median {np.median(depth):.2f} m",
         "reflectance": f"{light.min():.2f} to {light.max():.2f}, mean {light.mean():.3f}",
-        "fields": " ".join(["x y z reflectance", *own, *(name for name in scan.extra if name not in own)]),
+        "fields": fields,
         "sensor": f"{name} ({reason})" if name else reason,
     }
     warning = check_frame(scan).warning()
@@ -116,10 +122,10 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
 
 def _bag(path: Path, reading: Reading) -> Lines:
     with open_bag(path) as bag:
-        lines = {"kind": f"bag of {bag.seconds:.1f} s, {len(bag.topics)} topics"}
+        lines = {"kind": f"bag of {bag.seconds:.1f} s, {plural(len(bag.topics), 'topic')}"}
         for topic in bag.topics:
             rate = f", {(topic.count - 1) / bag.seconds:.1f} a second" if bag.seconds > 0 and topic.count > 1 else ""
-            lines[topic.name] = f"{topic.kind}, {topic.count} messages{rate} ({topic.encoding})"
+            lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
         clouds = [topic.name for topic in bag.topics if topic.kind == POINTS]
         for name in clouds:
             first = next(bag.clouds(name), None)
@@ -158,14 +164,16 @@ def _cache(path: Path) -> Lines:
 
 def _folder(path: Path, reading: Reading) -> Lines:
     """A folder of scans, or of bags and captures: what it holds, what else, and the first scan."""
-    files, streams = scan_files(path) if has_scans(path) else [], sorted(p for p in path.iterdir() if is_stream(p))
+    files = scan_files(path) if has_scans(path) else []
+    streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
     if not files and not streams:
         raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
     if not files and moves(reading):
         raise FileError(f"{path}: expected a scan to move or take rings of, found bags and captures: name one of them")
     if not files:
         listed = ", ".join(p.name for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
-        return {"kind": f"folder of {len(streams)} bags and captures", "files": listed}
+        kind = f"folder of {len(streams)} bags and captures" if streams[1:] else "folder of a bag or capture"
+        return {"kind": kind, "files": listed}
     lines = {"kind": "folder of scans", "scans": _counted(None, files)}
     if rest := _counted(path, files):
         lines["passed over"] = rest

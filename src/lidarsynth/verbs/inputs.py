@@ -13,9 +13,9 @@ import numpy as np
 
 from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import scan_files
+from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.turns import capture_turns
-from lidarsynth.files.fields import PLACE, Fields, FileError, find, rings_from_top, scan_from_fields
+from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
@@ -53,12 +53,14 @@ class Loaded:
              place in `given`, from 1
     given    the columns of the message, or x y z of the file
     dropped  points without a return, or not finite
+    scale    what a reflectance of 1 is in the intensities of a message
     stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
     """
 
     scan: Scan
     given: Fields
     dropped: int
+    scale: float = 1.0
     stamp: int = 0
     frame_id: str = ""
     time: int = 0
@@ -107,7 +109,8 @@ class MessageInput:
             how = self.reading.intensity, self.reading.rings
             places = np.arange(1, len(next(iter(cloud.fields.values()), ())) + 1)
             scan, dropped = scan_from_fields({**cloud.fields, PLACE: places}, *how)
-            loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields)
+            scale = full_scale(cloud.fields, *how)
+            loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields, scale=scale)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
         return replace(loaded, stamp=cloud.stamp, frame_id=cloud.frame_id, time=cloud.time)
@@ -209,9 +212,9 @@ def _expanded(path: Path) -> list[Path]:
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
         if not found:
             raise ValueError(f"{path}: expected files of this pattern, found none")
-        return [p for p in found if _is_scan(p) or is_stream(p)]
+        return [p for p in found if _is_scan(p)] + sorted(filter(is_stream, found), key=by_number)
     if path.is_dir() and not is_bag(path) and not _is_scan(path):
-        bags = sorted(p for p in path.iterdir() if is_stream(p))
+        bags = sorted(filter(is_stream, path.iterdir()), key=by_number)
         return bags if bags and not has_scans(path) else scan_files(path)
     if not (path.exists() or _is_scan(path) or is_stream(path)):
         raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
@@ -356,13 +359,13 @@ def without_places(scan: Scan) -> Scan:
     return replace(scan, extra={name: values for name, values in scan.extra.items() if name != PLACE})
 
 
-def message_fields(filled: Scan, given: Fields) -> Fields:
+def message_fields(filled: Scan, loaded: Loaded) -> Fields:
     """A filled scan as the columns that its message had, bit by bit for measured points, and `new`, `confidence`.
 
     New points have their x y z, a reflectance in the message's own scale, the ring number that their row, or the next
     one that has any, has there, and the time of the points in their direction; other fields are 0.
     """
-    new = filled.extra[PLACE] == 0
+    given, new = loaded.given, filled.extra[PLACE] == 0
     place = np.where(new, 0, filled.extra[PLACE] - 1)
     fields = {name: column[place] for name, column in given.items()}
     for column in fields.values():
@@ -371,9 +374,7 @@ def message_fields(filled: Scan, given: Fields) -> Fields:
         fields[str(find(given, axis))][new] = filled.xyz[new, i]
     old = ~new
     if (name := find(given, "reflectance")) is not None:
-        lit = old & (filled.reflectance > 0)
-        scale = float(np.median(fields[name][lit] / filled.reflectance[lit])) if lit.any() else 1.0
-        fields[name][new] = (filled.reflectance[new] * scale).astype(fields[name].dtype)
+        fields[name][new] = (filled.reflectance[new] * loaded.scale).astype(fields[name].dtype)
     if (name := find(given, "ring")) is not None and filled.ring is not None:
         rows, first = np.unique(filled.ring[old], return_index=True)
         nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, filled.ring[new])

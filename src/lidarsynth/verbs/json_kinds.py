@@ -9,6 +9,7 @@ from typing import Any
 
 from lidarsynth.data import ouster
 from lidarsynth.files.fields import FileError
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 
 Lines = dict[str, str]
@@ -67,7 +68,7 @@ def _boxes(values: Mapping[str, Any]) -> Lines:
 
 def _generated(values: Mapping[str, Any]) -> Lines:
     return {"kind": "settings of lidarsynth generate, with which it goes on: "
-                    f"{values['steps']} steps, seed {values['seed']}, {values['format']}"}  # fmt: skip
+                    f"{plural(values['steps'], 'step')}, seed {values['seed']}, {values['format']}"}  # fmt: skip
 
 
 OURS = {

@@ -10,6 +10,7 @@ from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import Filled
+from lidarsynth.verbs.inputs import Loaded
 
 MOST = 4  # classes that are told
 
@@ -32,8 +33,8 @@ def found(points: Scan, sensor: Sensor) -> str:
     return f"{len(points)} points of {sensor.name}: {named}, {count[0]} without a class"
 
 
-def labelled_fields(named: Scan, given: Fields) -> Fields:
+def labelled_fields(named: Scan, loaded: Loaded) -> Fields:
     """A labelled scan as the columns that its message had, bit by bit, and `label`."""
     assert named.label is not None
-    fields = {name: column[named.extra[PLACE] - 1] for name, column in given.items()}
+    fields = {name: column[named.extra[PLACE] - 1] for name, column in loaded.given.items()}
     return fields | {"label": named.label.astype(np.uint8)}

@@ -12,7 +12,8 @@ import numpy as np
 
 from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
 from lidarsynth.lidar.learning import FEWEST, NEAR, SMEARED, LearnedSensor, learn_sensor
-from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.plural import plural
+from lidarsynth.lidar.scan import Scan, with_points
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.inputs import Input, Inputs
@@ -52,7 +53,7 @@ def _readable(inputs: Iterable[Input], broken: list[str]) -> Iterator[Scan]:
     read = 0
     for item in inputs:
         try:
-            yield item.read().scan
+            yield with_points(item.read().scan, str(item.path))
             read += 1
         except ValueError as error:
             broken.append(str(error))
@@ -93,14 +94,14 @@ def summary(learned: LearnedSensor) -> str:
     share, (nose, left) = float(sensor.blocked_rays().mean()), sensor.tilt
     top, bottom = sensor.elevations[0], sensor.elevations[-1]
     lines = [
-        f"{sensor.name}: {sensor.height} beams from {top:+.2f} to {bottom:+.2f} degrees, {sensor.width} columns, "
-        f"{sensor.min_range:g} to {sensor.max_range:g} m",
+        f"{sensor.name}: {plural(sensor.height, 'beam')} from {top:+.2f} to {bottom:+.2f} degrees, "
+        f"{sensor.width} columns, {sensor.min_range:g} to {sensor.max_range:g} m",
         f"  points lie {np.median(residuals):.4f} degrees off their beams (median), {residuals.max():.4f} (worst beam)",
         "  how far above the ground is not known"
         if learned.afloat
         else f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
         f"  blocked by its carrier: {share:.1%} of the rays" if sensor.blocked else "  nothing seen to be blocked",
-        f"  from {learned.scans} scans" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
+        f"  from {plural(learned.scans, 'scan')}" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
     ]
     return "\n".join(lines)
 
@@ -125,7 +126,7 @@ def doubts(learned: LearnedSensor) -> list[str]:
     if learned.afloat:
         found.append(f"{name}: {learned.afloat}: mount and tilt are not learned, {learned.sensor.mount:g} m and level "
                      "are written: set them in the file")  # fmt: skip
-    took = f"{learned.merged} rings are taken as one beam with another"
+    took = f"{plural(learned.merged, 'ring')} {'is' if learned.merged == 1 else 'are'} taken as one beam with another"
     if learned.turns:
         found.append(f"{name}: {learned.turns} ({took if learned.merged else 'its columns may be too many'})")
     elif learned.merged:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from lidarsynth.files.fields import PLACE, Fields, find, full_scale
+from lidarsynth.files.fields import PLACE, Fields, find
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import Filled
+from lidarsynth.verbs.inputs import Loaded
 
 
 def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) -> Filled:
@@ -21,11 +22,12 @@ def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) ->
     return Filled(real, lambda: {"simulated": project(scan, real.sensor), f"as {sensor.name} sees it": real}, {})
 
 
-def realised_fields(real: Scan, given: Fields) -> Fields:
+def realised_fields(real: Scan, loaded: Loaded) -> Fields:
     """A realised scan as the columns that its message had, bit by bit but for the intensity, in the message's scale."""
+    given = loaded.given
     fields = {name: column[real.extra[PLACE] - 1] for name, column in given.items()}
     name = find(given, "reflectance")
     if name is None:
         return fields | {"intensity": real.reflectance}
-    fields[name] = (real.reflectance * full_scale(given)).astype(given[name].dtype)
+    fields[name] = (real.reflectance * loaded.scale).astype(given[name].dtype)
     return fields

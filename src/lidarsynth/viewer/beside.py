@@ -6,11 +6,12 @@ import math
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.files.fields import FileError
+from lidarsynth.files.fields import FileError, dropped_points
 from lidarsynth.files.formats import BARE, BESIDE, read_with_report
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.verbs.inputs import stem
+from lidarsynth.verbs.viewpoint import viewpoint_note
 from lidarsynth.viewer.packing import Shown
 
 THREE = ("centre", "size")  # fields of a box with three numbers
@@ -32,7 +33,9 @@ def read_shown(path: Path, intensity: str = "auto") -> Shown:
         scan, dropped = read_with_report(path, intensity)  # a broken scan raises again
         notes.append(_why(labels, len(scan) + dropped))
     if dropped:
-        notes.append(f"{dropped} points without a return or not finite were dropped")
+        notes.append(dropped_points(dropped))
+    if (placed := viewpoint_note(path)) is not None:
+        notes.append(placed)
     bare = path.name.lower().endswith(BARE) and not path.name.lower().endswith(".pcd.bin")
     for name, kind in BESIDE.items() if bare else ():
         if (marks := path.with_suffix(f".{name}")).is_file() and name not in scan.extra:  # those that fit are read

@@ -47,7 +47,7 @@ def packed(shown: Shown) -> bytes:
         "blocks": [{"name": name, "type": values.dtype.str[1:], "count": values.size}
                    for name, values in blocks.items()],
         "boxes": list(shown.boxes),
-        "notes": list(shown.notes),
+        "notes": [*shown.notes, *([] if len(scan) else ["no point in this scan"])],
         "name": shown.name,
     }  # fmt: skip
     text = json.dumps(header, allow_nan=False).encode()

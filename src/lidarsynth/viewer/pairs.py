@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lidarsynth.data.capture import is_capture
+from lidarsynth.lidar.plural import plural
 from lidarsynth.verbs.inputs import Reading, is_stream
 from lidarsynth.viewer.page import Entry
 from lidarsynth.viewer.series import Files, Series, series_of
@@ -26,9 +27,8 @@ def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dic
     if isinstance(scans, Files) and isinstance(partners, Files):
         partners = _by_name(scans, partners)
     if None not in (scans.count, partners.count) and scans.count != partners.count:
-        raise ValueError(
-            f"{other}: expected {scans.count} scans to compare, or one of each name, found {partners.count}"
-        )
+        number = plural(scans.count or 0, "scan")
+        raise ValueError(f"{other}: expected {number} to compare, or one of each name, found {partners.count}")
     first, second = _caption(paths), _caption([other])
     return {first: scans, second if second != first else str(other): partners}
 

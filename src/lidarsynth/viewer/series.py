@@ -11,6 +11,7 @@ from typing import Protocol
 
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.folder import scan_files
+from lidarsynth.files.fields import dropped_points
 from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of, moved
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.packing import Shown
@@ -72,8 +73,8 @@ class Stream:
     def __getitem__(self, index: int) -> Shown:
         item = self._thread.submit(self._at, index).result()
         loaded = item.read()
-        dropped = (f"{loaded.dropped} points without a return or not finite were dropped",) if loaded.dropped else ()
-        return Shown(loaded.scan, notes=dropped, name=item.name)
+        notes = (dropped_points(loaded.dropped),) if loaded.dropped else ()
+        return Shown(loaded.scan, notes=notes, name=item.name)
 
     def _at(self, index: int) -> Input:
         if index < 0:

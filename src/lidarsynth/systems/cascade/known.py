@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.lidar.ground import standing_height
+from lidarsynth.lidar.ground import stance
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
@@ -20,7 +20,8 @@ from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 
 ANSWERS = 0.02  # of the rays of a beam
 FEW = 3  # beams that may be apart by chance
-ANOTHER, STEP, LOWEST = 0.2, 0.05, 0.2  # share of a mount by which another is told; metres
+# Share of a mount, and degrees, by which others are told; metres.
+ANOTHER, LEANING, STEP, LOWEST = 0.2, 3.5, 0.05, 0.2
 
 
 def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
@@ -39,12 +40,17 @@ def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit:
 
 
 def standing(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Sensor:
-    """The sensor as high above the road as the returns of an image, known (H, W) bool, tell it stands, to 5 cm; itself
-    where they do not, or where that is within a fifth."""
-    height = standing_height(sensor.points(image.range)[known & image.mask])
-    if height is None or abs(np.log(max(height, LOWEST) / max(sensor.mount, LOWEST))) < np.log(1 + ANOTHER):
+    """The sensor as high above the road, and as tilted, as the returns of an image, known (H, W) bool, tell it is, to 5
+    cm and a degree; what they do not tell, or what is within a fifth and three and a half degrees, stays."""
+    found = stance(sensor.points(image.range)[known & image.mask])
+    if found is None:
         return sensor
-    return replace(sensor, mount=round(max(height, LOWEST) / STEP) * STEP)
+    height, tilt = max(found[0], LOWEST), np.array(found[1:])
+    if abs(np.log(height / max(sensor.mount, LOWEST))) > np.log(1 + ANOTHER):
+        sensor = replace(sensor, mount=round(height / STEP) * STEP)
+    if np.abs(tilt - sensor.tilt).max() > LEANING:
+        sensor = replace(sensor, tilt=tuple(tilt.round().tolist()))
+    return sensor
 
 
 @lru_cache(maxsize=2)  # every scan of a folder asks for the same
