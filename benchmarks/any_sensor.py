@@ -6,7 +6,7 @@ python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of re
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
 python benchmarks/any_sensor.py floating SCAN...    new points where no surface is, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
-python benchmarks/any_sensor.py dense [--sensor vlp-16] [--mount 0.5] [--tilt 8 0]   held-out streets, four times the beams
+python benchmarks/any_sensor.py dense [--sensor vlp-16] [--mount 0.5] [--tilt 8 0]   streets in four times the beams
 python benchmarks/any_sensor.py responses           reflectance of held-out streets, reported in ways never trained on
 Each takes --models (words or folders).
 """
