@@ -23,8 +23,9 @@ BELOW = 2.5  # times as far off below, nothing lies of what is the ground
 ALL_AROUND = 0.4  # of the directions in which it must be seen
 TILTED, NEARLY = range(-TILT, TILT + 1, TILTS), (-2, 0, 2)
 # Of `stance`: points that are enough, cells on the ground in a direction, and the share of the lowest points that are
-# on it where it is nearly level, which is 0.46 and more of level sensors and 0.14 and less of tilted ones.
-SOME, DEEP, LEVEL, CLEARLY = 20_000, 3, 0.4, 1.15
+# on it below which it may be tilted (of level sensors it is 0.46 and more, of tilted ones 0.14 and less, of those between
+# between), if so many times as many are on the tilted plane.
+SOME, DEEP, LEVEL, CLEARLY = 20_000, 3, 0.6, 1.15
 
 
 @dataclass(frozen=True)
