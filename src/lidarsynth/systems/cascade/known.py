@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.lidar.ground import stance
+from lidarsynth.lidar.ground import SOME, stance
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
@@ -42,7 +42,8 @@ def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit:
 def standing(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Sensor:
     """The sensor as high above the road, and as tilted, as the returns of an image, known (H, W) bool, tell it is, to 5
     cm and a degree; what they do not tell, or what is within a fifth and three and a half degrees, stays."""
-    found = stance(sensor.points(image.range)[known & image.mask])
+    places = np.flatnonzero(known & image.mask)
+    found = stance(sensor.points(image.range, places[:: max(1, -(-len(places) // SOME))]))
     if found is None:
         return sensor
     height, tilt = max(found[0], LOWEST), np.array(found[1:])
