@@ -4,6 +4,7 @@ python examples/onnx_complete.py OUT.onnx scan.pcd dense.npy        # dense.npy:
 """
 
 import json
+import os
 import sys
 
 import numpy as np
@@ -12,6 +13,9 @@ import onnxruntime
 if len(sys.argv) != 4:
     sys.exit(__doc__)
 _, network, source, target = sys.argv
+for path in (network, source):
+    if not os.path.isfile(path):
+        sys.exit(f"{path}: expected a file, found none")
 session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
 sensor = json.loads(session.get_modelmeta().custom_metadata_map["sensor"])
 elevations, width = np.array(sensor["elevations"]), sensor["width"]
@@ -28,6 +32,8 @@ with open(source, "rb") as file:  # the points
     cloud = np.fromfile(file, np.dtype(list(zip(header["FIELDS"], types, strict=True))), int(header["POINTS"][0]))
 xyz = np.stack([cloud[axis] for axis in "xyz"], 1).astype(np.float32)
 metres, light = np.linalg.norm(xyz, axis=1), cloud["intensity"].astype(np.float32)
+hit = np.isfinite(metres) & (metres > 0)  # others are rays without a return
+xyz, metres, light = xyz[hit], metres[hit], light[hit]
 light = light if light.max() <= 1 else light / 255
 
 # row: the beam nearest in elevation, some of which stand a little above the origin; column 0 looks backwards

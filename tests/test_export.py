@@ -158,6 +158,7 @@ def test_the_example_refuses_what_is_no_binary_cloud_in_one_line(tmp_path: Path)
     head = (
         "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
     )
+    (tmp_path / "x.onnx").touch()
     for content, found in ((f"{head}DATA binary_compressed\n0000", "binary_compressed"),
                            (f"{head}DATA ascii\n1 2 3 0\n", "ascii"), (head, "no DATA"), ("", "no DATA"),
                            ("\x89PNG\x00\xff", "no DATA")):  # fmt: skip

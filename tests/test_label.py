@@ -13,6 +13,7 @@ from lidarsynth.files.formats import read, write
 from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.naming import class_of_points
 from lidarsynth.weights.load import load
 
@@ -177,3 +178,10 @@ def test_what_cannot_be_labelled_is_refused_in_one_line(place: Path, capsys: pyt
             main(words)
         error = capsys.readouterr().err.strip()
         assert stopped.value.code == 2 and said in error and "\n" not in error and not Path("o.ply").exists()
+
+
+def test_a_seed_is_taken_and_nothing_sure_enough_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    write(tmp_path / "a.pcd", SyntheticStreets(5, 1, "vlp-16").image(0).to_scan())
+    words = ["label", str(tmp_path / "a.pcd"), "--out", str(tmp_path / "b.pcd"), "--no-picture", "--seed", "3"]
+    main([*words, "--min-confidence", "1"])
+    assert " points of vlp-16: " in (out := capsys.readouterr().out) and ": ," not in out

@@ -156,3 +156,51 @@ def test_what_is_left_out_for_doubt_is_no_error_of_the_model(tmp_path: Path, cap
         left.append(len(ls.read(tmp_path / "o.ply")))
     assert said[0] == said[1] and left[1] < left[0]
     assert len(ls.read(tmp_path / "o.ply")) < 16 * 1024
+
+
+def test_a_sensor_that_cannot_be_the_scans_is_told_where_images_are_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "in").mkdir()
+    write(tmp_path / "in" / "a.pcd", street("hdl-32e"))
+    words = ["data", "files", str(tmp_path / "in"), str(tmp_path / "cache"), "--workers", "0", "--sensor"]
+    main([*words, "vlp-16"])
+    assert "a.pcd: expected points of vlp-16, found them on 32 rings" in capsys.readouterr().err
+    main([*words[:3], str(tmp_path / "own"), *words[4:], "hdl-32e"])
+    assert "expected points of" not in capsys.readouterr().err
+    project = ["project", str(tmp_path / "in" / "a.pcd"), "--out", str(tmp_path / "a.npz"), "--sensor", "vlp-16"]
+    main(project)
+    assert "expected points of vlp-16, found them on 32 rings" in capsys.readouterr().err
+    assert "expected points of vlp-16" in refused([*project, "--strict"], capsys)
+
+
+def test_a_file_that_begins_with_a_mark_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "own.toml"
+    path.write_bytes(b"\xef\xbb\xbfname = 'own'\r\nbeams = 16\r\ntop = 10\r\nbottom = -10\r\n")
+    main(["info", str(path)])
+    assert "16 from +10.00" in capsys.readouterr().out
+
+
+def test_more_beams_than_an_image_has_are_refused_by_what_was_asked():
+    with pytest.raises(ValueError, match="expected at most 4096 beams, found 100 times 64, 6301: fewer times"):
+        SENSORS["os1-64"].denser(100)
+    assert SENSORS["os1-64"].denser(64).height == 4033
+
+
+@pytest.mark.parametrize("recipe", [None, 4, ["beams:4"]])
+def test_a_recipe_is_words(recipe: object):
+    with pytest.raises(ValueError, match="expected a recipe such as beams:4, found a"):
+        ls.corrupt(noise_image(0), recipe)  # type: ignore[arg-type]
+
+
+def test_a_field_of_the_file_that_another_has_the_name_of_is_shown_as_it_is_written():
+    scan = Scan(np.ones((3, 3)), ring=np.arange(3), extra={"ring": np.arange(3), "more": np.arange(3)})
+    assert repr(scan).endswith("ring, file_ring, more)")
+
+
+def test_streets_of_another_sensor_are_told_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = ["streets", "-n", "1", "--out", str(tmp_path / "set"), "--format", "pcd", "--sensor"]
+    main([*words, "vlp-16"])
+    capsys.readouterr()
+    line = refused([*words, "hdl-32e"], capsys)
+    assert "made with {sensor hdl-32e}, found {sensor vlp-16}; use another --out" in line

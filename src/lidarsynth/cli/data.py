@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from lidarsynth.cli.arguments import Positional, arg
-from lidarsynth.cli.terminal import at_least, counted, say
+from lidarsynth.cli.terminal import at_least, counted, say, warn
 
 MOST = 10_000_000  # synthetic scans of one cache; more fit on no disk
 
@@ -44,7 +44,7 @@ def data(
         intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
         apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
     """
-    from lidarsynth.data.sources import prepare, shards, summary
+    from lidarsynth.data.sources import prepare, shards, summary, unfit
 
     at_least(1, {"count": count})
     at_least(0, {"seed": seed, "workers": workers})
@@ -54,4 +54,6 @@ def data(
     there = shards(cache or root)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass
+    if (note := unfit(source, root, sensor)) is not None:
+        warn(note)
     say(f"{'nothing is new:' if shards(cache or root) == there else 'wrote'} {summary(cache or root)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from lidarsynth.cli.arguments import Device, Intensity, Picture, Positional, Precision, SensorWord, Source, arg
+from lidarsynth.cli.arguments import Device, Intensity, NoSeed, Picture, Positional, Precision, SensorWord, Source, arg
 from lidarsynth.cli.many import Many, work_through
 
 
@@ -21,6 +21,7 @@ def label(
     precision: Precision = "fp32",
     intensity: Intensity = "auto",
     picture: Picture = True,
+    seed: NoSeed = 0,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
     """A class for every point, one of SemanticKITTI's nineteen: road, building, car, person, pole ...

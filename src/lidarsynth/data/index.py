@@ -80,7 +80,7 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
         expected, found = ({k: v for k, v in table[key].items() if k not in PLACE} for table in (head, index))
         if expected != found and any(entry["count"] for entry in index["shards"].values()):
             differ = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
-            both = [", ".join(f"{k} {_short(t.get(k))}" for k in differ) for t in (expected, found)]
+            both = [", ".join(f"{k} {short(t.get(k))}" for k in differ) for t in (expected, found)]
             raise ValueError(f"{folder}: expected a cache of {key} {{{both[0]}}}, found one of {{{both[1]}}}; "
                              "name another folder")  # fmt: skip
         if expected != found:  # nothing of the other kind is stored: no scan could be read
@@ -90,7 +90,8 @@ def open_index(folder: Path, sensor: Sensor, source: dict[str, Any], count: int,
     return index | {"source": head["source"], "count": max(count, index["count"]), MOVED: moved}
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """A setting in a message: the beginning and the end of a long one."""
     text = str(value)
     return text if len(text) <= 40 else f"{text[:30]} ... {text[-6:]}"
 

@@ -24,6 +24,7 @@ from lidarsynth.lidar.projection import PROJECTIONS, columns_of, project_thinned
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
+from lidarsynth.lidar.view import misfit
 from lidarsynth.streets.edition import EDITION
 
 __all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "prepare", "scan_files", "summary"]
@@ -193,6 +194,20 @@ def _reader(name: str, root: Path, split: str, intensity: str) -> Reader:
     if name != "files":
         raise ValueError(f"expected --intensity with files, whose scale is not known, found it with {name}")
     return _files(root, split, intensity)
+
+
+def unfit(name: str, root: Path, sensor: str | None) -> str | None:
+    """That the first of files that can be read cannot be of the sensor that is named for all, in one line, or None."""
+    if name != "files" or sensor is None:
+        return None
+    reader, named = _files(root, "all"), get_sensor(sensor)
+    for i in range(len(reader)):
+        with suppress(ValueError):
+            scan = reader[i]
+            found = misfit(scan.xyz, named, scan.ring)
+            where = "/".join(reader.name(i)[1:])
+            return found and f"{where}: expected points of {named.name}, found {found}: it is drawn all the same"
+    return None
 
 
 def _recognised(reader: Reader) -> str:

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lidarsynth.data.index import resumable_file
+from lidarsynth.data.index import resumable_file, short
 from lidarsynth.data.layouts.kitti import KITTI
 from lidarsynth.data.layouts.layout import Layout, points_told
 from lidarsynth.data.layouts.nuscenes import NUSCENES
@@ -158,12 +158,20 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
             return
         if any(entry.is_file() and not entry.name.startswith(".") for entry in folder.rglob("*") if entry != path):
             asked, was = _differing(settings, found), _differing(found, settings)
-            raise ValueError(f"{folder}: expected a folder of streets made with {asked!s:.200}, found {was!s:.200}; "
+            raise ValueError(f"{folder}: expected a folder of streets made with {_told(asked)}, found {_told(was)}; "
                              "use another --out")  # fmt: skip
     elif folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
         raise ValueError(f"{folder}: expected an empty folder, or one with {RECORD}; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
     _put(path, (json.dumps(settings, indent=1) + "\n").encode())
+
+
+def _told(settings: dict[str, Any]) -> str:
+    """Settings in a message; of a sensor its name, where that differs."""
+    sensor = settings.get("sensor")
+    if isinstance(sensor, dict):
+        settings = settings | {"sensor": sensor["name"]} if "name" in sensor else settings | sensor
+    return "{" + ", ".join(f"{key} {short(value)}" for key, value in settings.items() if value is not sensor) + "}"
 
 
 def _differing(these: Any, those: Any) -> Any:

@@ -107,6 +107,8 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
 
 def check_recipe(recipe: str) -> list[tuple[str, list[float]]]:
     """Name and numbers of each part of a recipe. Raises ValueError that names the part it could not read."""
+    if not isinstance(recipe, str):
+        raise ValueError(f"expected a recipe such as beams:4, found a {type(recipe).__name__}")
     parts = []
     for part in recipe.split("+"):
         name, *numbers = part.strip().split(":")

@@ -22,9 +22,9 @@ OFF, FARTHER = 0.1, np.array([0.015, 0.01])  # metres off a plane that are on it
 BELOW = 2.5  # times as far off below, nothing lies of what is the ground
 ALL_AROUND = 0.4  # of the directions in which it must be seen
 TILTED, NEARLY = range(-TILT, TILT + 1, TILTS), (-2, 0, 2)
-# Of `stance`: points that are enough, cells on the ground in a direction, and the share of the lowest points that are
-# on it below which it may be tilted (of level sensors it is 0.46 and more, of tilted ones 0.14 and less, of those between
-# between), if so many times as many are on the tilted plane.
+# Of `stance`: points that are enough, cells on the ground in a direction, the share of the lowest points on the ground
+# below which a sensor may be tilted (of level ones it is 0.46 and more, of tilted ones 0.14 and less, of those between
+# between), and how many times as many must be on the tilted plane.
 SOME, DEEP, LEVEL, CLEARLY = 10_000, 3, 0.6, 1.15
 
 

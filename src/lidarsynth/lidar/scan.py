@@ -64,7 +64,8 @@ class Scan:
         """One line: how many points, how far away, and which fields."""
         far = np.linalg.norm(self.xyz, axis=1)
         has = [name for name in ("ring", "time", "label") if getattr(self, name) is not None]
-        has = ["reflectance"] * bool(self.reflectance.any()) + has + [str(name) for name in self.extra]
+        has = ["reflectance"] * bool(self.reflectance.any()) + has
+        has += [f"file_{name}" if name in has else str(name) for name in self.extra]  # as they are written
         return f"Scan({', '.join([f'{len(self):,} points{_span(far)}', *has])})"
 
     __iter__ = None  # a scan is no sequence of points

@@ -15,6 +15,7 @@ import numpy as np
 
 from lidarsynth.lidar.small_file import read_json, read_toml
 
+MOST = 4096  # beams that an image may have
 METRES = ("min_range", "max_range", "mount")  # fields that are one number each
 
 
@@ -171,6 +172,8 @@ class Sensor:
         """
         if times < 2 or times != int(times):
             raise ValueError(f"expected a whole number of at least 2 times as many beams, found {times}")
+        if (beams := (self.height - 1) * int(times) + 1) > MOST:
+            raise ValueError(f"expected at most {MOST} beams, found {times} times {self.height}, {beams}: fewer times")
         times = int(times)
         own, place = np.arange(self.height), np.arange((self.height - 1) * times + 1) / times
         elevations = tuple(np.interp(place, own, self.elevations).tolist())

@@ -44,7 +44,7 @@ def read_text(path: str | Path, most: int = LARGEST) -> str:
     if len(content) > most:
         raise ValueError(f"{path}: expected at most {most} bytes, found more")
     try:
-        return content.decode()
+        return content.decode("utf-8-sig")  # editors of Windows begin files with a mark
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected text in UTF-8, found {error.reason} at byte {error.start}") from None
 

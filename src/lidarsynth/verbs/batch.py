@@ -209,7 +209,7 @@ def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
 
 def _misfit(scan: Scan, job: Job) -> str | None:
     """That the points cannot be of the sensor that was named as theirs, in one line."""
-    if job.sensor is None or job.verb not in ("complete", "upsample", "label", "realise"):
+    if job.sensor is None or job.verb not in ("complete", "upsample", "label", "realise", "project"):
         return None
     sensor = get_sensor(job.sensor)
     if scan.ring is not None and len(scan):  # what learning a sensor may leave out is no other sensor's

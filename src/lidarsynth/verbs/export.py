@@ -87,24 +87,25 @@ def _program(graph: Graph) -> Any:
             dynamic_shapes=shapes,
             verbose=False,
         )
-    assert program is not None
-    optimizer.fold_constants(program.model)
-    optimizer.remove_unused_nodes(program.model)
+        assert program is not None
+        optimizer.fold_constants(program.model)
+        optimizer.remove_unused_nodes(program.model)
     return program.model_proto
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Without the exporter's warnings about itself."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
+    loggers = {logger: logger.level for logger in map(logging.getLogger, ("torch.onnx", "onnx_ir"))}
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.setLevel(level)
+        for logger, level in loggers.items():
+            logger.setLevel(level)
 
 
 def _shapes(values: Any) -> dict[str, tuple[int | str, ...]]:

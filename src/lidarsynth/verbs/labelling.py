@@ -29,8 +29,8 @@ def found(points: Scan, sensor: Sensor) -> str:
     assert points.label is not None
     count = np.bincount(points.label, minlength=len(CLASSES))
     most = [k for k in np.argsort(-count) if k and count[k]][:MOST]
-    named = ", ".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}" for k in most)
-    return f"{len(points)} points of {sensor.name}: {named}, {count[0]} without a class"
+    named = "".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}, " for k in most)
+    return f"{len(points)} points of {sensor.name}: {named}{count[0]} without a class"
 
 
 def labelled_fields(named: Scan, loaded: Loaded) -> Fields:
