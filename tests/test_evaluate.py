@@ -30,6 +30,7 @@ from lidarsynth.files.formats import write
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.metrics.reconstruction import voxel_errors
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.verbs.learned_sensor import sensor_toml
 
@@ -367,6 +368,23 @@ def test_upsampling_compares_images_one_by_one():
     assert report.values["IoU"] is None and "only for 2048" in str(report)
     with pytest.raises(ValueError, match=r"as many of both, found 6 and 8"):
         ls.evaluate(STREETS, REAL, protocol=R2DM_UPSAMPLING.name)
+
+
+def test_voxels_are_compared_scan_by_scan_and_no_return_is_far():
+    truth = REAL[0]
+    same = ls.evaluate([truth], [truth], protocol="iln-2022").values
+    assert list(same.values()) == [0, 100, 100, 100, 100]
+    half = truth.keep(np.arange(truth.shape[0])[:, None] % 2 + np.zeros(truth.shape) == 0)
+    report = ls.evaluate([half, truth], [truth, truth], protocol="iln-2022")
+    lost = truth.mask & ~half.mask
+    assert report.values["range MAE"] == pytest.approx((100 - truth.range[lost]).clip(0).sum() / truth.mask.size / 2)
+    points = [image.sensor.points(image.range)[image.mask] for image in (half, truth)]
+    errors = voxel_errors(*points)
+    assert errors.precision == 1 and 0.3 < errors.recall < 0.9
+    assert report.values["voxel recall"] == pytest.approx(50 * (errors.recall + 1))
+    assert report.values["voxel IoU"] == pytest.approx(50 * (errors.iou + 1))
+    nothing = truth.keep(np.zeros(truth.shape, bool))
+    assert list(ls.evaluate([nothing], [truth], protocol="iln-2022").values.values())[1:] == [0, 0, 0, 0]
 
 
 def test_the_shipped_network_tells_classes_without_a_download():

@@ -18,6 +18,7 @@ from lidarsynth.metrics.reconstruction import (
     mean_iou,
     point_errors,
     reconstruction_errors,
+    voxel_errors,
     weighted_iou,
 )
 
@@ -115,7 +116,17 @@ def test_point_errors_are_symmetric_and_zero_for_equal_sets():
     assert point_errors(a, a + 100).f_score == 0
 
 
-@pytest.mark.parametrize("judge", [point_errors, chamfer_distance])
+def test_voxels_in_closed_form():
+    truth = np.array([[0.05, 0.05, 0.05], [0.06, 0.01, 0.09], [0.15, 0, 0], [-0.05, 0, 0]])  # three voxels
+    result = np.array([[0.01, 0.01, 0.01], [0.17, 0.02, 0.03], [5, 5, 5], [6, 6, 6]])  # four, two of them right
+    errors = voxel_errors(result, truth)
+    assert (errors.iou, errors.precision, errors.recall) == (2 / 5, 2 / 4, 2 / 3)
+    assert errors.f1 == pytest.approx(2 * 2 / (3 + 4))
+    assert voxel_errors(truth, truth[::-1]).iou == 1
+    assert voxel_errors(truth, truth + 9).f1 == 0
+
+
+@pytest.mark.parametrize("judge", [point_errors, voxel_errors, chamfer_distance])
 @pytest.mark.parametrize("bad", [np.ones((0, 3)), np.ones((4, 2)), np.full((4, 3), np.nan)])
 def test_points_that_cannot_be_judged(judge, bad):
     with pytest.raises(ValueError, match=r"expected finite points \(N, 3\), at least one, found"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,13 @@ from lidarsynth.metrics.reconstruction import (
     mean_iou,
     point_errors,
     reconstruction_errors,
+    voxel_errors,
     weighted_iou,
 )
 from lidarsynth.networks.rangenet import RangeNet
+
+VOXELS = ("range-mae-full", "voxel-iou", "voxel-precision", "voxel-recall", "voxel-f1")  # of ILN, of one pair each
+FULL = 100.0  # metres that no return counts as, and at which ranges are cut
 
 
 class Pairs:
@@ -46,6 +51,7 @@ class Pairs:
         self.protocol, self.classes, self.seen = protocol, classes, seen
         self.errors: list[Errors] = []
         self.chamfer: list[float] | None = [] if any(row.measure == "chamfer" for row in protocol.rows) else None
+        self.voxels: list[list[float]] | None = [] if any(row.measure in VOXELS for row in protocol.rows) else None
         self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
         self.lit = False
         self._digests = [0, 0]
@@ -56,6 +62,8 @@ class Pairs:
             self.errors.append(reconstruction_errors(result, truth))
             if self.chamfer is not None:
                 self.chamfer.append(_chamfer(self._points(result, False), self._points(truth, True)))
+            if self.voxels is not None:
+                self.voxels.append(_voxels(result, truth))
             self.lit |= bool(result.reflectance.any())
             self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:
@@ -91,7 +99,8 @@ class Pairs:
         errors = [list(asdict(e).values()) for e in self.errors]
         digests = [f"{digest:032x}" for digest in self._digests]
         state = {"errors": errors, "confusion": self.confusion.tolist(), "lit": self.lit, "digests": digests}
-        return state if self.chamfer is None else {**state, "chamfer": self.chamfer}
+        more = {"chamfer": self.chamfer, "voxels": self.voxels}
+        return state | {name: values for name, values in more.items() if values is not None}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take in what `state` of another gave."""
@@ -100,6 +109,8 @@ class Pairs:
         self.lit |= state["lit"]
         if self.chamfer is not None:
             self.chamfer += state["chamfer"]
+        if self.voxels is not None:
+            self.voxels += state["voxels"]
         self._add_digests([int(digest, 16) for digest in state["digests"]])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -128,13 +139,14 @@ class Pairs:
     def report(self, missing: Mapping[str, str] | None = None, weights: Mapping[str, str] | None = None) -> Report:
         """The protocol's rows so far. Raises ValueError for no pair."""
         mean, results = None if self.chamfer and not self.errors else mean_errors(self.errors), []
+        each = {"chamfer": self.chamfer or [], **dict(zip(VOXELS, zip(*self.voxels or [], strict=True), strict=False))}
         for row in self.protocol.rows:
             reason = ""
             if row.network and not self.classes:
                 reason = (missing or {}).get(row.network, f"no {row.network} is here")
             elif (row.network or row.measure == "reflectance-mae") and not self.lit:
                 reason = "the samples have no reflectance"
-            value = None if reason else MEASURES[row.measure](mean, self.confusion, self.chamfer or []) * row.scale
+            value = None if reason else MEASURES[row.measure](mean, self.confusion, each) * row.scale
             results.append(Result(row.name, value, row.unit, row.digits, reason))
         counts = {"samples": self.count, "reference": self.count}
         names = ("samples", "reference")
@@ -149,12 +161,27 @@ def _chamfer(points: np.ndarray, truth: np.ndarray) -> float:
     return point_errors(points, truth).chamfer_squared / 2
 
 
-MEASURES: dict[str, Callable[[Any, np.ndarray, Sequence[float]], float]] = {  # of mean errors, confusion, distances
-    "range-mae": lambda errors, confusion, chamfer: errors.range_mae,
-    "reflectance-mae": lambda errors, confusion, chamfer: errors.reflectance_mae,
-    "iou": lambda errors, confusion, chamfer: mean_iou(confusion),
-    "iou-weighted": lambda errors, confusion, chamfer: weighted_iou(confusion),
-    "chamfer": lambda errors, confusion, chamfer: float(np.mean(chamfer)),
+def _voxels(result: RangeImage, truth: RangeImage) -> list[float]:
+    """`VOXELS` of a pair, of the points that lie on their pixels' rays; 0 where either has none."""
+    full = [np.where(image.mask, np.minimum(image.range, FULL), FULL) for image in (result, truth)]
+    mae = float(np.abs(full[0] - full[1]).mean())
+    if not (result.mask.any() and truth.mask.any()):
+        return [mae, 0.0, 0.0, 0.0, 0.0]
+    points, true = (image.sensor.points(image.range)[image.mask] for image in (result, truth))
+    return [mae, *asdict(voxel_errors(points, true)).values()]
+
+
+def _mean_of(name: str, errors: Any, confusion: np.ndarray, each: Mapping[str, Sequence[float]]) -> float:
+    return float(np.mean(each[name]))
+
+
+Measure = Callable[[Any, np.ndarray, Mapping[str, Sequence[float]]], float]
+MEASURES: dict[str, Measure] = {  # of mean errors, confusion, numbers of each pair by their names
+    "range-mae": lambda errors, confusion, each: errors.range_mae,
+    "reflectance-mae": lambda errors, confusion, each: errors.reflectance_mae,
+    "iou": lambda errors, confusion, each: mean_iou(confusion),
+    "iou-weighted": lambda errors, confusion, each: weighted_iou(confusion),
+    **{name: partial(_mean_of, name) for name in ("chamfer", *VOXELS)},
 }
 
 

@@ -144,6 +144,34 @@ R2DM_UPSAMPLING = EvaluationProtocol(
     notes=("which of the two IoUs the paper has is not known",),
 )
 
+_VOXELS = "of the voxels of 0.1 m that points occupy, of each scan, averaged"
+ILN = EvaluationProtocol(
+    "iln-2022",
+    1,
+    "Kwon, Sung & Yoon, Implicit LiDAR network, ICRA 2022, and its program; also what TULIP (CVPR 2024) calls IoU",
+    (
+        Row("range MAE", "range-mae-full", "mean over all pixels, cut at 100 m, no return as 100 m", unit="m"),
+        Row("voxel IoU", "voxel-iou", f"intersection over union {_VOXELS}", None, 100, "%", 2),
+        Row(
+            "voxel precision",
+            "voxel-precision",
+            f"share {_VOXELS} in the result that are in the truth",
+            None,
+            100,
+            "%",
+            2,
+        ),
+        Row("voxel recall", "voxel-recall", f"share {_VOXELS} in the truth that are in the result", None, 100, "%", 2),
+        Row("voxel F1", "voxel-f1", f"harmonic mean of both {_VOXELS}", None, 100, "%", 2),
+    ),
+    near=0.0,
+    far=float("inf"),
+    gated=(),
+    samples=None,
+    pairs=True,
+    notes=("points are those of pixels' rays, within the sensor's limits",),
+)
+
 BEV_1 = EvaluationProtocol(
     "bev-1",
     1,
@@ -204,7 +232,7 @@ STREET_UPSAMPLING_1 = replace(
     notes=("the network learned synthetic streets: its IoU tells methods apart, and is not that of RangeNet-53",),
 )
 
-_PUBLISHED = (R2DM, LIDARGEN, LIDM, R2FLOW, R3DPA, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, LIDM_RECONSTRUCTION)
+_PUBLISHED = (R2DM, LIDARGEN, LIDM, R2FLOW, R3DPA, DUSTY, DUSTY_SMALL, R2DM_UPSAMPLING, ILN, LIDM_RECONSTRUCTION)
 PROTOCOLS: dict[str, EvaluationProtocol] = {
     p.name: p for p in (*_PUBLISHED, BEV_1, STREET_1, STREET_2, STREET_UPSAMPLING_1)
 }

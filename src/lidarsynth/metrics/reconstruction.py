@@ -107,6 +107,28 @@ def _harmonic(precision: float, recall: float) -> float:
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
+@dataclass(frozen=True)
+class VoxelErrors:
+    """Overlap of the voxels that a result and the truth occupy, each in [0, 1]."""
+
+    iou: float
+    precision: float
+    recall: float
+    f1: float
+
+
+def voxel_errors(result: Array, truth: Array, size: float = 0.1) -> VoxelErrors:
+    """Overlap of the voxels floor(x / size) that points (N, 3) and (M, 3) in metres occupy; one scan (ILN, TULIP).
+
+    Means over scans are taken of these. Raises ValueError for other shapes, no points or NaN.
+    """
+    first, second = (np.unique(np.floor(_points(p) / size).astype(np.int64), axis=0) for p in (result, truth))
+    both = len(first) + len(second) - len(np.unique(np.concatenate([first, second]), axis=0))
+    precision, recall = both / len(first), both / len(second)
+    iou = both / (len(first) + len(second) - both)
+    return VoxelErrors(iou, precision, recall, _harmonic(precision, recall))
+
+
 def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.ndarray:
     """(classes, classes) int64 pixels, truth by row, predicted by column; those of several scans simply add up.
 
