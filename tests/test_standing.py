@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lidarsynth as ls
+from lidarsynth.cli.main import main
 from lidarsynth.lidar.ground import stance
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
@@ -88,3 +90,12 @@ def test_its_classes_go_by_it_too():
     scan = image.to_scan()
     told, found = (model.label(scan, sensor=replace(image.sensor, mount=m)).label for m in (0.5, image.sensor.mount))
     assert (told == found).mean() > 0.97, "by its own mount 0.91"
+
+
+def test_info_says_how_a_sensor_stands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for name, image in (("low", street("vlp-16", 0.5, 0)), ("tilted", street("os1-64", 1.73, 0, (8.0, 0.0)))):
+        ls.write(tmp_path / f"{name}.pcd", image.to_scan())
+        main(["info", str(tmp_path / f"{name}.pcd")])
+    low, tilted = [line.split("stands")[1].strip() for line in capsys.readouterr().out.splitlines() if "stands" in line]
+    assert low == "about 0.5 m above the ground" and tilted.startswith("about 1.")
+    assert "nose +8 and left side" in tilted or "nose +7 and" in tilted

@@ -26,6 +26,7 @@ TILTED, NEARLY = range(-TILT, TILT + 1, TILTS), (-2, 0, 2)
 # below which a sensor may be tilted (of level ones it is 0.46 and more, of tilted ones 0.14 and less, of those between
 # between), and how many times as many must be on the tilted plane.
 SOME, DEEP, LEVEL, CLEARLY = 10_000, 3, 0.6, 1.15
+LEANING = 3.5  # degrees of a tilt that is no slope of the road
 
 
 @dataclass(frozen=True)

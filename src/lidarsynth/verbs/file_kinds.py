@@ -18,6 +18,7 @@ from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
 from lidarsynth.lidar.frame import check_frame
+from lidarsynth.lidar.ground import LEANING, stance
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
@@ -117,7 +118,15 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
         "sensor": f"{name} ({reason})" if name else reason,
     }
     warning = check_frame(scan).warning()
-    return lines | ({"frame": warning} if warning else {})
+    if warning:
+        return lines | {"frame": warning}
+    return lines | ({"stands": _stands(*found)} if (found := stance(scan.xyz)) is not None else {})
+
+
+def _stands(height: float, nose: float, left: float) -> str:
+    """As `own-data.md` has it; a tilt that is a slope of the road's is not told."""
+    tilted = f", nose {nose:+.0f} and left side {left:+.0f} degrees up" if max(abs(nose), abs(left)) > LEANING else ""
+    return f"about {height:.1f} m above the ground{tilted}"
 
 
 def _bag(path: Path, reading: Reading) -> Lines:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.lidar.ground import SOME, stance
+from lidarsynth.lidar.ground import LEANING, SOME, stance
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
@@ -20,8 +20,7 @@ from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 
 ANSWERS = 0.02  # of the rays of a beam
 FEW = 3  # beams that may be apart by chance
-# Share of a mount, and degrees, by which others are told; metres.
-ANOTHER, LEANING, STEP, LOWEST = 0.2, 3.5, 0.05, 0.2
+ANOTHER, STEP, LOWEST = 0.2, 0.05, 0.2  # share of a mount by which another is told; metres
 
 
 def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, size: tuple[int, int]) -> Known:
