@@ -53,7 +53,7 @@ def test_the_origin_and_what_is_no_place_are_none(place: str):
 
 
 def test_points_stay_and_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    scan, path, words = full_scan(), tmp_path / "a.pcd", ["--sensor", "vlp-16", "--no-picture"]
+    scan, path, words = full_scan(), tmp_path / "a.pcd", ["--sensor", "pandar64", "--no-picture"]
     write(path, scan)
     assert viewpoint_note(path) is None and viewpoint_note(tmp_path / "no.pcd") is None
     path.write_bytes(path.read_bytes().replace(b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 1 2 3 0 0 0 1"))
