@@ -89,9 +89,9 @@ def test_a_sensor_that_hangs_upside_down_sees_its_own_rays_turned_over(name):
     sensor = replace(SENSORS[name], blocked=((2, 3, 5),), dimness=tuple(range(SENSORS[name].height)))
     over = sensor.inverted()
     metres = np.random.default_rng(0).uniform(5, 9, (sensor.height, sensor.width)).astype(np.float32)
-    turned = sensor.points(metres)[::-1] * np.float32([1, 1, -1])
-    np.testing.assert_allclose(over.points(metres[::-1]), turned, atol=2e-5)
-    assert (over.blocked_rays() == sensor.blocked_rays()[::-1]).all() and over.dimness == sensor.dimness[::-1]
+    turned = sensor.points(metres)[::-1, ::-1] * np.float32([1, -1, -1])
+    np.testing.assert_allclose(over.points(metres[::-1, ::-1]), turned, atol=2e-5)
+    assert (over.blocked_rays() == sensor.blocked_rays()[::-1, ::-1]).all() and over.dimness == sensor.dimness[::-1]
     assert over.mount == sensor.mount and over.name == f"{name}-inverted"
 
 
@@ -193,6 +193,11 @@ def test_files_of_another_kind_get_one_line(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=message):
             read_sensor(tmp_path / name)
+
+
+def test_all_words_are_listed():
+    with pytest.raises(ValueError, match=r"hdl-64e, .*pandar64, .*vlp-32c-inverted, .*hdl-64e-dusty.* found 'vlp32'"):
+        get_sensor("vlp32")
 
 
 def test_unknown_words_list_the_known_ones():

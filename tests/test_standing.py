@@ -63,6 +63,24 @@ def test_the_ground_tells_how_a_sensor_is_tilted(tilt: tuple[float, float]):
         assert standing(told, image, image.mask) is told, "as it is told"
 
 
+@pytest.mark.parametrize(
+    ("mount", "tilt"), [(1.73, (20.0, 0.0)), (1.73, (14.0, 14.0)), (4.8, (0.0, 0.0)), (1.73, (6.0, 0.0))]
+)
+def test_what_is_told_and_right_stays_where_nothing_like_it_is_tried(mount: float, tilt: tuple[float, float]):
+    for place in PLACES:
+        image = street("os1-64", mount, place, tilt)
+        told = replace(image.sensor, mount=mount, tilt=tilt)
+        for step in (1, 2):
+            assert standing(told, image, every(image, step)) is told
+
+
+def test_half_a_turn_tells_no_stance():
+    for place in PLACES:
+        image = street("vlp-16", 1.73, place, (0.0, 12.0))
+        half = every(image, 1) & (np.arange(image.shape[1]) < image.shape[1] // 2)
+        assert standing(image.sensor, image, half) is image.sensor
+
+
 def test_where_no_ground_is_seen_a_mount_stays():
     image = street("os1-64", 0.5, 0)
     assert standing(image.sensor, image, every(image, 64)) is image.sensor, "one beam"

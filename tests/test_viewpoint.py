@@ -44,6 +44,13 @@ def test_it_is_the_pose_that_it_tells(pose: str, length: float):
     np.testing.assert_allclose(found, matrix, atol=1e-9)
 
 
+@pytest.mark.parametrize("scale", ["1e200", "1e-200"])
+def test_a_rotation_of_any_length_is_one(scale: str):
+    found = viewpoint(header(f"1 2 3 0 0 0 {scale}"))
+    assert found is not None
+    np.testing.assert_allclose(found, viewpoint(header("1 2 3 0 0 0 1")))
+
+
 NOWHERE = ["0 0 0 1 0 0 0", "0 0 0 -1 0 0 0", "0 0 0 0 0 0 0", "0 0 0", "a b c 1 0 0 0", "nan 0 0 1 0 0 0"]
 
 

@@ -172,7 +172,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         warn(f"{merged}: expected shards of one recipe, found several in report-*-of-{shard[1]}.json; make those of "
              "another anew, without --skip-existing")  # fmt: skip
     if replaced:
-        warn(f"{report}: of all scans now, in place of {', '.join(path.name for path in replaced[:NAMED])}"
+        warn(f"{report}: of this run's scans now, in place of {', '.join(path.name for path in replaced[:NAMED])}"
              f"{', ...' if replaced[NAMED:] else ''}, of shards that were made here before")  # fmt: skip
     _summary(results, len(skipped), seconds, merged or report)
     return results

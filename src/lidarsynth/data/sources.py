@@ -196,11 +196,11 @@ def _reader(name: str, root: Path, split: str, intensity: str) -> Reader:
     return _files(root, split, intensity)
 
 
-def unfit(name: str, root: Path, sensor: str | None) -> str | None:
+def unfit(name: str, root: Path, sensor: str | None, intensity: str = "auto") -> str | None:
     """That the first of files that can be read cannot be of the sensor that is named for all, in one line, or None."""
     if name != "files" or sensor is None:
         return None
-    reader, named = _files(root, "all"), get_sensor(sensor)
+    reader, named = _files(root, "all", intensity), get_sensor(sensor)
     for i in range(len(reader)):
         with suppress(ValueError):
             scan = reader[i]

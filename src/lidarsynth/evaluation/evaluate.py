@@ -127,7 +127,7 @@ class _Run:
         """Of points: the protocol's into images of its own sensor; by rings into those that published programs take."""
         if sensor.name == self.protocol.sensor:
             return self.protocol.projection
-        return "unfolding" if sensor.name in GRIDS and not sensor.edges else "auto"
+        return "unfolding" if sensor.name.partition("/")[0] in GRIDS and not sensor.edges else "auto"
 
     def networks(self, sensor: Sensor) -> Loaded:
         return load_networks(self.protocol, sensor.width, self.device, self.on_images)
@@ -179,7 +179,7 @@ class _Run:
         chosen = select(self.protocol, role, images.names, count)
         numbers = part_of(chosen.numbers(), part)
         identity = [definition(self.protocol), role, sensor.to_dict(), images.stamp, loaded.weights, numbers]
-        identity += [] if sensor.width >= 1024 else [THINNED]  # drawn otherwise before
+        identity += [] if sensor.width >= 1024 else [f"{THINNED}, {self.projection(sensor)}"]  # drawn otherwise before
         limits = [sorted(part) for part in (chosen.features, chosen.bev, chosen.sets)]
         key = sha256(repr([*identity, *limits]).encode()).hexdigest()[:16]
         kept = cache_folder() / "statistics" / f"{self.protocol.name}-{key}{ENDING}" if images.stamp else None

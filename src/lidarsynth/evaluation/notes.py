@@ -10,7 +10,7 @@ from lidarsynth.evaluation.image_sets import ImageSet, stem_of
 from lidarsynth.evaluation.sample_tensors import beams_off
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 
 METRES = 1.5  # no outdoor scan ends so near
 LOOKED_AT = 8  # scans of a set, from everywhere, whether all are of one sensor
@@ -32,7 +32,7 @@ def unlike_sensors(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
     into, or than the other side's; of images their own beams tell."""
     taken = {side: names for side, images in sides.items() if images and (names := _sensors_of(images))}
     known = {name for names in taken.values() for name in names}
-    known |= {drawn.name} & SENSORS.keys()  # a user's own may be a unit of any of them
+    known |= {drawn.name} & WORDS.keys()  # a user's own may be a unit of any of them
     if not taken or all(same_kind(name, min(known)) for name in known):
         return ()
     told = " and ".join(f"{side} of {', '.join(names)}" for side, names in taken.items())

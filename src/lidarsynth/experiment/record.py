@@ -14,7 +14,7 @@ from lidarsynth.experiment.ranges import check_ranges, within
 class Data:
     """From scans to x_0."""
 
-    sensor: str | dict = "hdl-64e"  # a word of lidar.sensor.SENSORS, or a sensor of one's own as a table
+    sensor: str | dict = "hdl-64e"  # a word of lidar.sensor.WORDS, or a sensor of one's own as a table
     projection: str = "spherical"  # spherical | unfolding | auto
     height: int = within(64, 1, 4096)  # rows of the image
     width: int = within(1024, 4, 65_536)  # columns of the image

@@ -36,10 +36,14 @@ def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]
         return
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
-    folder.mkdir(parents=True, exist_ok=True)
     path, held, locked, tries = folder / LOCK, False, True, TRIES if shared else 1
     while not held:
-        with path.open("a+b") as file:  # NFS wants to read what is shared
+        folder.mkdir(parents=True, exist_ok=True)  # a shard that left nothing in it may have taken it away
+        try:
+            opened = path.open("a+b")  # NFS wants to read what is shared
+        except FileNotFoundError:
+            continue
+        with opened as file:
             try:
                 fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             except BlockingIOError:

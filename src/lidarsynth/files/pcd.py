@@ -70,10 +70,10 @@ def viewpoint(data: bytes) -> np.ndarray | None:
         place = np.array(words, np.float64)
     except ValueError:
         return None
-    length = np.linalg.norm(place[3:]) if place.shape == (7,) else 0.0
-    if not (np.isfinite(place).all() and length > 0):
+    if place.shape != (7,) or not np.isfinite(place).all() or not place[3:].any():
         return None
-    w, x, y, z = place[3:] / length
+    turn = place[3:] / np.abs(place[3:]).max()
+    w, x, y, z = turn / np.linalg.norm(turn)
     matrix = np.eye(4)
     matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

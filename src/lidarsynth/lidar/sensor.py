@@ -191,6 +191,7 @@ class Sensor:
 
     def inverted(self) -> Sensor:
         """The sensor hung upside down, as `vlp-32c-inverted`, in a frame whose z is up; its mount stays."""
+        end = self.width - 1  # what is to the left in one is to the right in the other
         edge = 2 * self.elevations[-1] - self.elevations[-2] if self.height > 1 else self.elevations[-1]
         lower = (*self.elevations[1:], edge) if self.edges else self.elevations
         return replace(
@@ -198,7 +199,7 @@ class Sensor:
             name=f"{self.name}-inverted",
             elevations=tuple(-angle for angle in reversed(lower)),
             offsets=tuple(-height for height in reversed(self.offsets)),
-            blocked=tuple((self.height - 1 - row, first, last) for row, first, last in self.blocked),
+            blocked=tuple((self.height - 1 - row, end - last, end - first) for row, first, last in self.blocked),
             dimness=self.dimness[::-1],
         )
 
@@ -380,4 +381,5 @@ def get_sensor(name: str | Sensor) -> Sensor:
         return WORDS[name]
     if Path(name).suffix in (".toml", ".json"):
         return read_sensor(name)
-    raise ValueError(f"expected a sensor of {', '.join(SENSORS)} or a .toml/.json sensor file, found {name!r}")
+    words = ", ".join([*SENSORS, *INVERTED, *GRIDS])
+    raise ValueError(f"expected a sensor of {words} or a .toml/.json sensor file, found {name!r}")

@@ -42,7 +42,8 @@ def standing(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Sensor:
     """The sensor as high above the road, and as tilted, as the returns of an image, known (H, W) bool, tell it is, to 5
     cm and a degree; what they do not tell, or what is within a fifth and three and a half degrees, stays."""
     places = np.flatnonzero(known & image.mask)
-    found = stance(sensor.points(image.range, places[:: max(1, -(-len(places) // SOME))]))
+    told = sensor.mount, *sensor.tilt
+    found = stance(sensor.points(image.range, places[:: max(1, -(-len(places) // SOME))]), told)
     if found is None:
         return sensor
     height, tilt = max(found[0], LOWEST), np.array(found[1:])
