@@ -145,11 +145,11 @@ R2DM_UPSAMPLING = EvaluationProtocol(
 )
 
 _VOXELS = "of the voxels of 0.1 m that points occupy, of each scan, averaged"
-ILN = EvaluationProtocol(
-    "iln-2022",
-    1,
-    "Kwon, Sung & Yoon, Implicit LiDAR network, ICRA 2022, and its program; also what TULIP (CVPR 2024) calls IoU",
-    (
+ILN = replace(
+    R2DM_UPSAMPLING,
+    name="iln-2022",
+    source="Kwon, Sung & Yoon, Implicit LiDAR network, ICRA 2022, and its program; TULIP (CVPR 2024) has the same IoU",
+    rows=(
         Row("range MAE", "range-mae-full", "mean over all pixels, cut at 100 m, no return as 100 m", unit="m"),
         Row("voxel IoU", "voxel-iou", f"intersection over union {_VOXELS}", None, 100, "%", 2),
         Row(
@@ -164,11 +164,7 @@ ILN = EvaluationProtocol(
         Row("voxel recall", "voxel-recall", f"share {_VOXELS} in the truth that are in the result", None, 100, "%", 2),
         Row("voxel F1", "voxel-f1", f"harmonic mean of both {_VOXELS}", None, 100, "%", 2),
     ),
-    near=0.0,
-    far=float("inf"),
-    gated=(),
-    samples=None,
-    pairs=True,
+    networks=(),
     notes=("points are those of pixels' rays, within the sensor's limits",),
 )
 
