@@ -123,8 +123,8 @@ def stance(xyz: np.ndarray, told: tuple[float, float, float] | None = None) -> t
 
     Metres, and degrees of pitch and roll. Of 64 streets of sensors 0.5 to 3.2 m up and 19 real scans, whole, in every
     second, fourth and eighth beam, and in one point in ten and in a hundred, it says something of 440 of 498: heights
-    are off by 0.03 m (median), and by more than a fifth once. Of 24 streets of sensors that are tilted by 7 to 15 degrees, 90 of
-    96: tilts are off by 1 degree (median), at most 2.
+    are off by 0.03 m (median), and by more than a fifth once. Of 24 streets of sensors that are tilted by 7 to 15
+    degrees, 90 of 96: tilts are off by 1 degree (median), at most 2.
     """
     if (points := _around(xyz[:: max(1, -(-len(xyz) // SOME))])) is None:
         return None

@@ -124,7 +124,7 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
 
 
 def _stands(height: float, nose: float, left: float) -> str:
-    """As `own-data.md` has it; a tilt that is a slope of the road's is not told."""
+    """Metres, and degrees of tilt, in the words of `sensor`; a tilt that may be a slope of the road is not told."""
     tilted = f", nose {nose:+.0f} and left side {left:+.0f} degrees up" if max(abs(nose), abs(left)) > LEANING else ""
     return f"about {height:.1f} m above the ground{tilted}"
 
