@@ -25,6 +25,7 @@ def data(
     seed: int = 0,
     intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
     apart: bool = False,
+    inside: bool = False,
 ) -> None:
     """Prepare a cache of range images for training; killed at any moment, the same command goes on.
 
@@ -43,6 +44,7 @@ def data(
         seed: of the synthetic streets.
         intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
         apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
+        inside: synthetic scans of rooms, halls and garages, for robots, the sensor as high as its mount says.
     """
     from lidarsynth.data.sources import prepare, shards, summary, unfit
 
@@ -50,7 +52,7 @@ def data(
     at_least(0, {"seed": seed, "workers": workers})
     if count is not None and count > MOST:
         raise ValueError(f"expected --count of at most {MOST:,} synthetic scans, found {count:,}")
-    more = (workers, count, check, seed, intensity, apart)
+    more = (workers, count, check, seed, intensity, apart, inside)
     there = shards(cache or root)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass

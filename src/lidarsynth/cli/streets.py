@@ -33,6 +33,7 @@ def streets(
     perfect: Annotated[
         bool, arg(help="as a simulator casts: every beam returns, no noise, no reflectance; `realise` makes it real.")
     ] = False,
+    inside: Annotated[bool, arg(help="rooms, halls and garages in place of streets, for robots.")] = False,
     traffic: Annotated[float, arg(help="moving vehicles, riders among them: 1 = as usual, 2 = twice, 0 = none.")] = 1.0,
     parking: Annotated[float, arg(help="parked vehicles, likewise; 0 = no car parks or bicycles either.")] = 1.0,
     pedestrians: Annotated[float, arg(help="likewise; 0.08 = the share of real scans, of which 1 has 14 times.")] = 1.0,
@@ -66,7 +67,7 @@ def streets(
             "walls": walls, "barriers": barriers, "panels": panels, "garages": garages,
             "riders": riders, "walkers": walkers, "racks": racks}  # fmt: skip
     density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
-    options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather)
+    options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, inside, density, weather)
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
     deque(counted((done, len(made)) for done in written), maxlen=0)

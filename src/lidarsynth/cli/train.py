@@ -15,7 +15,8 @@ from lidarsynth.training.options import Options
 def train(
     preset: Annotated[Positional[str], arg(help="such as default, r2dm-h, tiny.")],
     data: Annotated[
-        Path | None, arg(metavar="CACHE|synthetic|virtual|varied|recordings", help="or several, A,B; or streets.")
+        Path | None,
+        arg(metavar="CACHE|synthetic|virtual|varied|interiors|recordings", help="or several, A,B; or streets."),
     ] = None,
     out: Annotated[Path | None, arg(help="folder for weights and checkpoints; default runs/PRESET.")] = None,
     weights: Annotated[str | None, arg(name="from", metavar="MODEL", help="start from these weights.")] = None,

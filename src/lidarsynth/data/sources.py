@@ -90,6 +90,7 @@ def prepare(
     seed: int = 0,
     intensity: str = "auto",
     apart: bool = False,
+    inside: bool = False,
 ) -> Iterator[tuple[int, int]]:
     """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others.
 
@@ -101,9 +102,10 @@ def prepare(
                 raise ValueError(f"expected {word} with a data set, found it with synthetic, whose scans are cast")
         spec = SYNTHETIC if sensor is None else sensor
         wide, many = _width(width, spec, 1024), 1000 if count is None else count
-        return cache_synthetic(folder or root, many, spec, wide, seed, workers, check, apart)
-    if apart:
-        raise ValueError(f"expected --apart with synthetic, whose scans share worlds, found it with {name}")
+        return cache_synthetic(folder or root, many, spec, wide, seed, workers, check, apart, inside)
+    if apart or inside:
+        word = "--apart" if apart else "--inside"
+        raise ValueError(f"expected {word} with synthetic, whose worlds are drawn, found it with {name}")
     if count is not None:
         raise ValueError(f"expected -n with synthetic, of which there are endless ones, found it with {name}")
     if folder is None:
@@ -159,18 +161,23 @@ def cache_synthetic(
     workers: int | None = 0,
     check: bool = False,
     apart: bool = False,
+    inside: bool = False,
 ) -> Iterator[tuple[int, int]]:
     """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`.
 
-    apart  a world for each of them, for sets that are compared; else sixteen places in each, many times faster
+    apart   a world for each of them, for sets that are compared; else sixteen places in each, many times faster
+    inside  of buildings, not of streets (`streets.interiors`), the sensor `mount` above the floor
     A cache that tells no edition of its streets, as those of before 2026-11-26, is gone on with where it begins as
     today's streets do. Raises ValueError for one of other streets.
     """
+    from lidarsynth.streets.interiors import Buildings
     from lidarsynth.streets.reader import SyntheticStreets
 
     spec = _sensor(sensor, width)
-    streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart)
+    worlds = Buildings(seed, spec) if inside else None
+    streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart, worlds=worlds)
     source = {"name": "synthetic", "seed": seed} | ({"apart": True} if apart else {})
+    source |= {"inside": True} if inside else {}
     source |= {} if begins_alike(Path(folder), source, streets) else {"edition": EDITION}
     for done in write_cache(folder, streets.image, count, spec, source, workers=_processes(workers), check=check):
         yield done, count

@@ -15,6 +15,7 @@ from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import Box, boxes_of
 from lidarsynth.streets.drive import Drive, Moment, check_drives, draw_drive, parked_world
 from lidarsynth.streets.hdl64e import NAME
+from lidarsynth.streets.interiors import Buildings
 from lidarsynth.streets.moving import Bodies, MovingCaster
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.reader import FULL_TURN, Worlds, whole
@@ -24,6 +25,7 @@ from lidarsynth.streets.weather import CLEAR, Weather
 from lidarsynth.streets.world import POSES, World
 
 OUTLIER = np.uint32(1)  # returns of rain and fog
+FURNITURE = np.uint32(99)  # SemanticKITTI's other-object
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Options:
     deskewed  the carrier's own motion within a turn is taken out of the points, as odometry data sets have it, and
               boxes stand where the beams met them, as annotators put them around the points
     perfect   as a simulator casts: every beam reports exactly what it meets first, with a reflectance of 0
+    inside    places in buildings, not in streets: rooms, halls, garages, the sensor `mount` above the floor
     """
 
     frames: int = 0
@@ -43,6 +46,7 @@ class Options:
     speed: float | None = None
     deskewed: bool = False
     perfect: bool = False
+    inside: bool = False
     density: Density = TODAY
     weather: Weather = CLEAR
     optics: Optics = field(default=OPTICS)
@@ -53,6 +57,9 @@ class Options:
             raise ValueError(f"expected a rate of 0.1 to 100 turns per second, found {self.rate}")
         if self.perfect and self.weather != CLEAR:
             raise ValueError("expected clear weather of a perfect sensor, found rain or fog")
+        if self.inside and (self.frames or self.density != TODAY or self.weather != CLEAR):
+            raise ValueError("expected places of a building, in clear weather and as dense as they are, found drives, "
+                             "weather or densities, which only streets have")  # fmt: skip
         if self.frames == 0 and (self.speed is not None or self.deskewed):
             raise ValueError("expected the frames of a drive with a speed or deskewed points, found none: scans of "
                              "places stand still")  # fmt: skip
@@ -114,7 +121,7 @@ class LabelledStreets:
         full = sensor.name == NAME and sensor.width < FULL_TURN
         self.sensor = sensor.resized(width=FULL_TURN) if full else sensor
         self.seed, self.count, self.options = seed, count, options
-        self._worlds = Worlds(seed, sensor, density=options.density)
+        self._worlds = Buildings(seed, sensor) if options.inside else Worlds(seed, sensor, density=options.density)
         self._held: tuple[int, Any] | None = None
 
     def __len__(self) -> int:
@@ -218,6 +225,7 @@ class LabelledStreets:
         )
         raw = _raw(scan, numbers[:, order][hit], bodies, moment)
         raw = np.where((scan.label == 0) & (turn.face[:, order][hit] < 0), OUTLIER, raw)
+        raw = np.where((raw == 0) & self.options.inside, FURNITURE, raw)
         return Frame(scan, raw, boxes, to_world, stamp, number, k)
 
 

@@ -46,12 +46,16 @@ class Worlds:
 
     def __getitem__(self, number: int) -> tuple[World, Caster]:
         if number not in self._kept:
-            world = visible(build(np.random.default_rng((self.seed, number)), self.density), self.sensor)
+            world = self.build(number)
             world = _emptied(world, [CLASS_NUMBER[word] for word in self.without])
             if len(self._kept) >= 2:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[number] = (world, Caster(world.corners))
         return self._kept[number]
+
+    def build(self, number: int) -> World:
+        """The world of that number, as far as the sensor can see it."""
+        return visible(build(np.random.default_rng((self.seed, number)), self.density), self.sensor)
 
 
 class SyntheticStreets:

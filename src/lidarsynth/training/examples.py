@@ -6,7 +6,7 @@ import atexit
 import ctypes
 import signal
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from functools import lru_cache, partial
 from itertools import product
 from multiprocessing import active_children
@@ -32,24 +32,27 @@ PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
 SYNTHETIC = "synthetic"  # the word that stands for streets cast on the fly
 VIRTUAL = "virtual"  # the same, by virtual sensors that are drawn too
 VARIED = "varied"  # by virtual sensors too, in worlds of many densities
+INTERIORS = "interiors"  # by virtual sensors on robots, inside buildings
 RECORDINGS = "recordings"  # the same, by KITTI's sensor as it is on other days
-ENDLESS = (SYNTHETIC, VIRTUAL, VARIED, RECORDINGS)
+OF_ANY = frozenset((VIRTUAL, VARIED, INTERIORS))  # sensors
+ENDLESS = (SYNTHETIC, VIRTUAL, VARIED, INTERIORS, RECORDINGS)
 
 
 class Streets:
     """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
 
-    word  of ENDLESS: seen by `sensor`, by ones drawn from the seed (`VirtualStreets`, `VariedStreets`), or by KITTI's
-          on many days (`RecordedStreets`)
+    words  of ENDLESS, in turn world by world: seen by `sensor`, by ones drawn from the seed (`VirtualStreets`,
+           `VariedStreets`, `Interiors`), or by KITTI's on many days (`RecordedStreets`)
 
     Raises ImportError naming the extra when the ray caster is missing.
     """
 
-    def __init__(self, seed: int, sensor: Sensor, word: str = SYNTHETIC):
+    def __init__(self, seed: int, sensor: Sensor, words: Sequence[str] = (SYNTHETIC,)):
         self.seed = seed
         self.sensor = sensor
-        self.source = {"name": word, "seed": seed}
-        self._readers: dict[int, Any] = {}
+        self.words = tuple(words)
+        self.source = {"name": ",".join(words), "seed": seed}
+        self._readers: dict[tuple[int, str], Any] = {}
 
     def indices(self, step: int, batch_size: int) -> list[int]:
         """The scans of a step, each from another world; steps in a row go through the places of their worlds."""
@@ -59,27 +62,35 @@ class Streets:
 
     def name(self, i: int) -> Name:
         """What scan i is called."""
-        return Name(self.source["name"], f"seed {self.seed}", str(i))
+        return Name(self._word(i), f"seed {self.seed}", str(i))
 
     def take(self, indices: list[int]) -> list[RangeImage]:
         """Scans as images, with labels."""
         images = []
         for slot, index in enumerate(indices):  # a reader per slot, because a reader remembers only two worlds
-            if slot not in self._readers:
-                self._readers[slot] = self._reader()
-            images.append(self._readers[slot].image(index))
+            key = (slot, self._word(index))
+            if key not in self._readers:
+                self._readers[key] = self._reader(key[1])
+            images.append(self._readers[key].image(index))
         return images
 
-    def _reader(self) -> Any:
+    def _word(self, index: int) -> str:
+        """Where scan `index` is from."""
+        from lidarsynth.streets.world import POSES
+
+        return self.words[index // POSES % len(self.words)]
+
+    def _reader(self, word: str) -> Any:
+        from lidarsynth.streets.interiors import Interiors
         from lidarsynth.streets.reader import SyntheticStreets
         from lidarsynth.streets.recordings import RecordedStreets
         from lidarsynth.streets.varied import VariedStreets
         from lidarsynth.streets.virtual import VirtualStreets
 
-        word = self.source["name"]
         if word == SYNTHETIC:
             return SyntheticStreets(self.seed, 1 << 62, self.sensor)
-        return {VIRTUAL: VirtualStreets, VARIED: VariedStreets, RECORDINGS: RecordedStreets}[word](self.seed, 1 << 62)
+        drawn = {VIRTUAL: VirtualStreets, VARIED: VariedStreets, INTERIORS: Interiors, RECORDINGS: RecordedStreets}
+        return drawn[word](self.seed, 1 << 62)
 
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]."""
@@ -92,13 +103,19 @@ TrainingImages = CachedImages | SeveralCaches | Streets  # what a network can le
 def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> TrainingImages:
     """The images of a cache folder, or streets of `seed` (default the experiment's) for a word of ENDLESS.
 
-    Several folders, with commas between them, are seen equally often. Raises ValueError when one is no cache.
+    Several folders or words, with commas between them, are seen equally often. Raises ValueError for one of no cache.
     """
-    if str(data) in ENDLESS:
+    if words := words_of(data):
         seed = experiment.training.seed if seed is None else seed
-        return Streets(seed, build_sensor(experiment), str(data))
+        return Streets(seed, build_sensor(experiment), words)
     folders = folders_of(data)
     return CachedImages(data) if len(folders) == 1 else SeveralCaches(folders)
+
+
+def words_of(data: str | Path) -> tuple[str, ...]:
+    """The words of ENDLESS that are named with commas between them; () where anything else is."""
+    words = tuple(str(data).split(","))
+    return words if set(words) <= set(ENDLESS) else ()
 
 
 def folders_of(data: str | Path) -> list[str]:

@@ -9,7 +9,7 @@ from torch import nn
 from lidarsynth.data.dataset import SeveralCaches
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.training.examples import ENDLESS, Streets, folders_of, open_images
+from lidarsynth.training.examples import Streets, folders_of, open_images, words_of
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.task import Task
 
@@ -29,12 +29,12 @@ class Monitor:
         self._experiment = experiment
         self._task = task
         self._source = validation or data
-        held_out = validation is not None or str(data) in ENDLESS
+        held_out = validation is not None or bool(words_of(data))
         self._name = "validation" if held_out else "training_images"
         self._images: list[RangeImage] = []
         if validation is not None:  # now, and not in 5,000 steps
             open_images(validation, experiment, VALIDATION_SEED)
-            if str(data) not in ENDLESS and str(validation) not in ENDLESS:
+            if not words_of(data) and not words_of(validation):
                 SeveralCaches([*folders_of(data), *folders_of(validation)])  # refuses another sensor's
 
     def look(self, network: nn.Module, step: int, journal: Journal) -> None:

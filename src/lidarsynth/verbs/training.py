@@ -28,7 +28,7 @@ from lidarsynth.lidar.sensor import WORDS
 from lidarsynth.pictures.figure import compare
 from lidarsynth.systems.table import SYSTEMS, build_network, system_of, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import ENDLESS, SYNTHETIC, VARIED, VIRTUAL, TrainingImages, folders_of, open_images
+from lidarsynth.training.examples import OF_ANY, SYNTHETIC, Streets, TrainingImages, folders_of, open_images, words_of
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import DECAYS, Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
@@ -177,7 +177,8 @@ def _begin(
                          f"found {found.height} x {found.width}")  # fmt: skip
     with fixed_randomness(experiment.training.seed):
         network = build_network(experiment)
-    sensor = "" if images.source["name"] in (VARIED, VIRTUAL) else images.sensor.name
+    of_any = isinstance(images, Streets) and not OF_ANY.isdisjoint(images.words)
+    sensor = "" if of_any else images.sensor.name
     card = replace(experiment.card, data=begun.images, sensor=sensor)
     saved, note = newest_whole(out)
     if resume and not saved:
@@ -208,7 +209,7 @@ def _begin(
 
 def _gone_on(source: Experiment, weights: str, card: Card, data: str | Path) -> Card:
     """The card of a run that begins with the `weights` of `source`: what both learned from, and under which terms."""
-    licence, scans = card.licence or source.card.licence, str(data) not in ENDLESS and _holds_scans(data)
+    licence, scans = card.licence or source.card.licence, not words_of(data) and _holds_scans(data)
     told = source.card.data.removesuffix(UNTRUE_NOW) if scans else source.card.data
     before = f"what `{weights}` learned from" if weights in shipped() else told
     if scans and licence and not card.licence and not licence.startswith(TERMS):

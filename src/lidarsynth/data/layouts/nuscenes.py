@@ -19,7 +19,7 @@ from lidarsynth.data.layouts.layout import Content, Layout, Sizes, is_held_out, 
 from lidarsynth.data.layouts.nuscenes_tables import Shot, fixed_rows, lidarseg_path, scene_rows
 from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.streets.actors import KINDS
-from lidarsynth.streets.frame import Frame, LabelledStreets
+from lidarsynth.streets.frame import FURNITURE, Frame, LabelledStreets
 
 VERSION = "v1.0-trainval"
 TABLES = ("category", "attribute", "visibility", "sensor", "calibrated_sensor", "ego_pose", "log", "map", "scene",
@@ -64,7 +64,7 @@ def classes(frame: Frame) -> np.ndarray:
     """(N,) uint8 numbers of nuScenes-lidarseg."""
     assert frame.scan.label is not None
     table = np.zeros(1 << 16, np.uint8)
-    table[RAW] = CLASS
+    table[RAW], table[FURNITURE] = CLASS, CLASS[0]
     for kind in KINDS.values():
         table[[kind.raw, kind.moving]] = kind.nuscenes_index
     return table[frame.raw & 0xFFFF]

@@ -1,0 +1,155 @@
+"""Insides of buildings: floors, walls with doors, robots that stand clear, labelled sets of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lidarsynth.cli.main import main
+from lidarsynth.data.layouts import nuscenes
+from lidarsynth.experiment.presets import preset
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.floors import SMALLEST, Opening, draw_rooms, wall
+from lidarsynth.streets.frame import FURNITURE, LabelledStreets, Options
+from lidarsynth.streets.furniture import KINDS
+from lidarsynth.streets.interiors import Buildings, Interiors, building
+from lidarsynth.streets.raycast import Caster
+from lidarsynth.streets.shapes import join
+from lidarsynth.streets.weather import Weather
+from lidarsynth.training.examples import open_images, words_of
+
+pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
+
+ROBOT = Sensor("robot", tuple(np.linspace(22.5, -22.5, 32).tolist()), 256, 0.2, 60.0, mount=0.6)
+BUILDING, FLOOR, PERSON, CAR = (CLASS_NUMBER[word] for word in ("building", "other-ground", "person", "car"))
+
+
+def test_scans_depend_on_their_number_alone_and_share_sensors():
+    first, again = Interiors(5, 400), Interiors(5, 400)
+    late = again.image(33)
+    np.testing.assert_array_equal(first.image(2).range, again.image(2).range)
+    np.testing.assert_array_equal(first.image(33).range, late.range)
+    assert first.sensor(4) == first.sensor(7) != first.sensor(8)
+    sensors = [first.sensor(i).sensor for i in range(0, 400, 4)]
+    assert all(0.25 <= s.mount <= 1.8 and s.name != "hdl-64e-kitti" for s in sensors)
+    assert max(s.elevations[0] for s in sensors) > 30  # some look far up
+
+
+def test_one_stands_under_a_ceiling_on_a_floor_between_walls():
+    reader = LabelledStreets(3, 64, ROBOT, Options(inside=True, perfect=True))
+    seen = {"rooms": 0, "halls": 0}
+    for index in range(0, 64, 4):
+        scan = reader[index].scan
+        assert scan.label is not None
+        floor, up = scan.label == FLOOR, scan.xyz[:, 2] + ROBOT.mount
+        assert abs(np.median(up[floor])) < 0.06  # robots lean by half a degree
+        ceiling = (scan.label == BUILDING) & (up > 2.1)
+        level = np.quantile(up[ceiling], 0.99) if ceiling.sum() > 100 else 2.5
+        seen["rooms" if level < 4 else "halls"] += 1
+        assert level < 11 and up.min() > -1.5
+        assert np.linalg.norm(scan.xyz, axis=1).min() > 0.2
+        assert (scan.label == BUILDING).mean() > 0.15
+    assert min(seen.values()) > 0
+
+
+def test_robots_stand_in_the_open():
+    """Nobody's sensor is in a wall or a table: the nearest surface is a hand's breadth away, for nearly all."""
+    close = []
+    for number in range(24):
+        world = building(np.random.default_rng((1, number)))
+        caster = Caster(world.corners)
+        turn = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+        rays = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1).astype(np.float32)
+        for pose in world.poses:
+            origin = np.tile(np.float32((pose[0], pose[1], pose[2] + 0.6)), (len(rays), 1))
+            close.append(caster.cast(origin, rays)[1].min())
+    assert np.mean(np.array(close) > 0.2) > 0.97
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rooms_fill_the_plan_without_overlap(seed):
+    rng = np.random.default_rng(seed)
+    length, width = rng.uniform(9, 45), rng.uniform(6, 25)
+    rooms = draw_rooms(rng, length, width)
+    assert np.isclose(sum(room.area for room in rooms), length * width)
+    assert all(min(r.x1 - r.x0, r.y1 - r.y0) >= min(1.5, SMALLEST) - 1e-9 for r in rooms)
+    spots = rng.uniform((0, 0), (length, width), (200, 2))
+    inside = [sum(r.x0 <= x < r.x1 and r.y0 <= y < r.y1 for r in rooms) for x, y in spots]
+    assert inside == [1] * 200
+
+
+def test_one_sees_through_an_open_door_and_not_through_a_shut_one():
+    holes = [Opening(4.0, 5.0, 0.0, 2.0, "door"), Opening(1.0, 2.0, 0.0, 2.0), Opening(6.0, 8.0, 0.9, 2.0)]
+    caster = Caster(join(*wall(True, 3.0, (0.0, 10.0), 2.5, 0.1, "plaster", holes)).corners)
+
+    def far(x: float, z: float) -> float:
+        return float(caster.cast(np.array([[x, 0, z]], np.float32), np.array([[0, 1, 0]], np.float32))[1][0])
+
+    assert far(0.5, 1.0) == pytest.approx(2.9) and far(4.5, 1.0) == pytest.approx(2.98)
+    assert np.isinf(far(1.5, 1.0)) and far(1.5, 2.2) == pytest.approx(2.9)
+    assert far(7.0, 0.5) == pytest.approx(2.9) and np.isinf(far(7.0, 1.5)) and np.isinf(far(11.0, 1.0))
+
+
+def test_furniture_stands_on_the_floor():
+    rng = np.random.default_rng(0)
+    for kind, make in KINDS.items():
+        for _ in range(12):
+            corners = make(rng).corners
+            assert -1e-6 < corners[..., 2].min() < 0.25 and corners[..., 2].max() < 3.2, kind
+            assert np.abs(corners[..., :2]).max() < 3.0, kind
+
+
+def test_labelled_sets_have_instances_and_furniture(tmp_path):
+    reader, people = LabelledStreets(0, 96, ROBOT, Options(inside=True)), 0
+    for index in range(0, 96, 6):
+        frame = reader[index]
+        assert frame.scan.label is not None
+        raw = frame.raw & 0xFFFF
+        assert ((raw == FURNITURE) == (frame.scan.label == 0)).all()
+        of_things = np.isin(frame.scan.label, (PERSON, CAR))
+        assert ((frame.raw >> 16 > 0) == of_things).all()
+        assert {box.kind for box in frame.boxes} <= {"person", "car", "van"}
+        for box in frame.boxes:
+            inside = frame.scan.xyz[frame.raw >> 16 == box.instance]
+            low, high = box.corners().min(0) - 0.1, box.corners().max(0) + 0.1
+            assert len(inside) == box.points and ((inside > low) & (inside < high)).all()
+            people += box.kind == "person" and box.points > 0
+        assert (nuscenes.classes(frame)[raw == FURNITURE] == 29).all()  # static.other
+    assert people > 3
+
+
+@pytest.mark.parametrize("asked", [{"frames": 5}, {"weather": Weather(rain=3.0)}])
+def test_buildings_have_no_drives_and_no_weather(asked):
+    with pytest.raises(ValueError, match="expected places of a building"):
+        Options(inside=True, **asked)
+
+
+def test_a_cache_of_buildings_is_not_added_to_by_streets(tmp_path, capsys):
+    sensor, rooms = tmp_path / "robot.toml", tmp_path / "rooms"
+    sensor.write_text('name = "robot"\nbeams = 16\ntop = 20\nbottom = -20\nmax_range = 60\nmount = 0.5\n')
+    asked = ["data", "synthetic", str(rooms), "-n", "3", "--sensor", str(sensor), "--workers", "0"]
+    main([*asked, "--inside"])
+    assert json.loads((rooms / "index.json").read_text())["source"]["inside"] is True
+    of_files = ["data", "files", str(rooms), str(tmp_path / "c"), "--inside"]
+    for words, said in ((asked, "found one of {inside True}"), (of_files, "expected --inside with synthetic")):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        assert stopped.value.code == 2 and said in capsys.readouterr().err
+
+
+def test_words_take_turns_world_by_world():
+    images = open_images("varied,interiors", preset("default"))
+    assert words_of("varied,interiors") == ("varied", "interiors") and words_of("varied,elsewhere") == ()
+    indices = images.indices(0, 4)  # type: ignore[union-attr]
+    assert [images.name(i)[0] for i in indices] == ["varied", "interiors"] * 2
+    first = images.take(indices)[1]
+    np.testing.assert_array_equal(
+        first.range, Interiors(preset("default").training.seed, 1 << 40).image(indices[1]).range
+    )
+    assert images.source["name"] == "varied,interiors"
+
+
+def test_worlds_are_kept_whole():
+    worlds = Buildings(0, ROBOT)
+    assert len(worlds[0][0].corners) == len(building(np.random.default_rng((0, 0, 6))).corners)
