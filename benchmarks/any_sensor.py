@@ -7,6 +7,7 @@ python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that 
 python benchmarks/any_sensor.py floating SCAN...    new points where no surface is, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
 python benchmarks/any_sensor.py dense [--sensor vlp-16] [--mount 0.5] [--tilt 8 0]   streets in four times the beams
+python benchmarks/any_sensor.py inside              buildings that nothing was trained on, seen by virtual sensors
 python benchmarks/any_sensor.py responses           reflectance of held-out streets, reported in ways never trained on
 Each takes --models (words or folders).
 """
@@ -27,8 +28,10 @@ import lidarsynth as ls
 from lidarsynth.lidar.frame import parse_transform
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
+from lidarsynth.streets.interiors import Interiors
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import SHARING, VirtualStreets
+from lidarsynth.streets.world import POSES
 from lidarsynth.verbs.inputs import Reading, inputs_of
 
 AS_IT_IS = Reading()
@@ -158,6 +161,31 @@ def dense(name: str, models: Sequence[str], stance: Mapping[str, Any], count: in
     yield from (f"| {word} | {a:.3f} | {b:.4f} |" for word, (a, b) in totals.items())
 
 
+def inside(models: Sequence[str], count: int = 24) -> Iterator[str]:
+    """Metres / reflectance of hidden pixels, and of those that returned, in as many buildings; nobody is told how the
+    sensor stands."""
+    reader = Interiors(HELD_OUT, POSES * count)
+    seen = (reader.image(POSES * k) for k in range(count))
+    images = [replace(image, sensor=replace(image.sensor, mount=1.73, tilt=(0.0, 0.0))) for image in seen]
+    yield f"| {count} buildings | " + " | ".join((*RIVALS, *models)) + " |"
+    yield "|---" * (len(RIVALS) + len(models) + 1) + "|"
+    patterns: dict[str, Callable[[RangeImage, int], np.ndarray]] = {
+        "every 2nd beam": lambda image, _: every(image, 2),
+        "every 4th beam": lambda image, _: every(image, 4),
+        "one point in ten": lambda image, k: np.random.default_rng(k).random(image.shape) < 0.1,
+    }
+    for pattern, chosen in patterns.items():
+        cells = np.zeros((2, len(RIVALS) + len(models), 2))
+        for k, image in enumerate(images):
+            known = chosen(image, k)
+            for column, word in enumerate((*RIVALS, *models)):
+                filled = completed(word, image, known)
+                for row, hidden in enumerate((~known, ~known & image.mask)):
+                    cells[row, column] += mean_errors(filled, image, hidden) / count
+        for name, row in zip((pattern, "rays that returned"), cells, strict=True):
+            yield f"| {name} | " + " | ".join(f"{a:.3f} / {b:.4f}" for a, b in row) + " |"
+
+
 def responses(count: int = 8) -> Iterator[str]:
     """Reflectance of hidden returns against bilinear's, of streets that virtual sensors report otherwise: taken as it
     stands (a sensor file with a dimness of 0), and as the model finds out."""
@@ -205,7 +233,7 @@ REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str]], Iterator[str]]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=(*REPORTS, "dense", "responses"))
+    parser.add_argument("what", choices=(*REPORTS, "dense", "inside", "responses"))
     parser.add_argument("scans", nargs="*", type=Path)
     parser.add_argument("--models", nargs="+", default=["default"])
     parser.add_argument("--sensor", default="vlp-16")
@@ -218,7 +246,8 @@ def main() -> None:
     rings = None if args.rings is None else tuple(map(int, args.rings.split("-")))
     REPORTS["errors"] = partial(errors, returned=args.returned, reading=Reading(transform=args.transform, rings=rings))
     stance = {name: value for name, value in (("mount", args.mount), ("tilt", args.tilt)) if value is not None}
-    others = {"responses": responses, "dense": partial(dense, args.sensor, args.models, stance)}
+    others = {"responses": responses, "dense": partial(dense, args.sensor, args.models, stance),
+              "inside": partial(inside, args.models)}  # fmt: skip
     for line in others[args.what]() if args.what in others else REPORTS[args.what](args.scans, args.models):
         print(line, flush=True)
 

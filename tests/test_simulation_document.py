@@ -46,7 +46,7 @@ def test_the_walk_through_walks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         main(small(words)[1:])  # a refusal is a SystemExit
         said = capsys.readouterr().out
         assert "labelled scans of own" in said or words[1] != "streets"
-    for name in ("places", "detection", "drives", "scenes", "wet", "fog", "crowd", "perfect"):
+    for name in ("places", "detection", "drives", "scenes", "wet", "fog", "crowd", "indoors", "perfect"):
         assert (tmp_path / name / "overview.png").exists() and (tmp_path / name / "streets.json").exists(), name
     assert (tmp_path / "drives/sequences/00/poses.txt").read_text().count("\n") == 2
     tracks = json.loads((tmp_path / "drives/sequences/00/tracks.json").read_text())

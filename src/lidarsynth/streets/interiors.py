@@ -25,7 +25,7 @@ FLOORS, CEILINGS = ("sidewalk", "parking", "wall", "road", "cloth"), ("plaster",
 ROOMS = (("cabinet", 0.10, True), ("shelf", 0.08, True), ("sofa", 0.03, True), ("table", 0.09, False),
          ("chair", 0.16, False), ("goods", 0.05, False), ("stairs", 0.004, True))  # fmt: skip
 HALLS = (("goods", 0.03), ("cabinet", 0.01), ("table", 0.008), ("stairs", 0.001))
-CARS = 0.6  # share of a garage's places that are taken
+CARS, PLACE = 0.6, 2.5  # share of a garage's places that are taken; metres from one to the next
 LEVEL = 0.008  # radians, standard deviation of how robots lean
 WIDE = 0.25  # share of sensors that look far up and down, as those made for robots do
 BEHIND = 60.0  # m, what lies beyond a building's windows at most
@@ -86,10 +86,10 @@ class Site:
         self.meshes.append(shape)
         self.tints.append(float(np.clip(self.rng.normal(), -1.5, 2.2)))
 
-    def stand(self, shape: Mesh, x: float, y: float, yaw: float) -> bool:
-        """A mesh around its own middle, if nothing stands there yet."""
+    def stand(self, shape: Mesh, x: float, y: float, yaw: float, beside: float | None = None) -> bool:
+        """A mesh around its own middle, if nothing stands there yet; what is `beside` it may be as near, in metres."""
         reach = float(np.abs(shape.corners[..., :2]).max())
-        if any(np.hypot(x - a, y - b) < 0.7 * (reach + r) for a, b, r in self.taken):
+        if any(np.hypot(x - a, y - b) < (0.7 * (reach + r) if beside is None else beside) for a, b, r in self.taken):
             return False
         self.put(moved(shape, x, y, yaw=yaw))
         self.taken.append((x, y, reach))
@@ -186,7 +186,7 @@ def _stock(site: Site, room: Room, tall: float) -> None:
     _spots(site, room, int(rng.integers(0, 20)), "shelf", True)
     _people(site, room, rng.poisson(3))
     if rng.random() < 0.3:
-        _vehicle(site, *room.anywhere(rng), yaw=rng.uniform(0, 6.28))
+        _of_library(site, str(rng.choice(["van", "car"])), *room.anywhere(rng), yaw=rng.uniform(0, 6.28))
 
 
 def _park(site: Site, room: Room, tall: float) -> None:
@@ -195,9 +195,10 @@ def _park(site: Site, room: Room, tall: float) -> None:
     _pillars(site, room, tall, rng.uniform(5, 8.5), rng.uniform(0.2, 0.5))
     for y in np.arange(room.y0 + 2.7, room.y1 - 2.5, lane + 5.0):
         for row in (float(y), float(y) + lane):
-            for x in np.arange(room.x0 + 1.6, room.x1 - 1.5, 2.5):
+            for x in np.arange(room.x0 + 1.6, room.x1 - 1.5, PLACE):
                 if rng.random() < CARS and row < room.y1 - 2.4:
-                    _vehicle(site, float(x), row, np.pi / 2 * rng.choice([-1, 1]) + rng.normal(0, 0.02), tall)
+                    yaw = np.pi / 2 * rng.choice([-1, 1]) + rng.normal(0, 0.02)
+                    _of_library(site, "car", float(x), row, yaw, beside=0.9 * PLACE)
     _people(site, room, rng.poisson(1))
 
 
@@ -212,17 +213,15 @@ def _pillars(site: Site, room: Room, tall: float, step: float, thick: float) -> 
             site.stand(shape, float(x), float(y), 0.0)
 
 
-def _of_library(site: Site, kind: str, x: float, y: float, yaw: float, size: float = 1.0) -> None:
+def _of_library(
+    site: Site, kind: str, x: float, y: float, yaw: float, size: float = 1.0, beside: float | None = None
+) -> None:
     """One of the things that streets have, too, of any variant, where there is room for it."""
     variant = int(site.rng.integers(len(library()[kind])))
     shape = library()[kind][variant]
-    if site.stand(replace(shape, corners=shape.corners * np.float32(size)), x, y, yaw):
+    if site.stand(replace(shape, corners=shape.corners * np.float32(size)), x, y, yaw, beside):
         row = (x, y, 0.0, yaw, size, size, size, site.tints[-1])
         site.things.append((len(site.meshes) - 1, kind, variant, row))
-
-
-def _vehicle(site: Site, x: float, y: float, yaw: float, tall: float = 4.0) -> None:
-    _of_library(site, "van" if tall > 3 and site.rng.random() < 0.3 else "car", x, y, yaw)
 
 
 def _people(site: Site, room: Room, count: int) -> None:
