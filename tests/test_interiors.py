@@ -125,6 +125,11 @@ def test_buildings_have_no_drives_and_no_weather(asked):
         Options(inside=True, **asked)
 
 
+def test_kitti_s_car_does_not_fit():
+    with pytest.raises(ValueError, match="expected the sensor of a robot in buildings"):
+        LabelledStreets(0, 1, "hdl-64e-kitti", Options(inside=True))
+
+
 def test_a_cache_of_buildings_is_not_added_to_by_streets(tmp_path, capsys):
     sensor, rooms = tmp_path / "robot.toml", tmp_path / "rooms"
     sensor.write_text('name = "robot"\nbeams = 16\ntop = 20\nbottom = -20\nmax_range = 60\nmount = 0.5\n')

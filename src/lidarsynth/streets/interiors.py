@@ -60,7 +60,15 @@ class Interiors(VirtualStreets):
 
 
 class Buildings(Worlds):
-    """Buildings of a seed by number, as `Worlds`, but whole: little of one is out of sight."""
+    """Buildings of a seed by number, as `Worlds`, but whole: little of one is out of sight.
+
+    Raises ValueError as `Worlds`, and for KITTI's sensor, whose car does not fit.
+    """
+
+    def __init__(self, seed: int, sensor: Sensor):
+        if sensor.name == NAME:
+            raise ValueError(f"expected the sensor of a robot in buildings, such as vlp-16, found {NAME}, on its car")
+        super().__init__(seed, sensor)
 
     def build(self, number: int) -> World:
         """The building of that number."""

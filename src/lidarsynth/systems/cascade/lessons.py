@@ -107,7 +107,7 @@ def _as_told(sensor: Sensor, rng: np.random.Generator) -> Sensor:
     """The sensor as its user knows it."""
     tilt = (0.0, 0.0) if rng.random() < 0.3 else sensor.tilt
     mount = sensor.mount * math.exp(rng.normal(0, 0.1)) if rng.random() < 0.15 else sensor.mount
-    return replace(sensor, tilt=tilt, mount=float(np.clip(mount, 0.5, 3)))
+    return replace(sensor, tilt=tilt, mount=float(np.clip(mount, 0.2, 4)))
 
 
 def _less_rough(seen: Pixels, surface: np.ndarray | None, rng: np.random.Generator) -> Pixels:

@@ -52,6 +52,7 @@ from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, obse
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
+from lidarsynth.systems.cascade.unit import as_streets
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling, whole
 from lidarsynth.systems.known_pixels import sensor_that_made, with_known
@@ -135,7 +136,6 @@ class CascadeModel(AnySensorModel):
 
         sampler  of the grid: columns | ddpm | ddim | dpmpp-2m | heun; default columns, dpmpp-2m where steps are given
         steps    of diffusion, default 16; the fill takes one more
-
         Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """
         self._checked(n, steps, seed, sampler, batch_size, first)
@@ -173,7 +173,8 @@ class CascadeModel(AnySensorModel):
 
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
-        image = image.keep(known)  # on a blocked ray too, which is told as empty
+        recorded = image.keep(known)  # on a blocked ray too, which is told as empty
+        image, unit = as_streets(recorded, known, self.tuned)
         rng, lit = generators(how.seed, 1), bool(image.reflectance.any())
         own = replace(self._as_found(image, known), grain=SPECKLE)
         known = known | (self._blocked & ~image.mask)
@@ -188,13 +189,12 @@ class CascadeModel(AnySensorModel):
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
             rays, fill = own.response.told(rays_told(own.sensor)), self.network.surest
             with torch.autocast(self._device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-                response = tried(own.response, fill, image, known, reflectance, rays, self.tuned)
-            own = replace(own, response=response)
+                own = replace(own, response=tried(own.response, fill, image, known, reflectance, rays, self.tuned))
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = straight_in_gaps(settled(filled, image, told), told) if noise is None else filled
         shade = own.response.straightened(own.response.reported(filled.reflectance), image, known)
-        filled = replace(filled, reflectance=shade * filled.mask)
-        filled = with_known(filled if noise is None else noisy(filled, rng[0]), image, known, keep_reflectance=lit)
+        filled = replace(filled, reflectance=unit.read(shade, filled) * filled.mask)
+        filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
         return own._named([filled])[0]
 
