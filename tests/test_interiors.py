@@ -1,6 +1,7 @@
 """Insides of buildings: floors, walls with doors, robots that stand clear, labelled sets of them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from lidarsynth.data.layouts import nuscenes
 from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.streets.floors import SMALLEST, Opening, draw_rooms, wall
+from lidarsynth.streets.floors import SMALLEST, Opening, draw_rooms, wall, walls_between
 from lidarsynth.streets.frame import FURNITURE, LabelledStreets, Options
 from lidarsynth.streets.furniture import KINDS
 from lidarsynth.streets.interiors import Buildings, Interiors, building
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.shapes import join
 from lidarsynth.streets.weather import Weather
+from lidarsynth.streets.world import visible
 from lidarsynth.training.examples import open_images, words_of
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
@@ -121,12 +123,15 @@ def test_labelled_sets_have_instances_and_furniture(tmp_path):
 
 @pytest.mark.parametrize("asked", [{"frames": 5}, {"weather": Weather(rain=3.0)}])
 def test_buildings_have_no_drives_and_no_weather(asked):
-    with pytest.raises(ValueError, match="expected places of a building"):
+    with pytest.raises(
+        ValueError,
+        match="expected places of buildings, where nothing drives or rains, found",
+    ):
         Options(inside=True, **asked)
 
 
 def test_kitti_s_car_does_not_fit():
-    with pytest.raises(ValueError, match="expected the sensor of a robot in buildings"):
+    with pytest.raises(ValueError, match="expected a robot's sensor in buildings"):
         LabelledStreets(0, 1, "hdl-64e-kitti", Options(inside=True))
 
 
@@ -145,7 +150,7 @@ def test_a_cache_of_buildings_is_not_added_to_by_streets(tmp_path, capsys):
 
 def test_words_take_turns_world_by_world():
     images = open_images("varied,interiors", preset("default"))
-    assert words_of("varied,interiors") == ("varied", "interiors") and words_of("varied,elsewhere") == ()
+    assert words_of("varied,interiors") == ("varied", "interiors") and words_of("varied-elsewhere") == ()
     indices = images.indices(0, 4)  # type: ignore[union-attr]
     assert [images.name(i)[0] for i in indices] == ["varied", "interiors"] * 2
     first = images.take(indices)[1]
@@ -156,5 +161,43 @@ def test_words_take_turns_world_by_world():
 
 
 def test_worlds_are_kept_whole():
-    worlds = Buildings(0, ROBOT)
-    assert len(worlds[0][0].corners) == len(building(np.random.default_rng((0, 0, 6))).corners)
+    """Also what is farther than the sensor sees from every place."""
+    whole = building(np.random.default_rng((0, 4, 6)))
+    near = replace(ROBOT, max_range=3.0)
+    assert len(Buildings(0, near)[4][0].corners) == len(whole.corners) > len(visible(whole, near).corners)
+
+
+@pytest.mark.parametrize("mount", [2.1, 12.0])
+def test_no_sensor_stands_above_a_ceiling(mount):
+    with pytest.raises(ValueError, match="expected a mount of 0 to 2.1 m in buildings"):
+        Buildings(0, replace(ROBOT, mount=mount))
+
+
+def test_every_room_has_a_door_or_an_opening():
+    """From the middle of its floor one sees beyond its walls, at the height of a robot."""
+    rng, out = np.random.default_rng(3), []
+    for _ in range(12):
+        length, width = rng.uniform(14, 30), rng.uniform(10, 20)
+        rooms = draw_rooms(rng, length, width)
+        caster = Caster(join(*walls_between(rng, rooms, (length, width, 2.6), windows=False)).corners)
+        for room in rooms if len(rooms) > 1 else ():
+            seen = 0.0
+            for x, y in rng.uniform((room.x0 + 0.3, room.y0 + 0.3), (room.x1 - 0.3, room.y1 - 0.3), (12, 2)):
+                turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+                rays = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1).astype(np.float32)
+                far = caster.cast(np.tile(np.float32((x, y, 0.5)), (360, 1)), rays)[1]
+                ends = np.array((x, y)) + rays[:, :2] * far[:, None]
+                off = (ends < (room.x0 - 0.2, room.y0 - 0.2)) | (ends > (room.x1 + 0.2, room.y1 + 0.2))
+                seen = max(seen, off.any(1).mean())
+            out.append(seen > 0)
+    assert len(out) > 60 and np.mean(out) > 0.7  # a third of the doors is shut, one of several per room
+
+
+def test_mixed_words_and_folders_are_refused_by_name(tmp_path):
+    for data, other in (("varied,interior", "interior"), (f"interiors,{tmp_path / 'c'}", "c'"), ("interiors,", "''")):
+        with pytest.raises(ValueError, match=f"expected words of .* alone, or caches alone, found .*{other}"):
+            open_images(data, preset("default"))
+    with pytest.raises(
+        ValueError, match="expected streets of one sensor, such as synthetic, for the network conditional-unet"
+    ):
+        open_images("synthetic,interiors", preset("tiny"))

@@ -67,7 +67,9 @@ def streets(
             "walls": walls, "barriers": barriers, "panels": panels, "garages": garages,
             "riders": riders, "walkers": walkers, "racks": racks}  # fmt: skip
     density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
-    options = Options(frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, inside, density, weather)
+    options = Options(
+        frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather, inside=inside
+    )
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
     deque(counted((done, len(made)) for done in written), maxlen=0)

@@ -175,11 +175,11 @@ def _told(settings: dict[str, Any]) -> str:
 
 
 def _differing(these: Any, those: Any) -> Any:
-    """What of these settings is not in those, without what is equal."""
+    """What of these settings is otherwise in those, None where they have none, without what is equal."""
     if not (isinstance(these, dict) and isinstance(those, dict)):
         return these
-    keys = [key for key in these if key not in those or these[key] != those[key]]
-    return {key: _differing(these[key], those.get(key)) for key in keys}
+    keys = [key for key in (these | those) if key not in those or key not in these or these[key] != those[key]]
+    return {key: _differing(these.get(key), those.get(key)) for key in keys}
 
 
 def _put(path: Path, content: bytes | BinaryIO) -> None:

@@ -11,6 +11,7 @@ from lidarsynth.streets.shapes import Mesh, box
 WALLS = ("plaster", "plaster", "plaster", "wall", "stone", "door")
 SMALLEST = 2.4  # m, side of a room
 OFF = 0.7  # m, from walls to the middle of what stands free
+GAP = 0.12  # m, of a room's side that its wall takes, at most
 GLASS = 0.1  # share of the walls between rooms
 MISSING = 0.1  # share of the walls between rooms that are left out
 DOOR = (0.8, 1.1, 2.05)  # m, least and most width, height
@@ -29,15 +30,16 @@ class Room(NamedTuple):
         """Square metres."""
         return (self.x1 - self.x0) * (self.y1 - self.y0)
 
-    def anywhere(self, rng: np.random.Generator) -> tuple[float, float]:
-        """A place OFF the walls, or the middle of what is too narrow."""
-        sides = ((self.x0 + OFF, self.x1 - OFF), (self.y0 + OFF, self.y1 - OFF))
+    def anywhere(self, rng: np.random.Generator, reach: float = OFF) -> tuple[float, float]:
+        """A place so far, or OFF, from the walls, or the middle of what is too narrow."""
+        off = max(reach + GAP, OFF)
+        sides = ((self.x0 + off, self.x1 - off), (self.y0 + off, self.y1 - off))
         x, y = (float(rng.uniform(a, b)) if a < b else (a + b) / 2 for a, b in sides)
         return x, y
 
-    def beside_wall(self, rng: np.random.Generator, off: float) -> tuple[float, float, float]:
-        """x, y and yaw of something that looks into the room, its middle `off` metres from a wall."""
-        (x, y), side = self.anywhere(rng), int(rng.integers(4))
+    def beside_wall(self, rng: np.random.Generator, half: float, deep: float) -> tuple[float, float, float]:
+        """x, y and yaw of something `half` as long and `deep` metres to either side that looks into the room."""
+        (x, y), off, side = self.anywhere(rng, half), deep + GAP, int(rng.integers(4))
         return ((x, self.y0 + off, 0.0), (self.x1 - off, y, np.pi / 2), (x, self.y1 - off, np.pi),
                 (self.x0 + off, y, -np.pi / 2))[side]  # fmt: skip
 
@@ -88,13 +90,23 @@ def walls_between(
         meshes += wall(along_x, at, (0.0, stop), tall, thick, stuff, holes)
     glassy = rng.random() < GLASS
     for room in rooms:
-        for along_x, at, start, stop, edge in ((True, room.y1, room.x0, room.x1, width),
-                                               (False, room.x1, room.y0, room.y1, length)):  # fmt: skip
-            if at < edge - 0.01 and rng.random() >= MISSING:
-                pane = "glass" if glassy or rng.random() < GLASS / 2 else ""
-                holes = _doors(rng, start, stop, tall, pane)
-                meshes += wall(along_x, at, (start, stop), tall, thick / 2, inner, holes)
+        for along_x, at, edge in ((True, room.y1, width), (False, room.x1, length)):
+            beside = (_shared(room, other, along_x) for other in rooms) if at < edge - 0.01 else ()
+            for start, stop in filter(None, beside):
+                if rng.random() >= MISSING:
+                    pane = "glass" if glassy or rng.random() < GLASS / 2 else ""
+                    holes = _doors(rng, start, stop, tall, pane)
+                    meshes += wall(along_x, at, (start, stop), tall, thick / 2, inner, holes)
     return meshes
+
+
+def _shared(room: Room, other: Room, along_x: bool) -> tuple[float, float] | None:
+    """From where to where the upper or right side of a room is the lower or left one of the other."""
+    if (room.y1 if along_x else room.x1) != (other.y0 if along_x else other.x0):
+        return None
+    mine, theirs = ((r.x0, r.x1) if along_x else (r.y0, r.y1) for r in (room, other))
+    start, stop = max(mine[0], theirs[0]), min(mine[1], theirs[1])
+    return (start, stop) if stop > start + 0.01 else None
 
 
 def _windows(rng: np.random.Generator, stop: float, tall: float) -> list[Opening]:

@@ -46,10 +46,10 @@ class Options:
     speed: float | None = None
     deskewed: bool = False
     perfect: bool = False
-    inside: bool = False
     density: Density = TODAY
     weather: Weather = CLEAR
     optics: Optics = field(default=OPTICS)
+    inside: bool = False
 
     def __post_init__(self):
         object.__setattr__(self, "frames", whole("frames", self.frames, 0))
@@ -57,9 +57,12 @@ class Options:
             raise ValueError(f"expected a rate of 0.1 to 100 turns per second, found {self.rate}")
         if self.perfect and self.weather != CLEAR:
             raise ValueError("expected clear weather of a perfect sensor, found rain or fog")
-        if self.inside and (self.frames or self.density != TODAY or self.weather != CLEAR):
-            raise ValueError("expected places of a building, in clear weather and as dense as they are, found drives, "
-                             "weather or densities, which only streets have")  # fmt: skip
+        of_streets = {"frames of a drive": self.frames, "a density": self.density != TODAY,
+                      "rain or fog": self.weather != CLEAR}  # fmt: skip
+        if self.inside and (found := [word for word, given in of_streets.items() if given]):
+            raise ValueError(
+                f"expected places of buildings, where nothing drives or rains, found {' and '.join(found)}"
+            )
         if self.frames == 0 and (self.speed is not None or self.deskewed):
             raise ValueError("expected the frames of a drive with a speed or deskewed points, found none: scans of "
                              "places stand still")  # fmt: skip

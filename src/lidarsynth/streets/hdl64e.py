@@ -33,6 +33,8 @@ RING_DIP = (
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
+DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
+
 # Metres that each laser reads too far; the upper block measured on walls, the lower one within what the ground allows.
 RING_SHIFT = (
     0.005, -0.013, 0.031, -0.010, 0.006, -0.056, 0.048, -0.016, -0.022, 0.007, 0.027, -0.012, 0.019,
@@ -44,17 +46,17 @@ RING_SHIFT = (
 # How much more reflectance each laser reads than others, at 12 m, and how much more still per natural logarithm of
 # how many times as far it looks: what a network errs between known beams of 111 scans. Not cast into streets.
 RING_OFFSET = (
-    0.032, 0.000, 0.032, -0.050, 0.024, -0.020, 0.028, -0.017, 0.020, -0.014, -0.018, 0.021, 0.013,
-    -0.002, -0.002, -0.024, -0.017, 0.002, 0.003, -0.022, 0.021, -0.033, -0.009, 0.025, -0.022, -0.006,
-    0.022, -0.018, -0.008, -0.020, 0.002, 0.012, -0.019, -0.009, 0.003, -0.034, -0.026, 0.008, 0.010,
-    0.033, -0.012, -0.001, -0.009, -0.005, 0.054, 0.024, -0.021, 0.016, 0.040, -0.045, 0.075, -0.062,
-    -0.059, 0.034, 0.010, -0.092, 0.108, 0.067, -0.080, 0.032, 0.035, -0.114, -0.085, 0.050)
+    0.034, 0.010, 0.029, -0.052, 0.025, -0.020, 0.031, -0.017, 0.020, -0.017, -0.017, 0.021, 0.011,
+    -0.001, -0.007, -0.028, -0.022, 0.000, 0.003, -0.027, 0.014, -0.038, -0.009, 0.020, -0.025, -0.004,
+    0.019, -0.017, -0.008, -0.018, 0.001, 0.014, -0.015, -0.008, 0.000, -0.034, -0.030, 0.016, 0.016,
+    0.038, -0.001, 0.008, -0.014, 0.006, 0.063, 0.040, 0.000, 0.037, 0.052, -0.026, 0.075, -0.083,
+    -0.069, 0.039, 0.014, -0.097, 0.134, 0.080, -0.094, 0.061, 0.052, -0.146, -0.113, 0.017)
 RING_SLOPE = (
-    -0.042, 0.002, -0.043, 0.077, -0.081, 0.037, -0.058, 0.033, -0.040, 0.020, 0.007, -0.021, -0.041,
-    -0.002, 0.012, 0.013, 0.006, -0.006, -0.046, 0.036, -0.005, 0.033, -0.012, -0.058, 0.064, 0.000,
-    -0.031, 0.010, 0.024, 0.023, 0.030, 0.050, -0.159, -0.062, -0.047, -0.047, -0.013, -0.011, 0.000,
-    0.060, -0.032, -0.004, 0.005, -0.032, 0.081, 0.030, -0.045, 0.021, 0.057, -0.076, 0.081, -0.049,
-    -0.087, 0.040, 0.015, -0.122, 0.109, 0.051, -0.073, 0.044, 0.037, -0.126, -0.090, 0.044)
+    -0.044, -0.006, -0.042, 0.075, -0.085, 0.034, -0.062, 0.027, -0.043, 0.020, 0.003, -0.023, -0.042,
+    -0.006, 0.013, 0.013, 0.005, -0.007, -0.047, 0.039, -0.009, 0.035, -0.019, -0.056, 0.069, 0.002,
+    -0.022, 0.010, 0.020, 0.034, 0.030, 0.046, -0.148, -0.075, -0.065, -0.057, -0.020, -0.001, 0.005,
+    0.061, -0.016, 0.003, -0.001, -0.019, 0.088, 0.045, -0.021, 0.042, 0.069, -0.060, 0.074, -0.066,
+    -0.102, 0.045, 0.019, -0.136, 0.132, 0.062, -0.088, 0.073, 0.058, -0.163, -0.126, 0.007)
 
 # Outlines of what stands on the car's roof and hides the ground: for each part, (row, first column, last column) at
 # 1024 columns, row by row; and by how many columns every second laser of the lower block sees it shifted.
@@ -147,6 +149,17 @@ def misread(metres: np.ndarray) -> np.ndarray:
     far = np.log(np.maximum(metres, np.float32(1)) / np.float32(12))
     offset, slope = np.array([RING_OFFSET, RING_SLOPE], np.float32)[:, :, None]
     return offset + slope * far
+
+
+def dip(metres: np.ndarray) -> np.ndarray:
+    """(64, W) float32: how much less signal each laser of KITTI's unit reports at ranges (64, W) in metres."""
+    return np.array(RING_DIP, np.float32)[:, None] * dipped(metres)
+
+
+def dipped(metres: np.ndarray) -> np.ndarray:
+    """Share of a laser's dip at ranges of any shape, in metres."""
+    near = np.minimum((metres - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - metres) / (DIP[3] - DIP[2]))
+    return np.clip(near, 0, 1)
 
 
 def dimness(sensor: Sensor) -> Table:

@@ -28,6 +28,8 @@ HALLS = (("goods", 0.03), ("cabinet", 0.01), ("table", 0.008), ("stairs", 0.001)
 CARS, PLACE = 0.6, 2.5  # share of a garage's places that are taken; metres from one to the next
 LEVEL = 0.008  # radians, standard deviation of how robots lean
 WIDE = 0.25  # share of sensors that look far up and down, as those made for robots do
+TALL = {"rooms": (2.3, 3.8), "hall": (4.0, 10.0), "garage": (2.2, 3.0)}  # m, from floor to ceiling
+LOWEST = 2.1  # m, above which no sensor stands
 BEHIND = 60.0  # m, what lies beyond a building's windows at most
 CLEAR = 0.4  # m, between a robot's middle and what stands
 
@@ -42,7 +44,7 @@ class Interiors(VirtualStreets):
 
     def __init__(self, seed: int = 0, length: int = 1000):
         super().__init__(seed, length)
-        self._worlds = Buildings(seed, WIDEST)
+        self._worlds = Buildings(seed, replace(WIDEST, mount=1.0))
 
     def sensor(self, index: int) -> VirtualSensor:
         """The sensor of scan `index`."""
@@ -62,12 +64,17 @@ class Interiors(VirtualStreets):
 class Buildings(Worlds):
     """Buildings of a seed by number, as `Worlds`, but whole: little of one is out of sight.
 
-    Raises ValueError as `Worlds`, and for KITTI's sensor, whose car does not fit.
+    Raises ValueError for a sensor that is not below the lowest ceiling, and for KITTI's, whose car does not fit.
     """
 
     def __init__(self, seed: int, sensor: Sensor):
         if sensor.name == NAME:
-            raise ValueError(f"expected the sensor of a robot in buildings, such as vlp-16, found {NAME}, on its car")
+            raise ValueError(
+                f"expected a robot's sensor in buildings, such as --sensor vlp-16, found {NAME}, on its car"
+            )
+        if not 0 < sensor.mount < LOWEST:
+            raise ValueError(f"sensor {sensor.name}: expected a mount of 0 to {LOWEST:g} m in buildings, below their "
+                             f"ceilings, found {sensor.mount:g}")  # fmt: skip
         super().__init__(seed, sensor)
 
     def build(self, number: int) -> World:
@@ -108,7 +115,7 @@ def building(rng: np.random.Generator) -> World:
     """One building. The same generator state gives the same one."""
     site, draw = Site(rng), rng.random()
     kind = "rooms" if draw < 0.55 else "hall" if draw < 0.8 else "garage"
-    tall = float(rng.uniform(*{"rooms": (2.3, 3.8), "hall": (4.0, 10.0), "garage": (2.2, 3.0)}[kind]))
+    tall = float(rng.uniform(*TALL[kind]))
     size = {"rooms": ((9, 45), (6, 25)), "hall": ((18, 80), (12, 45)), "garage": ((20, 70), (16, 40))}[kind]
     length, width = (float(rng.uniform(*bounds)) for bounds in size)
     rooms = draw_rooms(rng, length, width) if kind == "rooms" else [Room(0.0, length, 0.0, width)]
@@ -137,8 +144,8 @@ def _under_ceiling(site: Site, room: Room, tall: float) -> None:
     rng, draw = site.rng, site.rng.random(3)
     if draw[0] < 0.6:
         step, size = rng.uniform(1.8, 4.0), (rng.uniform(0.1, 0.6), rng.uniform(0.6, 1.4))
-        for x in np.arange(room.x0 + step / 2, room.x1 - 0.3, step):
-            for y in np.arange(room.y0 + step / 2, room.y1 - 0.3, step):
+        for x in np.arange(room.x0 + step / 2, room.x1 - size[0] - 0.1, step):
+            for y in np.arange(room.y0 + step / 2, room.y1 - size[1] - 0.1, step):
                 site.put(box((x, x + size[0]), (y, y + size[1]), (tall - 0.08, tall), "lamp", "unlabeled"))
     if draw[1] < (0.3 if tall < 4 else 0.8):
         deep, step = rng.uniform(0.15, 0.6), rng.uniform(2.0, 7.0)
@@ -157,11 +164,11 @@ def _spots(site: Site, room: Room, count: int, shape_of: str, beside_walls: bool
     rng = site.rng
     for _ in range(count):
         shape = furniture.KINDS[shape_of](rng)
-        deep = float(np.abs(shape.corners[..., 1]).max())
+        flat = shape.corners[..., :2]
         if beside_walls:
-            x, y, yaw = room.beside_wall(rng, deep + 0.03)
+            x, y, yaw = room.beside_wall(rng, *(float(np.abs(flat[..., axis]).max()) for axis in (0, 1)))
         else:
-            x, y, yaw = *room.anywhere(rng), rng.uniform(0, 6.28)
+            x, y, yaw = *room.anywhere(rng, float(np.hypot(*flat.reshape(-1, 2).T).max())), rng.uniform(0, 6.28)
         site.stand(shape, x, y, yaw)
 
 
@@ -177,24 +184,24 @@ def _furnish(site: Site, room: Room, tall: float) -> None:
 
 
 def _stock(site: Site, room: Room, tall: float) -> None:
-    """A hall: pillars, racks in rows or machines, goods, people, now and then a van."""
+    """A hall: racks in rows or machines, pillars where there is room, goods, people, now and then a van."""
     rng = site.rng
-    _pillars(site, room, tall, rng.uniform(5, 14), float(rng.choice([0.0, 0.15, 0.3])))
     if rng.random() < 0.6:
         middle = (room.x0 + room.x1) / 2
         aisle, bays = rng.uniform(2.8, 5.0), max(1, int((room.x1 - room.x0 - rng.uniform(4, 10)) / 2.7))
         for y in np.arange(room.y0 + aisle, room.y1 - 1.5, aisle + 1.2):
-            high = min(tall - 0.5, rng.uniform(2, 7))
+            high = min(tall - 1.8, rng.uniform(2, 7))  # and what lies on top
             site.put(moved(furniture.rack(rng, bays, high), middle, float(y)))
             site.taken += [
                 (float(x), float(y), 0.7) for x in np.arange(middle - 1.35 * bays, middle + 1.35 * bays, 0.7)
             ]
+    _pillars(site, room, tall, rng.uniform(5, 14), float(rng.choice([0.0, 0.15, 0.3])))
     for kind, per in HALLS:
         _spots(site, room, min(int(rng.poisson(per * room.area)), 60), kind, False)
     _spots(site, room, int(rng.integers(0, 20)), "shelf", True)
     _people(site, room, rng.poisson(3))
     if rng.random() < 0.3:
-        _of_library(site, str(rng.choice(["van", "car"])), *room.anywhere(rng), yaw=rng.uniform(0, 6.28))
+        _of_library(site, str(rng.choice(["van", "car"])), *room.anywhere(rng, 2.5), yaw=rng.uniform(0, 6.28))
 
 
 def _park(site: Site, room: Room, tall: float) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsynth.streets.hdl64e import Lasers
+from lidarsynth.streets.hdl64e import Lasers, dipped
 from lidarsynth.streets.materials import NUMBER, TABLE
 from lidarsynth.streets.raycast import AnyCaster
 from lidarsynth.streets.surfaces import Met, surfaces
@@ -57,7 +57,6 @@ RESPONSE = (
 REPORTED = np.round(np.interp(np.arange(801) / 1000, *RESPONSE), 2).astype(np.float32)  # by signal in thousandths
 GRAZING = (0.13, 0.17)  # signal lost per natural logarithm of cos(incidence) below the second number
 FADE = (0.15, 0.11, 20.0)  # signal lost: a x + b x^2, x = ln(distance / 20 m) where positive
-DIP = (2.2, 4.0, 6.0, 9.5)  # metres over which near returns are read too dark: from, fully, until, no more
 VANISH = -0.14  # signal at which half of the returns vanish
 VANISH_WIDTH = 0.014
 GLASS = np.uint8(NUMBER["glass"])  # the material that lets beams pass
@@ -163,8 +162,7 @@ def sense(
     made_of = material.astype(np.intp)
     optics = [column.take(made_of, mode="wrap") for column in eye.table.T[:4]]
     strength = _signal(optics, tint, cosine, distance, lasers, eye.fade)
-    near = np.minimum((distance - DIP[0]) / (DIP[1] - DIP[0]), (DIP[3] - distance) / (DIP[3] - DIP[2]))
-    signal = strength - lasers.dip * np.clip(near, 0, 1)
+    signal = strength - lasers.dip * dipped(distance)
     gone, lossy = face < 0, np.flatnonzero(LOSSY.take(made_of, mode="wrap"))
     steady = _steady(first.take(lossy), lasers.number.take(lossy))
     gone[lossy] |= 0.7 * steady + 0.3 * chance[0].take(lossy) > 1 - TABLE[:, 4].take(made_of.take(lossy))

@@ -6,7 +6,7 @@ import atexit
 import ctypes
 import signal
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from functools import lru_cache, partial
 from itertools import product
 from multiprocessing import active_children
@@ -35,23 +35,24 @@ VARIED = "varied"  # by virtual sensors too, in worlds of many densities
 INTERIORS = "interiors"  # by virtual sensors on robots, inside buildings
 RECORDINGS = "recordings"  # the same, by KITTI's sensor as it is on other days
 OF_ANY = frozenset((VIRTUAL, VARIED, INTERIORS))  # sensors
+CASCADE = "cascade"  # the network that knows any
 ENDLESS = (SYNTHETIC, VIRTUAL, VARIED, INTERIORS, RECORDINGS)
 
 
 class Streets:
     """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
 
-    words  of ENDLESS, in turn world by world: seen by `sensor`, by ones drawn from the seed (`VirtualStreets`,
-           `VariedStreets`, `Interiors`), or by KITTI's on many days (`RecordedStreets`)
+    word  of ENDLESS, or several with commas between them, in turn world by world: seen by `sensor`, by ones drawn from
+          the seed (`VirtualStreets`, `VariedStreets`, `Interiors`), or by KITTI's on many days (`RecordedStreets`)
 
     Raises ImportError naming the extra when the ray caster is missing.
     """
 
-    def __init__(self, seed: int, sensor: Sensor, words: Sequence[str] = (SYNTHETIC,)):
+    def __init__(self, seed: int, sensor: Sensor, word: str = SYNTHETIC):
         self.seed = seed
         self.sensor = sensor
-        self.words = tuple(words)
-        self.source = {"name": ",".join(words), "seed": seed}
+        self.words = words_of(word)
+        self.source = {"name": ",".join(self.words), "seed": seed}
         self._readers: dict[tuple[int, str], Any] = {}
 
     def indices(self, step: int, batch_size: int) -> list[int]:
@@ -103,19 +104,26 @@ TrainingImages = CachedImages | SeveralCaches | Streets  # what a network can le
 def open_images(data: str | Path, experiment: Experiment, seed: int | None = None) -> TrainingImages:
     """The images of a cache folder, or streets of `seed` (default the experiment's) for a word of ENDLESS.
 
-    Several folders or words, with commas between them, are seen equally often. Raises ValueError for one of no cache.
+    Several folders or words, with commas between them, are seen equally often. Raises ValueError for one of no cache,
+    and for streets of many sensors where the network knows one alone.
     """
     if words := words_of(data):
+        if experiment.model.network != CASCADE and (other := OF_ANY.intersection(words)):
+            raise ValueError(f"{data}: expected streets of one sensor, such as {SYNTHETIC}, for the network "
+                             f"{experiment.model.network}, found {min(other)}, of many")  # fmt: skip
         seed = experiment.training.seed if seed is None else seed
-        return Streets(seed, build_sensor(experiment), words)
+        return Streets(seed, build_sensor(experiment), ",".join(words))
     folders = folders_of(data)
     return CachedImages(data) if len(folders) == 1 else SeveralCaches(folders)
 
 
 def words_of(data: str | Path) -> tuple[str, ...]:
-    """The words of ENDLESS that are named with commas between them; () where anything else is."""
-    words = tuple(str(data).split(","))
-    return words if set(words) <= set(ENDLESS) else ()
+    """The words of ENDLESS that are named with commas between them; () for folders. Raises ValueError for both."""
+    words = tuple(word.strip() for word in str(data).split(","))
+    others = [word for word in words if word not in ENDLESS]
+    if others and len(others) < len(words) and not Path(data).exists():
+        raise ValueError(f"{data}: expected words of {', '.join(ENDLESS)} alone, or caches alone, found {others[0]!r}")
+    return () if others else words
 
 
 def folders_of(data: str | Path) -> list[str]:

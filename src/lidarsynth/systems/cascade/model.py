@@ -174,9 +174,9 @@ class CascadeModel(AnySensorModel):
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
         """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
         recorded = image.keep(known)  # on a blocked ray too, which is told as empty
-        image, unit = as_streets(recorded, known, self.tuned)
-        rng, lit = generators(how.seed, 1), bool(image.reflectance.any())
-        own = replace(self._as_found(image, known), grain=SPECKLE)
+        rng, lit = generators(how.seed, 1), bool(recorded.reflectance.any())
+        own = replace(self._as_found(recorded, known), grain=SPECKLE)
+        image, unit = as_streets(recorded, known, own.response == AS_STREETS and not self.tuned)
         known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":

@@ -17,6 +17,7 @@ from lidarsynth.streets import hdl64e
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 MOST = 0.15  # reflectance by which a laser reads otherwise than its neighbours; more is of what they meet
 ENOUGH, PER_LASER = 500, 50  # pixels that tell; returns of a laser that counts
+SHOWN = 0.78  # of what is put onto streets, whole and in every second and fourth beam, so much is found
 UNTOLD = 0.5  # share where nothing tells: streets lose little by it
 
 
@@ -40,20 +41,20 @@ class Unit(NamedTuple):
         return np.float32(self.share) * hdl64e.misread(image.range)
 
 
-def as_streets(image: RangeImage, known: np.ndarray, tuned: bool = False) -> tuple[RangeImage, Unit]:
-    """The image as the streets' lasers would read it, and the unit that read it; as it is for a model that was `tuned`
-    to scans of the sensor."""
-    unit = Unit() if tuned else unit_of(image, known)
+def as_streets(image: RangeImage, known: np.ndarray, own: bool = True) -> tuple[RangeImage, Unit]:
+    """The image as the streets' lasers would read it, and the unit that read it; as it is if not `own`, where the
+    sensor reports otherwise, or the model has learned from its scans."""
+    unit = unit_of(image, known) if own else Unit()
     return unit.even(image), unit
 
 
 def unit_of(image: RangeImage, known: np.ndarray) -> Unit:
     """By the known returns of an image, known (H, W) bool; none of any other sensor than `hdl-64e-kitti`.
 
-    Where a laser and its known neighbours above and below meet one surface, it differs from their mean as they say, or
-    does not: the share is that of least squares.
+    Where a laser and its known neighbours above and below meet one surface, it differs from their mean as it would on
+    KITTI's unit, or does not: the share is that of least squares, beside what its dimness and its near dip do.
     """
-    if image.sensor.name != hdl64e.NAME or not image.reflectance.any():
+    if image.sensor.name != hdl64e.NAME or image.shape[0] != len(hdl64e.RING_OFFSET) or not image.reflectance.any():
         return Unit()
     lit = known & image.mask & (image.reflectance > 0)
     rows = np.flatnonzero(lit.sum(1) >= PER_LASER)
@@ -64,10 +65,11 @@ def unit_of(image: RangeImage, known: np.ndarray) -> Unit:
     alike = seen[:-2] & seen[1:-1] & seen[2:] & near[:-1] & near[1:]
     if np.count_nonzero(alike) < ENOUGH:
         return Unit(UNTOLD)
-    said = hdl64e.misread(image.range)[rows]
-    shade = image.reflectance[rows] + hdl64e.unevenness(image.sensor)[rows]
-    differs, should = (_off_neighbours(part)[alike].astype(np.float64) for part in (shade, said))
-    share = (should * differs.clip(-MOST, MOST)).sum() / max((should**2).sum(), 1e-9)
+    dim = np.broadcast_to(hdl64e.unevenness(image.sensor), image.shape)
+    parts = hdl64e.misread(image.range), dim, hdl64e.dip(image.range)
+    should = np.stack([_off_neighbours(part[rows])[alike] for part in parts], 1).astype(np.float64)
+    differs = _off_neighbours((image.reflectance + dim)[rows])[alike].clip(-MOST, MOST)
+    share = np.linalg.solve(should.T @ should + 1e-3 * np.eye(3), should.T @ differs)[0] / SHOWN
     return Unit(float(np.clip(share, 0, 1)))
 
 
