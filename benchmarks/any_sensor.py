@@ -28,7 +28,7 @@ import lidarsynth as ls
 from lidarsynth.lidar.frame import parse_transform
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
-from lidarsynth.streets.interiors import Interiors
+from lidarsynth.streets.interiors import interiors
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import SHARING, VirtualStreets
 from lidarsynth.streets.world import POSES
@@ -164,7 +164,7 @@ def dense(name: str, models: Sequence[str], stance: Mapping[str, Any], count: in
 def inside(models: Sequence[str], count: int = 24) -> Iterator[str]:
     """Metres / reflectance of hidden pixels, and of those that returned, in as many buildings; nobody is told how the
     sensor stands."""
-    reader = Interiors(HELD_OUT, POSES * count)
+    reader = interiors(HELD_OUT, POSES * count)
     seen = (reader.image(POSES * k) for k in range(count))
     images = [replace(image, sensor=replace(image.sensor, mount=1.73, tilt=(0.0, 0.0))) for image in seen]
     yield f"| {count} buildings | " + " | ".join((*RIVALS, *models)) + " |"

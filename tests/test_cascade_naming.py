@@ -200,22 +200,6 @@ def test_what_gets_more_is_named_more_often():
     np.testing.assert_array_equal(more[kept], plain[kept])
 
 
-def test_what_is_rather_of_none_has_no_class_unless_textures_are_asked_for():
-    """Furniture, for one: of no class that streets have."""
-    torch.manual_seed(0)
-    network = ClassUNet(8).eval()
-    for part in (network.classes.weight, network.classes.bias):
-        torch.nn.init.zeros_(part)
-    for logit, share in ((0.0, 1.0), (9.0, 0.0)):
-        with torch.no_grad():
-            network.classes.bias[0] = logit
-        image, texture = (named(network, [kerb(WIDE)], AS_STREETS, WIDE, alone=k)[0] for k in (False, True))
-        assert image.label is not None and texture.label is not None
-        assert (image.label[image.mask] > 0).mean() == share and (texture.label[texture.mask] > 0).all()
-    (sure,) = named(network, [kerb(WIDE)], AS_STREETS, WIDE, least=0.01, alone=True)
-    assert sure.label is not None and not sure.label.any()
-
-
 def test_pixels_of_a_surface_are_named_together_and_edges_stay():
     metres = torch.full((8, 32), 10.0)
     metres[:, 16:] = 12.0  # a step, and behind it another class

@@ -14,7 +14,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.floors import SMALLEST, Opening, draw_rooms, wall, walls_between
 from lidarsynth.streets.frame import FURNITURE, LabelledStreets, Options
 from lidarsynth.streets.furniture import KINDS
-from lidarsynth.streets.interiors import Buildings, Interiors, building
+from lidarsynth.streets.interiors import building, buildings, interiors
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.shapes import join
 from lidarsynth.streets.weather import Weather
@@ -28,7 +28,7 @@ BUILDING, FLOOR, PERSON, CAR = (CLASS_NUMBER[word] for word in ("building", "oth
 
 
 def test_scans_depend_on_their_number_alone_and_share_sensors():
-    first, again = Interiors(5, 400), Interiors(5, 400)
+    first, again = interiors(5, 400), interiors(5, 400)
     late = again.image(33)
     np.testing.assert_array_equal(first.image(2).range, again.image(2).range)
     np.testing.assert_array_equal(first.image(33).range, late.range)
@@ -155,7 +155,7 @@ def test_words_take_turns_world_by_world():
     assert [images.name(i)[0] for i in indices] == ["varied", "interiors"] * 2
     first = images.take(indices)[1]
     np.testing.assert_array_equal(
-        first.range, Interiors(preset("default").training.seed, 1 << 40).image(indices[1]).range
+        first.range, interiors(preset("default").training.seed, 1 << 40).image(indices[1]).range
     )
     assert images.source["name"] == "varied,interiors"
 
@@ -164,13 +164,13 @@ def test_worlds_are_kept_whole():
     """Also what is farther than the sensor sees from every place."""
     whole = building(np.random.default_rng((0, 4, 6)))
     near = replace(ROBOT, max_range=3.0)
-    assert len(Buildings(0, near)[4][0].corners) == len(whole.corners) > len(visible(whole, near).corners)
+    assert len(buildings(0, near)[4][0].corners) == len(whole.corners) > len(visible(whole, near).corners)
 
 
 @pytest.mark.parametrize("mount", [2.1, 12.0])
 def test_no_sensor_stands_above_a_ceiling(mount):
-    with pytest.raises(ValueError, match="expected a mount of 0 to 2.1 m in buildings"):
-        Buildings(0, replace(ROBOT, mount=mount))
+    with pytest.raises(ValueError, match=r"expected a mount of 0 to 2\.1 m in buildings"):
+        buildings(0, replace(ROBOT, mount=mount))
 
 
 def test_every_room_has_a_door_or_an_opening():

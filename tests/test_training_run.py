@@ -345,7 +345,9 @@ def test_a_run_from_shipped_weights_says_what_these_learned_from_and_under_which
         assert training_verb._gone_on(mine, "runs/mine", Card(data="more"), cache).licence == own + licence
     source = load_parts("default")[0]  # of a copy elsewhere, whose word says nothing
     copied = training_verb._gone_on(source, "./copy", Card(data="4 images of files"), cache).data
-    assert copied.startswith("synthetic streets alone") and copied.endswith(", then 4 images of files")
+    assert copied.startswith("synthetic streets and insides of buildings alone") and copied.endswith(
+        ", then 4 images of files"
+    )
     assert "no real scan" not in copied
     assert "no real scan" in training_verb._gone_on(source, "./copy", Card(data="4 images"), streets).data
 

@@ -63,17 +63,14 @@ def streets(
     from lidarsynth.streets.frame import LabelledStreets, Options
     from lidarsynth.streets.weather import Weather
 
-    more = {"groups": groups, "motorcycles": motorcycles, "works": works, "cyclists": cyclists, "heavy": heavy,
-            "walls": walls, "barriers": barriers, "panels": panels, "garages": garages,
-            "riders": riders, "walkers": walkers, "racks": racks}  # fmt: skip
-    density, weather = Density(traffic, parking, pedestrians, vegetation, kerbs=kerbs, **more), Weather(rain, fog)
-    options = Options(
-        frames, rate, None if speed is None else speed / 3.6, deskewed, perfect, density, weather, inside=inside
-    )
+    density = Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs, cyclists, heavy,
+                      walls, barriers, panels, garages, riders, walkers, racks)  # fmt: skip
+    weather, speed = Weather(rain, fog), speed and speed / 3.6
+    options = Options(frames, rate, speed, deskewed, perfect, density, weather, inside=inside)
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
     deque(counted((done, len(made)) for done in written), maxlen=0)
-    kept = f", more than -n {count} asks for" if made.count > count else ""
+    kept = f", more than -n {count} asks for" * (made.count > count)
     say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}{kept}")
     if picture:
         _picture(made, out / "overview.png")

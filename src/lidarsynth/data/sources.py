@@ -170,11 +170,11 @@ def cache_synthetic(
     A cache that tells no edition of its streets, as those of before 2026-11-26, is gone on with where it begins as
     today's streets do. Raises ValueError for one of other streets.
     """
-    from lidarsynth.streets.interiors import Buildings
+    from lidarsynth.streets.interiors import buildings
     from lidarsynth.streets.reader import SyntheticStreets
 
     spec = _sensor(sensor, width)
-    worlds = Buildings(seed, spec) if inside else None
+    worlds = buildings(seed, spec) if inside else None
     streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart, worlds=worlds)
     source = {"name": "synthetic", "seed": seed} | ({"apart": True} if apart else {})
     source |= {"inside": True} if inside else {}

@@ -15,7 +15,7 @@ from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import Box, boxes_of
 from lidarsynth.streets.drive import Drive, Moment, check_drives, draw_drive, parked_world
 from lidarsynth.streets.hdl64e import NAME
-from lidarsynth.streets.interiors import Buildings
+from lidarsynth.streets.interiors import buildings
 from lidarsynth.streets.moving import Bodies, MovingCaster
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.reader import FULL_TURN, Worlds, whole
@@ -124,7 +124,7 @@ class LabelledStreets:
         full = sensor.name == NAME and sensor.width < FULL_TURN
         self.sensor = sensor.resized(width=FULL_TURN) if full else sensor
         self.seed, self.count, self.options = seed, count, options
-        self._worlds = Buildings(seed, sensor) if options.inside else Worlds(seed, sensor, density=options.density)
+        self._worlds = buildings(seed, sensor) if options.inside else Worlds(seed, sensor, density=options.density)
         self._held: tuple[int, Any] | None = None
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ from lidarsynth.streets.hdl64e import NAME
 from lidarsynth.streets.objects import library
 from lidarsynth.streets.reader import Worlds
 from lidarsynth.streets.shapes import Mesh, box, frustum, join, moved
-from lidarsynth.streets.virtual import SHARING, WIDEST, VirtualSensor, VirtualStreets, draw_sensor
+from lidarsynth.streets.virtual import WIDEST, VirtualSensor, VirtualStreets, draw_sensor
 from lidarsynth.streets.world import POSES, STILL, THING, THINGS, World
 
 FLOORS, CEILINGS = ("sidewalk", "parking", "wall", "road", "cloth"), ("plaster", "plaster", "wall", "sidewalk")
@@ -34,52 +34,39 @@ BEHIND = 60.0  # m, what lies beyond a building's windows at most
 CLEAR = 0.4  # m, between a robot's middle and what stands
 
 
-class Interiors(VirtualStreets):
+def interiors(seed: int = 0, length: int = 1000) -> VirtualStreets:
     """As `VirtualStreets`, but every world is a building, and the sensor stands 0.25 to 1.8 m above its floor.
 
-    `len`, `sensor(i)`, `image(i)`, `pair(i)`. Walls and ceilings are building, floors other-ground, furniture is
-    unlabeled, as SemanticKITTI has no words for it. Scan i of a seed depends on nothing else. Raises as
-    `SyntheticStreets`.
+    Walls and ceilings are building, floors other-ground, furniture is unlabeled, as SemanticKITTI has no words for it.
     """
+    return VirtualStreets(seed, length, buildings(seed, replace(WIDEST, mount=1.0)), draw_robot)
 
-    def __init__(self, seed: int = 0, length: int = 1000):
-        super().__init__(seed, length)
-        self._worlds = Buildings(seed, replace(WIDEST, mount=1.0))
 
-    def sensor(self, index: int) -> VirtualSensor:
-        """The sensor of scan `index`."""
-        rng = np.random.default_rng((self.seed, index // SHARING, 5))
+def draw_robot(rng: np.random.Generator) -> VirtualSensor:
+    """A sensor of `draw_sensor`, but for KITTI's, near the floor; a quarter of them look far up and down."""
+    seen = draw_sensor(rng)
+    while seen.sensor.name == NAME:
         seen = draw_sensor(rng)
-        while seen.sensor.name == NAME:  # KITTI's car does not fit
-            seen = draw_sensor(rng)
-        sensor = replace(seen.sensor, mount=float(rng.uniform(0.25, 1.8)), min_range=float(rng.uniform(0.1, 0.7)))
-        if rng.random() < WIDE:
-            top, beams = rng.uniform(15, 50), int(rng.choice([16, 32, 64, 128]))
-            evenly = tuple(np.linspace(top, -rng.uniform(15, min(top, 48)), beams).tolist())
-            sensor = Sensor("virtual", evenly, sensor.width, sensor.min_range, sensor.max_range, mount=sensor.mount)
-            return VirtualSensor(sensor, replace(seen.optics, loss=(), dip=(), shift=()))
-        return replace(seen, sensor=sensor)
+    sensor = replace(seen.sensor, mount=float(rng.uniform(0.25, 1.8)), min_range=float(rng.uniform(0.1, 0.7)))
+    if rng.random() < WIDE:
+        top, beams = rng.uniform(15, 50), int(rng.choice([16, 32, 64, 128]))
+        evenly = tuple(np.linspace(top, -rng.uniform(15, min(top, 48)), beams).tolist())
+        sensor = Sensor("virtual", evenly, sensor.width, sensor.min_range, sensor.max_range, mount=sensor.mount)
+        return VirtualSensor(sensor, replace(seen.optics, loss=(), dip=(), shift=()))
+    return replace(seen, sensor=sensor)
 
 
-class Buildings(Worlds):
-    """Buildings of a seed by number, as `Worlds`, but whole: little of one is out of sight.
+def buildings(seed: int, sensor: Sensor) -> Worlds:
+    """Buildings of a seed by number, whole: little of one is out of sight.
 
     Raises ValueError for a sensor that is not below the lowest ceiling, and for KITTI's, whose car does not fit.
     """
-
-    def __init__(self, seed: int, sensor: Sensor):
-        if sensor.name == NAME:
-            raise ValueError(
-                f"expected a robot's sensor in buildings, such as --sensor vlp-16, found {NAME}, on its car"
-            )
-        if not 0 < sensor.mount < LOWEST:
-            raise ValueError(f"sensor {sensor.name}: expected a mount of 0 to {LOWEST:g} m in buildings, below their "
-                             f"ceilings, found {sensor.mount:g}")  # fmt: skip
-        super().__init__(seed, sensor)
-
-    def build(self, number: int) -> World:
-        """The building of that number."""
-        return building(np.random.default_rng((self.seed, number, 6)))
+    if sensor.name == NAME:
+        raise ValueError(f"expected a robot's sensor in buildings, such as --sensor vlp-16, found {NAME}, on its car")
+    if not 0 < sensor.mount < LOWEST:
+        raise ValueError(f"sensor {sensor.name}: expected a mount of 0 to {LOWEST:g} m in buildings, below their "
+                         f"ceilings, found {sensor.mount:g}")  # fmt: skip
+    return Worlds(seed, sensor, built=lambda number: building(np.random.default_rng((seed, number, 6))))
 
 
 @dataclass

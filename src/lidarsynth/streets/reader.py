@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from operator import index as index_of
 
@@ -34,27 +35,36 @@ def whole(name: str, number: int, least: int) -> int:
 class Worlds:
     """Worlds of a seed by number, without what `sensor` cannot see; the last two are kept.
 
+    built  makes the world of a number, whole; None = a street's
+
     Raises ValueError for a sensor that cannot stand on a road.
     """
 
-    def __init__(self, seed: int, sensor: Sensor, without: tuple[str, ...] = (), density: Density = TODAY):
+    def __init__(
+        self,
+        seed: int,
+        sensor: Sensor,
+        without: tuple[str, ...] = (),
+        density: Density = TODAY,
+        built: Callable[[int], World] | None = None,
+    ):
         if not 0 < sensor.mount < sensor.max_range:
             raise ValueError(f"sensor {sensor.name}: expected a mount above the road and within its range of it, 0 to "
                              f"{sensor.max_range:g} m, found {sensor.mount:g}")  # fmt: skip
         self.seed, self.sensor, self.without, self.density = seed, sensor, without, density
+        self._built = built or self._street
         self._kept: dict[int, tuple[World, Caster]] = {}
 
     def __getitem__(self, number: int) -> tuple[World, Caster]:
         if number not in self._kept:
-            world = self.build(number)
+            world = self._built(number)
             world = _emptied(world, [CLASS_NUMBER[word] for word in self.without])
             if len(self._kept) >= 2:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[number] = (world, Caster(world.corners))
         return self._kept[number]
 
-    def build(self, number: int) -> World:
-        """The world of that number, as far as the sensor can see it."""
+    def _street(self, number: int) -> World:
         return visible(build(np.random.default_rng((self.seed, number)), self.density), self.sensor)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,13 +34,23 @@ class VirtualStreets:
     """Streets seen by virtual sensors: `len`, `sensor(i) -> VirtualSensor`, `image(i) -> RangeImage` of that sensor,
     and `pair(i)` of it and what a perfect sensor would give.
 
+    worlds  of this seed, if other than streets
+    drawn   a sensor of a generator, `draw_sensor` if not given
+
     Four scans in a row share a sensor, sixteen a world. Scan i of a seed depends on nothing else. Raises as
     `SyntheticStreets`.
     """
 
-    def __init__(self, seed: int = 0, length: int = 1000):
+    def __init__(
+        self,
+        seed: int = 0,
+        length: int = 1000,
+        worlds: Worlds | None = None,
+        drawn: Callable[[np.random.Generator], VirtualSensor] | None = None,
+    ):
         self.seed, self.length = seed, length
-        self._worlds = Worlds(seed, WIDEST)
+        self._worlds = worlds or Worlds(seed, WIDEST)
+        self._drawn = drawn or draw_sensor
         self._streets: tuple[int, SyntheticStreets] | None = None
 
     def __len__(self) -> int:
@@ -47,7 +58,7 @@ class VirtualStreets:
 
     def sensor(self, index: int) -> VirtualSensor:
         """The sensor of scan `index`."""
-        return draw_sensor(np.random.default_rng((self.seed, index // SHARING, 2)))
+        return self._drawn(np.random.default_rng((self.seed, index // SHARING, 2)))
 
     def image(self, index: int) -> RangeImage:
         """(H, W) image of scan `index`, in the sensor of it, with the surfaces that its rays meet."""

@@ -43,7 +43,7 @@ class Streets:
     """Endless synthetic streets of one seed, cast when asked for; no two steps see the same scan.
 
     word  of ENDLESS, or several with commas between them, in turn world by world: seen by `sensor`, by ones drawn from
-          the seed (`VirtualStreets`, `VariedStreets`, `Interiors`), or by KITTI's on many days (`RecordedStreets`)
+          the seed (`VirtualStreets`, `VariedStreets`, `interiors`), or by KITTI's on many days (`RecordedStreets`)
 
     Raises ImportError naming the extra when the ray caster is missing.
     """
@@ -82,7 +82,7 @@ class Streets:
         return self.words[index // POSES % len(self.words)]
 
     def _reader(self, word: str) -> Any:
-        from lidarsynth.streets.interiors import Interiors
+        from lidarsynth.streets.interiors import interiors
         from lidarsynth.streets.reader import SyntheticStreets
         from lidarsynth.streets.recordings import RecordedStreets
         from lidarsynth.streets.varied import VariedStreets
@@ -90,7 +90,7 @@ class Streets:
 
         if word == SYNTHETIC:
             return SyntheticStreets(self.seed, 1 << 62, self.sensor)
-        drawn = {VIRTUAL: VirtualStreets, VARIED: VariedStreets, INTERIORS: Interiors, RECORDINGS: RecordedStreets}
+        drawn = {VIRTUAL: VirtualStreets, VARIED: VariedStreets, INTERIORS: interiors, RECORDINGS: RecordedStreets}
         return drawn[word](self.seed, 1 << 62)
 
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:

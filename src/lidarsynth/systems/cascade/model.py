@@ -323,10 +323,10 @@ class CascadeModel(AnySensorModel):
         """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         image = image.keep(known)
         own, told = self._as_found(image, known), known | (self._blocked & ~image.mask)
-        metres, shades = image.range[None], own.response.even(image.reflectance)[None]
-        pixels = known_of(metres, shades, told[None], True, padded(self.sensor))
-        filled, rays = own._network(pixels, None, doubt=True)
-        return signals(filled, rays)[0, :, : self.sensor.height, : self.sensor.width]
+        image, _ = as_streets(image, known, own.response == AS_STREETS and not self.tuned)
+        shades = own.response.even(image.reflectance)[None]
+        pixels = known_of(image.range[None], shades, told[None], True, padded(self.sensor))
+        return signals(*own._network(pixels, None, doubt=True))[0, :, : self.sensor.height, : self.sensor.width]
 
     def _fill(
         self,

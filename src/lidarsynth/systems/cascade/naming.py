@@ -36,7 +36,6 @@ GROWING = {"vegetation": 0.45, "terrain": 0.6}
 # Rows and columns on either side whose chances count as much as a pixel's own, where they are as far to this share of
 # the range: single pixels are of no class of their own (docs/training-default.md).
 BESIDE, AS_FAR = (1, 2), 0.02
-NOTHING = 0.5  # chance from which a return is rather of no class
 
 
 def weights() -> np.ndarray:
@@ -79,10 +78,10 @@ def named(
     alone: bool = False,
 ) -> list[RangeImage]:
     """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
-    there is none, where it is rather of none of these, as furniture is, or where the network is less sure than `least`.
+    there is none, or where the network is less sure of it than `least`.
 
     more   is added to the logits of these classes
-    alone  each pixel by itself, instead of with those beside it on its surface; all have a class then
+    alone  each pixel by itself, instead of with those beside it on its surface
     """
     off = FAIR * np.log(weights())
     for word, logit in (more or {}).items():
@@ -90,21 +89,17 @@ def named(
     rays = response.told(rays_told(sensor))
     with torch.autocast(next(network.parameters()).device.type, torch.bfloat16, enabled=precision == "bf16"):
         each = [_logits(network, image, response.even(image.reflectance), rays) for image in images]
-    off[0] = 0
-    taken = torch.from_numpy(off)[:, None, None].float()
+    taken = torch.from_numpy(off)[1:, None, None].float()  # 0 is no answer
     answers = [_likeliest(logits - taken, image, least, alone) for logits, image in zip(each, images, strict=True)]
     return [replace(image, label=label * image.mask) for image, label in zip(images, answers, strict=True)]
 
 
 def _likeliest(logits: Tensor, image: RangeImage, least: float, alone: bool) -> np.ndarray:
-    """(H, W) classes by logits (20, H, W), of nothing that has one first; 0 where all are less likely than `least`."""
-    single = logits.softmax(0)
-    chances = single if alone else of_surfaces(single, torch.from_numpy(image.range * image.mask))
-    label = chances[1:].argmax(0) + 1
-    if not alone:
-        label = label * (chances[0] <= NOTHING)
+    """(H, W) classes by logits (19, H, W) of those from 1 on; 0 where all are less likely than `least`."""
+    chances = logits if alone else of_surfaces(logits.softmax(0), torch.from_numpy(image.range * image.mask))
+    label = chances.argmax(0) + 1
     if least > 0:
-        label = label * (chances[1:].amax(0) >= least)
+        label = label * ((logits.softmax(0) if alone else chances).amax(0) >= least)
     return label.numpy()
 
 
@@ -126,7 +121,7 @@ def of_surfaces(chances: Tensor, metres: Tensor) -> Tensor:
 
 
 def _logits(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays) -> Tensor:
-    """(20, H, W) of every ray and class, told reflectances (H, W) as the streets' sensor would report
+    """(19, H, W) of every ray and the classes from 1 on, told reflectances (H, W) as the streets' sensor would report
     them. One image at a time: four at once take a quarter longer, and longer sums may round otherwise.
     """
     device, size = next(network.parameters()).device, (rays.elevation.shape[2], rays.elevation.shape[3])
@@ -137,7 +132,7 @@ def _logits(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays)
     parts = known.metres, known.reflectance, torch.from_numpy(around), *rays
     metres, shade, near, *told = (part.to(device) for part in parts)
     logits = network(around_the_turn(class_inputs(metres, shade, near, Rays(*told))))
-    return logits[0, :, :height, :width].float().cpu()
+    return logits[0, 1:, :height, :width].float().cpu()
 
 
 def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
