@@ -39,12 +39,15 @@ def test_what_is_read_otherwise_is_taken_off_and_put_on(streets: list[RangeImage
     assert Unit().even(streets[0]) is streets[0]
 
 
-@pytest.mark.parametrize("step", [1, 2, 4])
-def test_a_scan_shows_how_much_of_it_there_is(streets: list[RangeImage], step: int):
+@pytest.mark.parametrize("step", [1, 2, 4, None])
+def test_a_scan_shows_how_much_of_it_there_is(streets: list[RangeImage], step: int | None):
+    """In every beam, every second and fourth, and in one point in ten."""
+    scattered = np.random.default_rng(5).random(streets[0].shape) < 0.1
     for share in (0.0, 0.5, 1.0):
         read = (np.where(one.mask, Unit(share).read(one.reflectance, one), 0) for one in streets)
         seen = [replace(one, reflectance=shade) for one, shade in zip(streets, read, strict=True)]
-        assert np.mean([unit_of(one, every(one, step)).share for one in seen]) == pytest.approx(share, abs=0.32)
+        known = every(streets[0], step) if step else scattered
+        assert np.mean([unit_of(one, known).share for one in seen]) == pytest.approx(share, abs=0.32)
 
 
 def test_where_nothing_tells_it_is_half(streets: list[RangeImage]):

@@ -97,6 +97,8 @@ def own_car(sensor: Sensor) -> np.ndarray:
 
 
 Table = tuple[float, ...]
+Rows = slice | np.ndarray  # some of the lasers
+ALL = slice(None)
 
 
 class Lasers(NamedTuple):
@@ -144,16 +146,16 @@ def shifts(sensor: Sensor) -> np.ndarray:
     return np.asarray(RING_SHIFT if sensor.name == NAME else [0.0] * sensor.height, np.float32)[:, None]
 
 
-def misread(metres: np.ndarray) -> np.ndarray:
-    """(64, W) float32: how much more reflectance each laser of KITTI's own unit reads at ranges (64, W) in metres."""
+def misread(metres: np.ndarray, rows: Rows = ALL) -> np.ndarray:
+    """(R, W) float32: how much more reflectance lasers of KITTI's own unit, all or some, read at ranges (R, W) in m."""
     far = np.log(np.maximum(metres, np.float32(1)) / np.float32(12))
-    offset, slope = np.array([RING_OFFSET, RING_SLOPE], np.float32)[:, :, None]
+    offset, slope = np.array([RING_OFFSET, RING_SLOPE], np.float32)[:, rows, None]
     return offset + slope * far
 
 
-def dip(metres: np.ndarray) -> np.ndarray:
-    """(64, W) float32: how much less signal each laser of KITTI's unit reports at ranges (64, W) in metres."""
-    return np.array(RING_DIP, np.float32)[:, None] * dipped(metres)
+def dip(metres: np.ndarray, rows: Rows = ALL) -> np.ndarray:
+    """(R, W) float32: how much less signal lasers of KITTI's unit, all or some, report at ranges (R, W) in metres."""
+    return np.array(RING_DIP, np.float32)[rows, None] * dipped(metres)
 
 
 def dipped(metres: np.ndarray) -> np.ndarray:

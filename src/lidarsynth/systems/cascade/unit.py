@@ -16,7 +16,8 @@ from lidarsynth.streets import hdl64e
 
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 MOST = 0.15  # reflectance by which a laser reads otherwise than its neighbours; more is of what they meet
-ENOUGH, PER_LASER = 500, 50  # pixels that tell; returns of a laser that counts
+CELL = 4  # columns of a laser whose known returns are taken together, where they are of one surface
+ENOUGH = 150  # cells that tell
 SHOWN = 0.78  # of what is put onto streets, whole and in every second and fourth beam, so much is found
 UNTOLD = 0.5  # share where nothing tells: streets lose little by it
 
@@ -57,20 +58,29 @@ def unit_of(image: RangeImage, known: np.ndarray) -> Unit:
     if image.sensor.name != hdl64e.NAME or image.shape[0] != len(hdl64e.RING_OFFSET) or not image.reflectance.any():
         return Unit()
     lit = known & image.mask & (image.reflectance > 0)
-    rows = np.flatnonzero(lit.sum(1) >= PER_LASER)
-    if len(rows) < 3:
-        return Unit(UNTOLD)
-    seen, far = lit[rows], np.log(np.maximum(image.range[rows], 0.1))
-    near = np.abs(np.diff(far, axis=0)) < ALIKE
-    alike = seen[:-2] & seen[1:-1] & seen[2:] & near[:-1] & near[1:]
+    rows = np.flatnonzero(lit.any(1))
+    lit = lit[rows]
+    count = _cells(lit)
+    logs, shade = np.log(np.maximum(image.range[rows], 0.1)), image.reflectance[rows]
+    far, squares, shade = (_cells(part * lit) / np.maximum(count, 1) for part in (logs, logs**2, shade))
+    sound, near = (count > 0) & (squares - far**2 < ALIKE**2), np.abs(np.diff(far, axis=0)) < ALIKE
+    alike = sound[:-2] & sound[1:-1] & sound[2:] & near[:-1] & near[1:]
     if np.count_nonzero(alike) < ENOUGH:
         return Unit(UNTOLD)
-    dim = np.broadcast_to(hdl64e.unevenness(image.sensor), image.shape)
-    parts = hdl64e.misread(image.range), dim, hdl64e.dip(image.range)
-    should = np.stack([_off_neighbours(part[rows])[alike] for part in parts], 1).astype(np.float64)
-    differs = _off_neighbours((image.reflectance + dim)[rows])[alike].clip(-MOST, MOST)
+    metres, dim = np.exp(far), np.broadcast_to(hdl64e.unevenness(image.sensor)[rows], far.shape)
+    parts = hdl64e.misread(metres, rows), dim, hdl64e.dip(metres, rows)
+    one, two, three = (1 / count[k : len(count) - 2 + k][alike] for k in range(3))
+    surer = 1 / np.sqrt(two + (one + three) / 4)  # of cells of more returns
+    should = np.stack([_off_neighbours(part)[alike] * surer for part in parts], 1).astype(np.float64)
+    differs = _off_neighbours(shade + dim)[alike].clip(-MOST, MOST) * surer
     share = np.linalg.solve(should.T @ should + 1e-3 * np.eye(3), should.T @ differs)[0] / SHOWN
     return Unit(float(np.clip(share, 0, 1)))
+
+
+def _cells(part: np.ndarray) -> np.ndarray:
+    """(R, W // CELL) sums of (R, W) over the columns of each cell; what is left of a turn is left out."""
+    width = part.shape[1] // CELL * CELL
+    return part[:, :width].reshape(len(part), -1, CELL).sum(2, dtype=np.float32)
 
 
 def _off_neighbours(part: np.ndarray) -> np.ndarray:
