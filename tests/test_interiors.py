@@ -8,6 +8,7 @@ import pytest
 
 from lidarsynth.cli.main import main
 from lidarsynth.data.layouts import nuscenes
+from lidarsynth.data.street_sets import write_streets
 from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
@@ -165,6 +166,17 @@ def test_worlds_are_kept_whole():
     whole = building(np.random.default_rng((0, 4, 6)))
     near = replace(ROBOT, max_range=3.0)
     assert len(buildings(0, near)[4][0].corners) == len(whole.corners) > len(visible(whole, near).corners)
+
+
+def test_processes_share_a_set_of_buildings(tmp_path):
+    """The same files as one alone writes."""
+    streets = LabelledStreets(4, 20, replace(ROBOT, width=128), Options(inside=True))
+    for workers in (0, 2):
+        assert list(write_streets(tmp_path / str(workers), streets, "pcd", workers))[-1] == 20
+    names = [path.name for path in sorted((tmp_path / "0").glob("*.pcd"))]
+    assert len(names) == 20
+    for name in names:
+        assert (tmp_path / "0" / name).read_bytes() == (tmp_path / "2" / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("mount", [2.1, 12.0])

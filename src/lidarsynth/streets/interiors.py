@@ -6,6 +6,7 @@ Many small spinning LiDARs never see a road: they drive under a ceiling, between
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -66,7 +67,11 @@ def buildings(seed: int, sensor: Sensor) -> Worlds:
     if not 0 < sensor.mount < LOWEST:
         raise ValueError(f"sensor {sensor.name}: expected a mount of 0 to {LOWEST:g} m in buildings, below their "
                          f"ceilings, found {sensor.mount:g}")  # fmt: skip
-    return Worlds(seed, sensor, built=lambda number: building(np.random.default_rng((seed, number, 6))))
+    return Worlds(seed, sensor, built=partial(_numbered, seed))
+
+
+def _numbered(seed: int, number: int) -> World:
+    return building(np.random.default_rng((seed, number, 6)))
 
 
 @dataclass
