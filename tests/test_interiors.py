@@ -170,8 +170,8 @@ def test_worlds_are_kept_whole():
 
 def test_processes_share_a_set_of_buildings(tmp_path):
     """The same files as one alone writes."""
-    streets = LabelledStreets(4, 20, replace(ROBOT, width=128), Options(inside=True))
     for workers in (0, 2):
+        streets = LabelledStreets(4, 20, replace(ROBOT, width=128), Options(inside=True))
         assert list(write_streets(tmp_path / str(workers), streets, "pcd", workers))[-1] == 20
     names = [path.name for path in sorted((tmp_path / "0").glob("*.pcd"))]
     assert len(names) == 20
