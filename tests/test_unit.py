@@ -11,6 +11,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.streets import hdl64e
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.response import AS_STREETS, Response
 from lidarsynth.systems.cascade.unit import UNTOLD, Unit, as_streets, unit_of
 
 KITTI = SENSORS["hdl-64e-kitti"]
@@ -62,8 +63,10 @@ def test_other_sensors_models_tuned_to_kitti_and_scans_without_reflectance_stay(
     image, known = streets[0], every(streets[0], 2)
     other = replace(image, sensor=replace(KITTI, name="another"))
     dark = replace(image, reflectance=np.zeros_like(image.reflectance))
-    for one, own in ((other, True), (image, False), (dark, True)):
-        even, unit = as_streets(one, known, own)
+    darker = Response(scale=2.0)
+    for one, response, tuned in ((other, AS_STREETS, False), (image, AS_STREETS, True), (image, darker, False),
+                                 (dark, AS_STREETS, False)):  # fmt: skip
+        even, unit = as_streets(one, known, response, tuned)
         assert even is one and unit == Unit()
 
 

@@ -70,7 +70,7 @@ def streets(
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
     deque(counted((done, len(made)) for done in written), maxlen=0)
-    kept = f", more than -n {count} asks for" * (made.count > count)
+    kept = f", more than -n {count} asks for" if made.count > count else ""
     say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}{kept}")
     if picture:
         _picture(made, out / "overview.png")

@@ -160,13 +160,12 @@ def _seen(
 
 def _is_floor(xyz: np.ndarray, seen: tuple[tuple[float, float, float], np.ndarray, np.ndarray]) -> bool:
     """Whether what was seen inside is no roof of a carrier: it goes on, and nothing lies below it."""
-    (height, pitch, roll), low, on = seen
-    rho = np.hypot(xyz[:, 0], xyz[:, 1])
-    points = xyz[(rho > INSIDE[0]) & (rho < OUTSIDE[1])].astype(np.float64)
-    under = points[:, 2] + points[:, :2] @ np.tan(np.radians([pitch, roll])) + height < -BELOW * _near(points)
+    stands, low, on = seen
+    points = _around(xyz, (INSIDE[0], OUTSIDE[1]))
+    assert points is not None  # there were enough inside
+    under = _above(points, *stands) < -BELOW * _near(points)
     farthest = np.zeros(DIRECTIONS)
-    sector = ((np.arctan2(low[on, 1], low[on, 0]) / np.pi + 1) * (DIRECTIONS / 2)).astype(int) % DIRECTIONS
-    np.maximum.at(farthest, sector, np.hypot(low[on, 0], low[on, 1]))
+    np.maximum.at(farthest, _sector(low[on]), np.hypot(low[on, 0], low[on, 1]))
     return bool(under.mean() <= UNDER and np.median(farthest[farthest > 0]) >= ROOF)
 
 
@@ -179,8 +178,12 @@ def _around(xyz: np.ndarray, reach: tuple[float, float] = OUTSIDE) -> np.ndarray
 
 def _on(low: np.ndarray, height: float, pitch: float, roll: float) -> np.ndarray:
     """(N,) bool: which of the lowest points are on the ground of a sensor that stands so."""
-    slopes = np.tan(np.radians([pitch, roll]))
-    return np.abs(low[:, 2] + low[:, :2] @ slopes + height) < _near(low)
+    return np.abs(_above(low, height, pitch, roll)) < _near(low)
+
+
+def _above(points: np.ndarray, height: float, pitch: float, roll: float) -> np.ndarray:
+    """(N,) metres of points (N, 3) above the ground of a sensor that stands so."""
+    return points[:, 2] + points[:, :2] @ np.tan(np.radians([pitch, roll])) + height
 
 
 def _near(low: np.ndarray) -> np.ndarray:
@@ -199,12 +202,17 @@ def _tilted(low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _lowest(points: np.ndarray, reach: tuple[float, float] = OUTSIDE) -> tuple[np.ndarray, np.ndarray]:
     """(N, 3) the lowest point of each cell that has any, and (N,) the direction of each."""
     rho = np.hypot(points[:, 0], points[:, 1])
-    sector = ((np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1) * (DIRECTIONS / 2)).astype(int) % DIRECTIONS
+    sector = _sector(points)
     near, far = reach
     cell = sector * STEPS + (np.log(rho / near) / np.log(far / near) * STEPS).astype(int).clip(0, STEPS - 1)
     order = np.lexsort((points[:, 2], cell))
     first = order[np.flatnonzero(np.diff(cell[order], prepend=-1))]
     return points[first], sector[first]
+
+
+def _sector(points: np.ndarray) -> np.ndarray:
+    """(N,) the direction of each of the points (N, 3), of DIRECTIONS."""
+    return ((np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1) * (DIRECTIONS / 2)).astype(int) % DIRECTIONS
 
 
 def _on_most(low: np.ndarray, tilts: Iterable[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ class Room(NamedTuple):
         return (self.x1 - self.x0) * (self.y1 - self.y0)
 
     def anywhere(self, rng: np.random.Generator, reach: float = OFF) -> tuple[float, float]:
-        """A place so far, or OFF, from the walls, or the middle of what is too narrow."""
+        """x, y of a place `reach` metres off the sides of the walls, or more, or the middle of what is too narrow."""
         off = max(reach + GAP, OFF)
         sides = ((self.x0 + off, self.x1 - off), (self.y0 + off, self.y1 - off))
         x, y = (float(rng.uniform(a, b)) if a < b else (a + b) / 2 for a, b in sides)

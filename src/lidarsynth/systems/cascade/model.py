@@ -176,7 +176,7 @@ class CascadeModel(AnySensorModel):
         recorded = image.keep(known)  # on a blocked ray too, which is told as empty
         rng, lit = generators(how.seed, 1), bool(recorded.reflectance.any())
         own = replace(self._as_found(recorded, known), grain=SPECKLE)
-        image, unit = as_streets(recorded, known, own.response == AS_STREETS and not self.tuned)
+        image, unit = as_streets(recorded, known, own.response, self.tuned)
         known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
@@ -323,7 +323,7 @@ class CascadeModel(AnySensorModel):
         """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         image = image.keep(known)
         own, told = self._as_found(image, known), known | (self._blocked & ~image.mask)
-        image, _ = as_streets(image, known, own.response == AS_STREETS and not self.tuned)
+        image, _ = as_streets(image, known, own.response, self.tuned)
         shades = own.response.even(image.reflectance)[None]
         pixels = known_of(image.range[None], shades, told[None], True, padded(self.sensor))
         return signals(*own._network(pixels, None, doubt=True))[0, :, : self.sensor.height, : self.sensor.width]

@@ -13,12 +13,13 @@ import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
+from lidarsynth.systems.cascade.response import AS_STREETS, Response
 
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 MOST = 0.15  # reflectance by which a laser reads otherwise than its neighbours; more is of what they meet
 CELL = 4  # columns of a laser whose known returns are taken together, where they are of one surface
 ENOUGH = 150  # cells that tell
-SHOWN = 0.78  # of what is put onto streets, whole and in every second and fourth beam, so much is found
+SHOWN = 0.78  # of what is put onto streets, of all beams, every second and fourth, one point in ten, so much is found
 UNTOLD = 0.5  # share where nothing tells: streets lose little by it
 
 
@@ -42,10 +43,12 @@ class Unit(NamedTuple):
         return np.float32(self.share) * hdl64e.misread(image.range)
 
 
-def as_streets(image: RangeImage, known: np.ndarray, own: bool = True) -> tuple[RangeImage, Unit]:
-    """The image as the streets' lasers would read it, and the unit that read it; as it is if not `own`, where the
-    sensor reports otherwise, or the model has learned from its scans."""
-    unit = unit_of(image, known) if own else Unit()
+def as_streets(
+    image: RangeImage, known: np.ndarray, response: Response = AS_STREETS, tuned: bool = False
+) -> tuple[RangeImage, Unit]:
+    """The image (H, W), known (H, W) bool, as the streets' lasers would read it, and the unit that read it; as it is
+    where the sensor reports otherwise, by its response, or the model was `tuned` to its scans."""
+    unit = unit_of(image, known) if response == AS_STREETS and not tuned else Unit()
     return unit.even(image), unit
 
 
