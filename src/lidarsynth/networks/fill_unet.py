@@ -150,8 +150,8 @@ class FillUNet(nn.Module):
         with torch.no_grad():
             even = (known.reflectance + rays.dimness) * known.lit
             guesses = candidates(known.metres, even, known.returned, known.lit, rays, bend)
-            x = _to_patches(inputs(known, rays, guesses, noise))
-        top = h = self.stem(x)
+            x = inputs(known, rays, guesses, noise)
+        top = h = _of_patches(self.stem, x)
         kept = []
         for stage in self.down:
             if isinstance(stage, Halve):
@@ -163,7 +163,7 @@ class FillUNet(nn.Module):
             h = F.interpolate(join(h), scale_factor=2, mode="nearest")
             h = _through(stage, torch.cat([h, kept.pop()], 1))
         h = F.silu(self.head(torch.cat([h, top], 1)))
-        out = _to_pixels(self.out(h))
+        out = _to_pixels(self.out, h)
         filled, shares = _assemble(out, guesses, noise, noise if lost is None else lost, rays.dimness, self.training)
         if not self.training:
             filled = filled._replace(code=_snapped(filled.code, guesses, reach))
@@ -173,7 +173,7 @@ class FillUNet(nn.Module):
             return filled
         if self.classes is None:
             raise ValueError("expected a network that has learned classes, found one without")
-        return filled._replace(classes=_to_pixels(self.classes(h)))
+        return filled._replace(classes=_to_pixels(self.classes, h))
 
 
 def _through(blocks: nn.Module, h: Tensor) -> Tensor:
@@ -268,17 +268,18 @@ def draw_coherent(shape: tuple[int, int, int], rng: torch.Generator | None = Non
     return torch.cat([F.conv2d(pixel, kernel[None, None]), noise[:, 1:]], 1)
 
 
-def _to_patches(x: Tensor) -> Tensor:
-    """(B, C, H, W) -> (B, 8 C, H / 4, W / 2), channels last in memory: one transposed matrix, then whole runs."""
-    b, c, h, w = x.shape
-    rows = x.transpose(0, 1).reshape(c, -1).t().contiguous()
-    runs = rows.view(b, h // STEM[0], STEM[0], w // STEM[1], STEM[1] * c).transpose(2, 3)
-    return runs.reshape(b, h // STEM[0], w // STEM[1], -1).permute(0, 3, 1, 2)
+def _of_patches(matrix: Pointwise, x: Tensor) -> Tensor:
+    """(B, C, H, W) -> (B, D, H / 4, W / 2): patches of `STEM` through one matrix (D, 8 C), of which each row has the
+    pixels of a patch one after the other."""
+    kernel = matrix.weight.view(len(matrix.weight), *STEM, x.shape[1]).permute(0, 3, 1, 2)
+    return F.conv2d(x, kernel, matrix.bias, STEM)
 
 
-def _to_pixels(x: Tensor) -> Tensor:
-    """The inverse of `_to_patches`."""
-    b, c, h, w = x.shape
-    runs = x.permute(0, 2, 3, 1).reshape(b, h, w, STEM[0], c // STEM[0]).transpose(2, 3)
-    rows = runs.reshape(b * h * STEM[0] * w * STEM[1], c // (STEM[0] * STEM[1]))
-    return rows.t().contiguous().view(-1, b, h * STEM[0], w * STEM[1]).transpose(0, 1)
+def _to_pixels(matrix: Pointwise, x: Tensor) -> Tensor:
+    """(B, D, H, W) -> (B, C, 4 H, 2 W), the inverse: a matrix (8 C, D), then patches as pixels, channel by channel."""
+    (b, d, h, w), patch = x.shape, STEM[0] * STEM[1]
+    by_channel = matrix.weight.view(patch, -1, d).transpose(0, 1).reshape(-1, d)
+    bias = matrix.bias.view(patch, -1).t().reshape(-1, 1)
+    runs = torch.addmm(bias, by_channel, x.permute(0, 2, 3, 1).reshape(-1, d).t())
+    pixels = runs.view(-1, *STEM, b, h, w).permute(3, 0, 4, 1, 5, 2)
+    return pixels.reshape(b, -1, h * STEM[0], w * STEM[1])

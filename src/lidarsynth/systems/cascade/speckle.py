@@ -32,21 +32,21 @@ def calmed(reflectance: Tensor, metres: Tensor, lit: Tensor, share: float = SHAR
     about as far, so that its own speckle does not go on to the beams between; others are 0."""
     width = reflectance.shape[-1]
     reach = min(REACH, (width - 1) // 2)
-    far = metres.clamp_min(0.1).log()
-    values, away, there = (
-        torch.stack([wide[..., k : k + width] for k in range(2 * reach + 1)])
-        for wide in (ring(part, reach) for part in (reflectance, far, lit))
-    )
-    there = there & lit & ((away - far).abs() < ALIKE)
-    ranked = _lowest(torch.where(there, values, math.inf), reach + 1)
-    middle = ((there.sum(0) - 1) // 2).clamp_min(0)
+    far = torch.where(lit, metres.clamp_min(0.1).log(), math.inf)
+    around = zip(*(_moved(ring(part, reach), width) for part in (reflectance, far)), strict=True)
+    there, values = zip(*(((away - far).abs() < ALIKE, value) for value, away in around), strict=True)  # not nan
+    ranked = _lowest([torch.where(near, value, math.inf) for near, value in zip(there, values, strict=True)], reach + 1)
+    middle = ((torch.stack(there).sum(0) - 1) // 2).clamp_min(0)
     median = ranked.gather(0, middle[None])[0]
     return torch.where(lit, torch.lerp(reflectance, torch.where(lit, median, 0.0), share), 0.0)
 
 
-def _lowest(values: Tensor, count: int) -> Tensor:
-    """(count, ...) the lowest of the values (N, ...), in their order: of nine, a quarter of the time of a sort."""
-    rest = list(values.unbind(0))
+def _moved(wide: Tensor, width: int) -> list[Tensor]:
+    return [wide[..., k : k + width] for k in range(wide.shape[-1] - width + 1)]
+
+
+def _lowest(rest: list[Tensor], count: int) -> Tensor:
+    """(count, ...) the lowest of the values, in their order: of nine, a quarter of the time of a sort."""
     for place in range(count):
         for k in range(len(rest) - 1, place, -1):
             rest[k - 1], rest[k] = torch.minimum(rest[k - 1], rest[k]), torch.maximum(rest[k - 1], rest[k])
