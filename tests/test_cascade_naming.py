@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.lidar.surroundings import CHANNELS, surroundings
 from lidarsynth.networks.class_unet import MULTIPLE, RAYS, ClassUNet, around_the_turn
@@ -140,6 +141,41 @@ def test_the_loss_is_none_where_all_is_right_and_minds_no_ends_and_nothing_unnam
     said[0, 5:20] = 7
     wrong = objective(batch(said[:, None].float(), classes))["named"]
     assert wrong[0] > wrong[1] > 0.05
+
+
+def test_inside_buildings_returns_may_be_of_none_and_what_is_empty_is_not_judged():
+    class Echo(torch.nn.Module):
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return 40 * torch.nn.functional.one_hot(x[:, 1].long(), 20).permute(0, 3, 1, 2).float()
+
+    classes = torch.randint(0, 20, (2, 64, 256), generator=torch.Generator().manual_seed(0))
+    back = torch.ones(2, 64, 256)
+    back[:, :8] = 0
+    said = classes.clone()
+    said[:, :8] = 3
+    objective = NamingObjective(Echo(), inside=True)  # type: ignore[arg-type]
+    assert objective(batch(torch.stack([back, said], 1), classes))["inside"].max() < 1e-3
+    said[0][classes[0] == 0] = 13  # furniture, taken for walls
+    wrong = objective(batch(torch.stack([back, said], 1), classes))["inside"]
+    assert wrong[0] > wrong[1] > 0.01
+
+
+def sure(word: str) -> ClassUNet:
+    """A network to which all is of one class."""
+    network = ClassUNet(8).eval()
+    torch.nn.init.zeros_(network.classes.weight)
+    torch.nn.init.zeros_(network.classes.bias)
+    network.classes.bias.data[CLASS_NUMBER[word]] = 40
+    return network
+
+
+@pytest.mark.parametrize(
+    ("said", "found"), [("other-ground", "other-ground"), ("unlabeled", "car"), ("road", "car"), ("building", "car")]
+)
+def test_the_network_of_insides_is_believed_where_most_of_the_ground_is_a_floor(said: str, found: str):
+    (image,) = named(sure("car"), [kerb(WIDE)], AS_STREETS, WIDE, inside=sure(said))
+    assert image.label is not None and (image.label[image.mask] == CLASS_NUMBER[found]).all()
+    assert not image.label[~image.mask].any()
 
 
 def test_the_lovasz_softmax_is_one_less_the_iou_of_sure_answers():

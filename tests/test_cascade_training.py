@@ -32,7 +32,7 @@ TINY = with_fields(
     preset("default"),
     {"model.base_channels": 16, "model.channel_multipliers": (1, 1, 1, 1), "model.num_residual_blocks": (1, 1, 1, 1),
      "model.guide_channels": 8, "model.column_channels": 16, "model.between_channels": 16,
-     "model.beam_channels": 14,
+     "model.beam_channels": 14, "model.inside_channels": 8,
      "training.batch_size": 2, "training.steps": 2, "training.warmup": 0, "model.gn_num_groups": 8},
 )  # fmt: skip
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import lidarsynth as ls
+from lidarsynth.experiment.record import Card
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.rays import padded, rays_of
@@ -177,3 +178,14 @@ def test_few_columns_and_nothing_known_are_no_error():
     image = RangeImage(np.ones((2, 4)), np.full((2, 4), 0.5), np.ones((2, 4), bool), Sensor("s", (0.0, -1.0), 4))
     assert np.allclose(calm(np.full((2, 4), 0.5, np.float32), image, image.mask), 0.5)
     assert not calm(np.full((2, 4), 0.5, np.float32), image, ~image.mask).any()
+
+
+def test_a_network_is_tuned_to_a_sensor_whose_scans_it_saw_and_not_by_streets_alone():
+    model = ls.load("default").into("vlp-16")
+    record = model.experiment
+    for card, tuned in (
+        (Card(sensor="vlp-16"), True),
+        (Card(sensor="vlp-16", synthetic=True), False),
+        (Card(sensor="os1-64"), False),
+    ):
+        assert replace(model, experiment=replace(record, card=card)).tuned is tuned

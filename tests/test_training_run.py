@@ -183,7 +183,7 @@ def test_a_run_on_several_caches_says_so(cache: Path, tmp_path: Path):
         )
     )
     assert load(tmp_path / "run")[0].card.data == "48 images of several caches (24 of noise and 3 of few)"
-    assert load(tmp_path / "run")[0].card.sensor == SENSOR.name
+    assert load(tmp_path / "run")[0].card.sensor == SENSOR.name and not load(tmp_path / "run")[0].card.synthetic
     with pytest.raises(ValueError, match="nowhere"):
         list(run(tiny(2), f"{cache},nowhere", tmp_path / "other", options=QUIET))
 
@@ -341,6 +341,7 @@ def test_a_run_from_shipped_weights_says_what_these_learned_from_and_under_which
             card = training_verb._gone_on(source, word, Card(data="4 images of files, split all"), data)
             assert card.data == f"what `{word}` learned from, then 4 images of files, split all"
             assert card.licence == terms and card.history[-1] == f"from {word}"
+            assert card.synthetic == (terms == licence)
         mine = replace(source, card=replace(source.card, licence=own + licence))
         assert training_verb._gone_on(mine, "runs/mine", Card(data="more"), cache).licence == own + licence
     source = load_parts("default")[0]  # of a copy elsewhere, whose word says nothing

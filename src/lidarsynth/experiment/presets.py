@@ -198,6 +198,7 @@ def default() -> Experiment:
             column_channels=256,
             between_channels=64,
             beam_channels=56,
+            inside_channels=12,
             likeliest=True,
             observer_channels=48,
         ),

@@ -32,6 +32,7 @@ class Cascade(nn.Module):
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
     observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
     classes    says of each return what it is of
+    inside     the same of scans that were taken inside a building, and which are
     judge      says which of several drawn grids is most like a street's
     """
 
@@ -47,11 +48,12 @@ class Cascade(nn.Module):
         observer: FillUNet | None = None,
         classes: ClassUNet | None = None,
         judge: GridJudge | None = None,
+        inside: ClassUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
         self.beams, self.likeliest, self.observer, self.classes = beams, likeliest, observer, classes
-        self.judge = judge
+        self.judge, self.inside = judge, inside
 
     @property
     def surest(self) -> FillUNet:

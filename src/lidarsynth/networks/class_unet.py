@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import torch
@@ -30,11 +31,11 @@ class ClassUNet(nn.Module):
         self.down, self.halve = nn.ModuleList(), nn.ModuleList()
         self.join, self.up = nn.ModuleList(), nn.ModuleList()
         for own, count in zip(widths, BLOCKS, strict=True):
-            self.down.append(nn.Sequential(*(Block(own, own) for _ in range(count))))
+            self.down.append(nn.Sequential(*(_block(own, own) for _ in range(count))))
         for own, deeper in pairwise(widths):
             self.halve.append(Halve(own, deeper))
             self.join.append(Pointwise(deeper, own))
-            self.up.append(Block(2 * own, own))
+            self.up.append(_block(2 * own, own))
         self.pixel, self.spread = Pointwise(told, PIXEL), Pointwise(width, PIXEL * PATCH**2)
         self.mix, self.classes = Pointwise(PIXEL, PIXEL), Pointwise(PIXEL, classes)
 
@@ -49,6 +50,10 @@ class ClassUNet(nn.Module):
             h = stage(torch.cat([h, kept.pop()], 1))
         fine = F.silu(self.pixel(x) + F.pixel_shuffle(self.spread(h), PATCH))
         return self.classes(F.silu(self.mix(fine)))
+
+
+def _block(channels: int, out: int) -> Block:
+    return Block(channels, out, math.gcd(8, channels))
 
 
 def class_inputs(metres: Tensor, reflectance: Tensor, around: Tensor, rays: Rays) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 from lidarsynth.lidar.own_beams import own_beams
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 
@@ -39,9 +39,7 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
     A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
     in that direction. Raises ValueError when no point falls into the image.
     """
-    image = project(replace(scan, ring=None), sensor, "spherical")
-    if not image.mask.any():
-        raise ValueError(f"expected points within {sensor.name}'s view, found none of {len(scan)} points")
+    image = check_seen(project(replace(scan, ring=None), sensor, "spherical"), len(scan))
     own = project(scan, sensor_in, "auto", width=sensor.width)
     gap = np.abs(np.subtract.outer(np.asarray(sensor_in.elevations), np.asarray(sensor.elevations)))  # (H_in, H)
     # A beam that hardly returned anything may not have been there: of every fourth ring of an HDL-64E, 16 were.

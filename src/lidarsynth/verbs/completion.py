@@ -13,7 +13,7 @@ from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.own_beams import own_beams
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on, recognise
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, reconstruction_errors
 from lidarsynth.networks.interpolation import METHODS
@@ -83,9 +83,7 @@ def complete_scan(
     if recipe is None:
         filled = _sure(model.filled(scan, how, on_step=on_step), least)
         return Filled(filled, lambda: {"measured": _measured(model, scan, filled), "completed": filled}, {}, scan)
-    truth = model.image_of(scan)
-    if not truth.mask.any():
-        raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
+    truth = check_seen(model.image_of(scan), len(scan))
     known, judge = hidden_part(truth, recipe, how.seed)
     before = truth.keep(known)
     whole = model.filled(before, how, known, on_step)

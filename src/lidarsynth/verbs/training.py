@@ -179,7 +179,7 @@ def _begin(
         network = build_network(experiment)
     of_any = isinstance(images, Streets) and not OF_ANY.isdisjoint(images.words)
     sensor = "" if of_any else images.sensor.name
-    card = replace(experiment.card, data=begun.images, sensor=sensor)
+    card = replace(experiment.card, data=begun.images, sensor=sensor, synthetic=not _holds_scans(data))
     saved, note = newest_whole(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
@@ -209,18 +209,20 @@ def _begin(
 
 def _gone_on(source: Experiment, weights: str, card: Card, data: str | Path) -> Card:
     """The card of a run that begins with the `weights` of `source`: what both learned from, and under which terms."""
-    licence, scans = card.licence or source.card.licence, not words_of(data) and _holds_scans(data)
+    licence, scans = card.licence or source.card.licence, _holds_scans(data)
     told = source.card.data.removesuffix(UNTRUE_NOW) if scans else source.card.data
     before = f"what `{weights}` learned from" if weights in shipped() else told
     if scans and licence and not card.licence and not licence.startswith(TERMS):
         licence = f"{TERMS}; for the rest, {licence}"
     learned = ", then ".join(filter(None, (before, card.data)))
-    return Card(licence, learned, (*source.card.history, f"from {source.name}"), sensor=card.sensor)
+    history = *source.card.history, f"from {source.name}"
+    return Card(licence, learned, history, sensor=card.sensor, synthetic=not scans)
 
 
 def _holds_scans(data: str | Path) -> bool:
-    """Whether any of the caches holds others than synthetic streets."""
-    return any(read_index(Path(folder))["source"].get("name") != SYNTHETIC for folder in folders_of(data))
+    """Whether any of the caches holds others than synthetic streets, as words do."""
+    folders = [] if words_of(data) else folders_of(data)
+    return any(read_index(Path(folder))["source"].get("name") != SYNTHETIC for folder in folders)
 
 
 def _never_averaged(experiment: Experiment, state: Run) -> str:

@@ -43,7 +43,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
     classes = ClassUNet(model.class_channels, classes=model.classes) if model.classes else None
     judge = GridJudge(model.judge_channels) if model.judge_channels else None
-    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge)
+    inside = ClassUNet(model.inside_channels) if model.inside_channels else None
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside)
 
 
 def _widths(first: int) -> tuple[int, int, int, int]:
@@ -68,7 +69,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     that is as wide.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge"):
+    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)

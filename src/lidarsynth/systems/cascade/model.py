@@ -15,10 +15,11 @@ from lidarsynth.diffusion.samplers import checked_seed, generators
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points, project
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
+from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import ROWS, grid_rays
 from lidarsynth.networks.device import each_usually
 from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
@@ -196,7 +197,7 @@ class CascadeModel(AnySensorModel):
         filled = replace(filled, reflectance=unit.read(shade, filled) * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
-        return own._named([filled])[0]
+        return own._named([filled], inside=self.network.inside)[0]
 
     def upsampled(
         self,
@@ -221,9 +222,7 @@ class CascadeModel(AnySensorModel):
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
         scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
         own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
-        sparse = self.into(own).image_of(scan)
-        if not sparse.mask.any():
-            raise ValueError(f"expected points within {own.name}'s view, found none of {len(scan)} points")
+        sparse = check_seen(self.into(own).image_of(scan), len(scan))
         beams, dense, every = denser(own, beam_step(sparse), times)
         sparse = sparse if beams == own else self.into(beams).image_of(scan)
         model = self.into(dense)
@@ -241,9 +240,7 @@ class CascadeModel(AnySensorModel):
         model = model.into(fitting(scan, model.sensor, projection))
         network, grain = observing(self.network, model.tuned)
         model = replace(model, network=network, grain=grain, labelled=False)
-        image = project(scan, model.sensor, projection).keep(~model._blocked)
-        if not image.mask.any():
-            raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
+        image = check_seen(project(scan, model.sensor, projection).keep(~model._blocked), len(scan))
         model = replace(model, sensor=standing(model.sensor, image, image.mask))
         answer = model._answers(unanswered(image, padded(model.sensor)), generators(seed, 1), surely=image.range[None])
         return observed(scan, image, answer[0], projection)
@@ -253,10 +250,8 @@ class CascadeModel(AnySensorModel):
         scan, projection, model = as_scan(scan), self.experiment.data.projection, self.with_labels()
         model = model.suited_to(scan) if sensor is None else model.into(sensor)
         pixels = pixel_of_points(scan, model.sensor, projection)
-        image = project(scan, model.sensor, projection, pixels=pixels)
-        if not image.mask.any():
-            raise ValueError(f"expected points within {model.sensor.name}'s view, found none of {len(scan)} points")
-        (image,) = model._as_found(image, image.mask)._named([image], least)
+        image = check_seen(project(scan, model.sensor, projection, pixels=pixels), len(scan))
+        (image,) = model._as_found(image, image.mask)._named([image], least, self.network.inside)
         return replace(image, completed=replace(scan, label=class_of_points(scan.xyz, image, pixels)))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
@@ -298,12 +293,13 @@ class CascadeModel(AnySensorModel):
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         return self._named(recorded)
 
-    def _named(self, images: list[RangeImage], least: float = 0.0) -> list[RangeImage]:
+    def _named(self, images: list[RangeImage], least: float = 0.0, inside: ClassUNet | None = None) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for."""
         if not self.labelled:
             return [replace(image, label=None) for image in images]
         assert self.network.classes is not None
-        return named(self.network.classes, images, self.response, self.sensor, self.precision, least)
+        told = self.network.classes, images, self.response, self.sensor, self.precision, least
+        return named(*told, inside=inside)
 
     def _between(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -22,7 +23,7 @@ from lidarsynth.systems.cascade.response import Response
 from lidarsynth.systems.cascade.scores import SEAM, lovasz
 from lidarsynth.training.randomness import sample_rng
 
-JUDGED = 12_000  # pixels of a batch that the Lovasz-softmax sees
+JUDGED, NOBODY = 12_000, -1  # pixels of a batch that the Lovasz-softmax sees; the class of what is not judged
 # Of a thousand returns of varied streets, how many are of each class, from unlabeled to traffic sign.
 THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 29.7, 161, 25.5, 66.8, 9.8, 3.8)
 
@@ -30,6 +31,12 @@ THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 2
 # How much of the logarithm of its weight in learning is taken off a class's logit: so rare ones are named less often
 # than learned, and right more often (docs/training-default.md).
 FAIR = 0.5
+# Of a network of the insides of buildings, what these weigh in learning; furniture is unlabeled.
+INSIDE = {"unlabeled": 1.5, "car": 2.0, "person": 6.0, "other-ground": 1.2, "building": 1.2}
+GROUNDS = ("road", "parking", "sidewalk", "other-ground", "terrain")
+# Share of the returns of a ground that are of a floor, and of all returns that are of a ground, from which on a scan is
+# of the inside of a building (docs/training-default.md).
+FLOOR, SOME = 0.75, 0.02
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
 # is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": 0.45, "terrain": 0.6}
@@ -45,25 +52,38 @@ def weights() -> np.ndarray:
     return each / (each * shares).sum()
 
 
+def inside_weights() -> np.ndarray:
+    """(20,) of classes in learning of what is inside buildings: as `weights`, but for what is there."""
+    each = weights()
+    each[[CLASS_NUMBER[word] for word in INSIDE]] = list(INSIDE.values())
+    return each
+
+
 class NamingObjective(nn.Module):
     """`objective(batch)` -> `named` (n,): cross-entropies by `weights`, and the Lovasz-softmax of the batch; the cuts'
-    ends, beyond which their turns would go on, are not judged."""
+    ends, beyond which their turns would go on, are not judged.
 
-    def __init__(self, network: ClassUNet):
+    inside  a network of the insides of buildings learns, `inside` (n,), by its own weights: that returns may be of none
+    """
+
+    def __init__(self, network: ClassUNet, inside: bool = False):
         super().__init__()
-        self.network = network
-        self.register_buffer("weights", torch.from_numpy(weights()).float(), persistent=False)
+        self.network, self.inside = network, inside
+        weight = inside_weights() if inside else weights()
+        self.register_buffer("weights", torch.from_numpy(weight).float(), persistent=False)
 
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         lessons = batch.lessons
-        classes = lessons.classes[..., SEAM:-SEAM]
-        logits = self.network(lessons.inputs)[..., SEAM:-SEAM].float()
-        entropy = F.cross_entropy(logits, classes, self.get_buffer("weights"), ignore_index=0, reduction="none")
-        named, flat = (classes > 0).sum((1, 2)), classes.flatten()
+        inputs, classes = lessons.inputs, lessons.classes[..., SEAM:-SEAM]
+        judged = inputs[:, 0, :, SEAM:-SEAM] > 0 if self.inside else classes > 0
+        target = classes.masked_fill(~judged, NOBODY)
+        logits = self.network(inputs)[..., SEAM:-SEAM].float()
+        entropy = F.cross_entropy(logits, target, self.get_buffer("weights"), ignore_index=NOBODY, reduction="none")
+        count, flat = judged.sum((1, 2)), target.flatten()
         some = torch.randint(len(flat), (JUDGED,), generator=sample_rng(lessons.seeds[0], 5, 0)).to(flat.device)
-        some = some[flat[some] > 0]
+        some = some[flat[some] != NOBODY]
         overlap = lovasz(logits.permute(0, 2, 3, 1).flatten(0, 2)[some], flat[some])
-        return {"named": entropy.sum((1, 2)) / named.clamp_min(1) + overlap}
+        return {"inside" if self.inside else "named": entropy.sum((1, 2)) / count.clamp_min(1) + overlap}
 
 
 @torch.inference_mode()
@@ -76,28 +96,47 @@ def named(
     least: float = 0.0,
     more: Mapping[str, float] | None = None,
     alone: bool = False,
+    inside: ClassUNet | None = None,
 ) -> list[RangeImage]:
     """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
     there is none, or where the network is less sure of it than `least`.
 
-    more   is added to the logits of these classes
-    alone  each pixel by itself, instead of with those beside it on its surface
+    more    is added to the logits of these classes
+    alone   each pixel by itself, instead of with those beside it on its surface
+    inside  says of images of the insides of buildings what is there, furniture of class 0
     """
     off = FAIR * np.log(weights())
     for word, logit in (more or {}).items():
         off[CLASS_NUMBER[word]] -= logit
-    rays = response.told(rays_told(sensor))
+    rays, labels = response.told(rays_told(sensor)), []
     with torch.autocast(next(network.parameters()).device.type, torch.bfloat16, enabled=precision == "bf16"):
-        each = [_logits(network, image, response.even(image.reflectance), rays) for image in images]
-    taken = torch.from_numpy(off)[1:, None, None].float()  # 0 is no answer
-    answers = [_likeliest(logits - taken, image, least, alone) for logits, image in zip(each, images, strict=True)]
-    return [replace(image, label=label * image.mask) for image, label in zip(images, answers, strict=True)]
+        for image in images:
+            even = response.even(image.reflectance)
+            logits = None if inside is None else _inside(_logits(inside, image, even, rays), image)
+            if logits is None:
+                logits = _without(_logits(network, image, even, rays), off)
+                logits[0] = -math.inf  # 0 is no answer
+            labels.append(_likeliest(logits, image, least, alone) * image.mask)
+    return [replace(image, label=label) for image, label in zip(images, labels, strict=True)]
+
+
+def _without(logits: Tensor, off: np.ndarray) -> Tensor:
+    return logits - torch.from_numpy(off)[:, None, None].float()
+
+
+def _inside(logits: Tensor, image: RangeImage) -> Tensor | None:
+    """The logits (20, H, W) of the network of insides, if most of the ground that it sees is a floor; else None."""
+    logits = _without(logits, FAIR * np.log(inside_weights()))
+    count = np.bincount(_likeliest(logits, image, 0, False)[image.mask], minlength=len(logits))
+    ground = count[[CLASS_NUMBER[word] for word in GROUNDS]].sum()
+    is_inside = ground > SOME * count.sum() and count[CLASS_NUMBER["other-ground"]] > FLOOR * ground
+    return logits if is_inside else None
 
 
 def _likeliest(logits: Tensor, image: RangeImage, least: float, alone: bool) -> np.ndarray:
-    """(H, W) classes by logits (19, H, W) of those from 1 on; 0 where all are less likely than `least`."""
+    """(H, W) classes by logits (20, H, W); 0 where all are less likely than `least`."""
     chances = logits if alone else of_surfaces(logits.softmax(0), torch.from_numpy(image.range * image.mask))
-    label = chances.argmax(0) + 1
+    label = chances.argmax(0)
     if least > 0:
         label = label * ((logits.softmax(0) if alone else chances).amax(0) >= least)
     return label.numpy()
@@ -121,7 +160,7 @@ def of_surfaces(chances: Tensor, metres: Tensor) -> Tensor:
 
 
 def _logits(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays) -> Tensor:
-    """(19, H, W) of every ray and the classes from 1 on, told reflectances (H, W) as the streets' sensor would report
+    """(20, H, W) of every ray, told reflectances (H, W) as the streets' sensor would report
     them. One image at a time: four at once take a quarter longer, and longer sums may round otherwise.
     """
     device, size = next(network.parameters()).device, (rays.elevation.shape[2], rays.elevation.shape[3])
@@ -132,7 +171,7 @@ def _logits(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays)
     parts = known.metres, known.reflectance, torch.from_numpy(around), *rays
     metres, shade, near, *told = (part.to(device) for part in parts)
     logits = network(around_the_turn(class_inputs(metres, shade, near, Rays(*told))))
-    return logits[0, 1:, :height, :width].float().cpu()
+    return logits[0, :, :height, :width].float().cpu()
 
 
 def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

@@ -40,6 +40,8 @@ from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
 from lidarsynth.training.task import Phase, Task
 
+PARTS = ("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams", "observed", "named",
+         "inside")  # fmt: skip
 FITTED = 256  # streets that the standards of the coarse stage are measured on
 
 
@@ -188,6 +190,8 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
         own = (*own, Phase(NamingObjective(network.classes), "classes"))
     if experiment.base:
         return own
+    if network.inside is not None:
+        own = (*own, Phase(NamingObjective(network.inside, inside=True), "inside"))
     if bool((network.coarse.standard[1] == 1).all()):
         streets = VirtualStreets(experiment.training.seed + 1, FITTED)
         fit_standard(network.coarse, [streets.image(i) for i in range(0, FITTED, 4)])
@@ -213,7 +217,9 @@ def optimizers(experiment: Experiment, network: nn.Module) -> dict[str, torch.op
         learned["fill"] = torch.optim.AdamW(network.fill.parameters(), **options)
         learned["coarse"] = torch.optim.AdamW([coarse], **options)
     classes = network.classes if experiment.model.own_classes or not experiment.base else None
-    for name, own in (("likeliest", network.likeliest), ("observer", network.observer), ("classes", classes)):
+    inside = None if experiment.base else network.inside
+    each = {"likeliest": network.likeliest, "observer": network.observer, "classes": classes, "inside": inside}
+    for name, own in each.items():
         if own is not None:
             learned[name] = torch.optim.AdamW(own.parameters(), **options)
     return learned
@@ -257,7 +263,7 @@ def pictures(
 
 
 CASCADE = Task(
-    parts=("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams", "observed", "named"),
+    parts=PARTS,
     draw=draw,
     phases=phases,
     judge=judge,
