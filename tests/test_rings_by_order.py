@@ -1,13 +1,15 @@
 """Rows of files without rings, one ring after the other, wherever in the turn they begin and end."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lidarsynth as ls
+from lidarsynth.lidar.own_beams import own_beams
 from lidarsynth.lidar.projection import pixel_of_points, ring_of_points
-from lidarsynth.lidar.recognition import rings_in_order
+from lidarsynth.lidar.recognition import first_row, rings_in_order
 
 
 def by_rings(sensor: ls.Sensor, start: float, way: int, noise: float = 0.0) -> tuple[ls.Scan, np.ndarray]:
@@ -67,3 +69,41 @@ def test_rings_of_scans_put_straight_for_motion_stay_those_of_the_file(shared: P
         beam, _ = pixel_of_points(scan, sensor, "spherical")
         assert count == 64 and np.mean(row != beam) > 0.1
         assert np.array_equal(row, ring)
+
+
+@pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "hdl-64e-kitti"])
+@pytest.mark.parametrize(
+    ("kept", "first"), [(slice(None), 1), (slice(None), 100), (slice(None, -1), 0), (slice(1, None), -1),
+                        (slice(None, -1), 1), (slice(1, None), 0), (slice(1, None, 2), 3)],
+)  # fmt: skip
+def test_numbers_of_rings_may_begin_anywhere_and_the_first_and_last_beam_may_be_empty(
+    name: str, kept: slice, first: int
+):
+    """Drivers count from 1, too, and thinned scans keep their numbers: rows are those of the beams."""
+    sensor = ls.get_sensor(name)
+    scan, ring = by_rings(sensor, 0.0, 1, noise=0.001)
+    there = np.isin(ring, np.arange(sensor.height)[kept])
+    numbered = replace(scan[there], ring=(ring[there] + first).astype(np.int32))
+    assert first_row(numbered.ring, numbered.xyz, sensor) == -first
+    row, _ = pixel_of_points(numbered, sensor)
+    assert np.array_equal(row, ring[there])
+
+
+def test_rings_of_other_beams_go_where_their_points_are():
+    sensor, other = ls.get_sensor("hdl-32e"), ls.Sensor("other", tuple(np.linspace(10, -30, 24).tolist()), 512)
+    scan, ring = by_rings(other, 0.0, 1)
+    scan = replace(scan, ring=ring.astype(np.int32))
+    assert first_row(scan.ring, scan.xyz, sensor) is None
+    assert np.array_equal(pixel_of_points(scan, sensor)[0], pixel_of_points(scan, sensor, "spherical")[0])
+    assert first_row(scan.ring[:0], scan.xyz[:0], sensor) is None
+
+
+def test_a_stray_ring_is_found_whatever_its_number():
+    """A beam three degrees off its data sheet's: the scan says so, of rings from 1 on too."""
+    sheet = ls.get_sensor("vlp-16")
+    unit = replace(sheet, elevations=(*sheet.elevations[:-1], sheet.elevations[-1] - 3.0))
+    scan, ring = by_rings(unit, 0.0, 1)
+    for first in (0, 1):
+        found = own_beams(replace(scan, ring=(ring + first).astype(np.int32)), sheet)
+        assert found.elevations[-1] == pytest.approx(unit.elevations[-1], abs=0.05)
+        assert found.elevations[:-1] == sheet.elevations[:-1]

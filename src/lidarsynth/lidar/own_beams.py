@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarsynth.lidar.projection import is_even_grid
-from lidarsynth.lidar.recognition import FAR, beams_of, rings_in_order, spacing
+from lidarsynth.lidar.recognition import FAR, beams_of, first_row, rings_in_order, spacing
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
@@ -43,15 +43,21 @@ def own_beams(scan: Scan, sensor: Sensor) -> Sensor:
 def _strays(scan: Scan, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the rings that lie off their beams, and their median elevations in degrees.
 
-    Only where `project` takes rows from rings, as many as the sensor has beams: else elevations find the nearest beam.
+    Only where `project` takes rows from rings: else elevations find the nearest beam.
     A ring lies off where three quarters of its points do, to one side.
     """
     scan = scan[:: max(len(scan) // POINTS, 1)]
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
     far = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) > FAR
-    if ring is None or not far.any() or ring.max() + 1 != sensor.height or is_even_grid(sensor):
+    first = None
+    if ring is not None and far.any() and not is_even_grid(sensor):
+        usual = 0 if ring.max() + 1 == sensor.height else None
+        first = usual if scan.ring is None else first_row(ring, scan.xyz, sensor)
+    if ring is None or first is None:
         return np.zeros(0, int), np.zeros(0)
-    row, beams = beams_of(scan.xyz[far], ring[far], FEWEST)
+    row, beams = beams_of(scan.xyz[far], ring[far] + first, FEWEST)
+    inside = (row >= 0) & (row < sensor.height)
+    row, beams = row[inside], beams[inside]
     height = np.array(sensor.offsets or (0.0,) * sensor.height)[row]
     level = np.hypot(beams[..., 0], beams[..., 1])
     elevation = np.degrees(np.arctan2(beams[..., 2] - height[:, None], level))

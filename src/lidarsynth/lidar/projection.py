@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.lidar.recognition import first_row
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 
@@ -23,8 +24,9 @@ def project(
     """Draw a scan into the sensor's image; the nearest point of a pixel wins (R2DM, section III-A).
 
     method  `spherical`: row by elevation; `unfolding`: row by ring (Triess et al. 2020), from `scan.ring` or from the
-            point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, else spherical;
-            also on an even grid, whose rows are no beam's, and where points lie on the beams, but not of their rings
+            point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, or rings that lie
+            on its beams, wherever their numbers begin (`first_row`), else spherical; also on an even grid, whose rows
+            are no beam's, and where points lie on the beams, but not of their rings
     width   columns of the image, if other than the sensor's
     pixels  of the points, where they are known already
 
@@ -128,6 +130,8 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     ring, count = ring_of_points(scan)
     if scan.ring is not None:
         check_from_top(ring, scan.xyz)
+        first = first_row(ring, scan.xyz, sensor) if method == "auto" else None
+        ring, count = (ring, count) if first is None else (ring + first, sensor.height)
     if method == "auto" and count != sensor.height:
         return _rows_by_elevation(scan.xyz, sensor)
     if count < sensor.height // 2 or count > 2 * sensor.height:
@@ -136,7 +140,7 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
             "use the spherical projection"
         )
     if scan.ring is not None:
-        return np.where(ring < sensor.height, ring, -1)
+        return np.where((ring >= 0) & (ring < sensor.height), ring, -1)
     # Rings are counted from the last one upwards: a scan that lacks its top rings keeps the bottom rows. One ring too
     # many goes into the last row, and those before it into the first, as in the published program.
     row = np.where(ring < 0, 0, ring + (sensor.height - count))

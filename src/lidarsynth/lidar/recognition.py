@@ -12,6 +12,7 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import GRIDS, INVERTED, SENSORS, Sensor
 
 FAR = 3.0  # metres: nearer points show the beam's origin off the sensor's centre more than its elevation
+ON_ROW, RINGS = 0.25, 8  # of the beams' spacing: how far numbered rings may lie off their rows; how many tell
 UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by this much (HDL-64E units do)
 SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams only; chance gives 0.25
 STRAY = 0.02  # of a usual ring: a first or last one of fewer points is none
@@ -70,6 +71,29 @@ def same_kind(name: str, other: str) -> bool:
 
 def _unit(name: str) -> str:
     return "hdl-64e" if name in GRIDS else name.removesuffix("-kitti")
+
+
+def first_row(ring: np.ndarray, xyz: np.ndarray, sensor: Sensor) -> int | None:
+    """What is to be added to ring numbers (N,) that count from the top, of points (N, 3), for the sensor's rows.
+
+    0 where they go from 0 to its last beam. Else they may begin elsewhere, as some drivers' do at 1, or the first or
+    last beams may have no point: so that at least eight rings lie on the beams of their rows. None where they do not.
+    """
+    if not len(ring):
+        return None
+    usual = 0 if ring.max() + 1 == sensor.height else None
+    if usual == 0 and ring.min() == 0:
+        return usual
+    number, beams = beams_of(xyz, ring)
+    if len(number) < min(RINGS, sensor.height) or np.ptp(number) >= sensor.height:
+        return usual
+    offsets, table = np.array(sensor.offsets or (0.0,) * sensor.height), np.array(sensor.elevations)
+    off = {}
+    for first in range(-int(number[0]), sensor.height - int(number[-1])):
+        rows = number + first
+        off[first] = np.median(np.abs(median_elevations(beams, offsets[rows]) - table[rows]) / spacing(sensor)[rows])
+    best = min(off, key=off.__getitem__)
+    return best if off[best] < ON_ROW else usual
 
 
 def elevations_of(xyz: np.ndarray) -> np.ndarray:
