@@ -315,8 +315,7 @@ class ScanModel(ABC):
     @property
     def tuned(self) -> bool:
         """Whether the network saw real scans of this very sensor last."""
-        card = self.experiment.card
-        return card.sensor == self.sensor.name and not card.synthetic
+        return (card := self.experiment.card).sensor == self.sensor.name and not card.synthetic
 
     def stranger(self, scan: Scan, sensor: Sensor | str | None = None) -> str | None:
         """What a model that knows one sensor alone, or was tuned to one, has to say of another's scan, or None."""

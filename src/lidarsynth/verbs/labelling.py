@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarsynth.files.fields import PLACE, Fields
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import Filled
@@ -30,7 +30,8 @@ def found(points: Scan, sensor: Sensor) -> str:
     count = np.bincount(points.label, minlength=len(CLASSES))
     most = [k for k in np.argsort(-count) if k and count[k]][:MOST]
     named = "".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}, " for k in most)
-    return f"{len(points)} points of {sensor.name}: {named}{count[0]} without a class"
+    inside = ", as furniture is inside a building" if count[CLASS_NUMBER["other-ground"]] else ""  # a floor
+    return f"{len(points)} points of {sensor.name}: {named}{count[0]} without a class{inside}"
 
 
 def labelled_fields(named: Scan, loaded: Loaded) -> Fields:
