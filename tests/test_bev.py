@@ -92,5 +92,9 @@ def test_errors_say_both_sides():
         bev_histograms(np.ones((4, 3)))
     with pytest.raises(ValueError, match="NaN or infinity"):
         bev_histograms(np.full((1, 4, 3), np.inf))
+    with pytest.raises(ValueError, match="a number of bins of at least 1, found 0"):
+        bev_histograms(clouds(1), bins=0)
+    with pytest.raises(ValueError, match="an extent above 0, found 0"):
+        bev_histograms(clouds(1), extent=0)
     with pytest.raises(ValueError, match=r"\(100, 80.0, 3.0, 70.0\), found \(50, 80.0, 3.0, 70.0\)"):
         BevCounts().merge(BevCounts(bins=50))

@@ -198,6 +198,9 @@ def test_jensen_shannon_distance_equals_scipy():
     assert jensen_shannon_distance(np.array([1, 0]), np.array([0, 5])) == pytest.approx(math.sqrt(math.log(2)))
 
 
+SQUARES = np.ones((3, 3)), np.eye(3)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -210,6 +213,14 @@ def test_jensen_shannon_distance_equals_scipy():
         (lambda: frechet_distance(moments(np.ones((3, 2))), moments(np.ones((3, 3)))), "2 dimensions, found 3"),
         (lambda: kernel_distance(np.ones((3, 2)), np.ones((3, 3)), np.random.default_rng(0)), r"\(3, 2\) and \(3, 3\)"),
         (lambda: kernel_distance(np.ones((1, 2)), np.ones((3, 2)), np.random.default_rng(0)), "found 1 and 3"),
+        (
+            lambda: kernel_distance(*SQUARES, np.random.default_rng(0), subsets=0),
+            "a number of subsets of at least 1, found 0",
+        ),
+        (lambda: kernel_distance(*SQUARES, np.random.default_rng(0), size=1), "a size of at least 2, found 1"),
+        (lambda: gaussian_mmd(*SQUARES, width=0), "a width above 0, found 0"),
+        (lambda: gaussian_mmd(*SQUARES, width=math.nan), "a width above 0, found nan"),
+        (lambda: gaussian_mmd(*SQUARES, block=0), "a block of at least 1, found 0"),
         (lambda: gaussian_mmd(np.ones((2, 3)), np.ones((2, 4))), r"\(2, 3\) and \(2, 4\)"),
         (lambda: gaussian_mmd(np.ones((2, 3)), np.zeros((2, 3))), "found one without"),
         (lambda: gaussian_mmd(np.ones((2, 4)), np.ones((2, 2, 2))), r"\(2, 4\) and \(2, 2, 2\)"),

@@ -161,6 +161,15 @@ def test_statistics_of_the_reference_are_kept_shared_and_verified(tmp_path: Path
     assert ls.evaluate(STREETS, real).counts["reference"] == 9, "a changed folder is read anew"
 
 
+def test_what_was_kept_before_files_were_read_otherwise_is_made_anew(
+    real: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ls.evaluate(STREETS, real)
+    monkeypatch.setattr(evaluation, "GATHERED", evaluation.GATHERED + 1)
+    ls.evaluate(STREETS, real)
+    assert len(list((cache / "statistics").iterdir())) == 2
+
+
 def test_two_machines_share_the_samples(tmp_path: Path, real: Path):
     samples = saved(tmp_path / "samples", STREETS)
     parts = [tmp_path / f"{i}.safetensors" for i in (1, 2)]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,22 +11,26 @@ import torch
 
 import lidarsynth as ls
 from lidarsynth.cli.main import main
+from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation.evaluate import gather_part
 from lidarsynth.evaluation.image_sets import image_set
+from lidarsynth.evaluation.protocols import BEV_1, LIDARGEN, STREET_1
+from lidarsynth.evaluation.report import Report
 from lidarsynth.files.formats import read_image, write
-from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
 SENSOR = SENSORS["hdl-64e"].resized(width=64)
 
 
-def street(seed: int) -> RangeImage:
+def street(seed: int, sensor: Sensor = SENSOR) -> RangeImage:
     rng = np.random.default_rng(seed)
-    rays = SENSOR.directions()
+    rays = sensor.directions()
     with np.errstate(divide="ignore"):
         distance = np.minimum(np.where(rays[..., 2] < 0, -1.7 / rays[..., 2], np.inf), 9 / np.abs(rays[..., 1]))
     mask = (distance < 60) & (rng.random(distance.shape) < 0.9)
     reflectance = (rng.random(mask.shape) * mask).astype(np.float32)
-    return RangeImage(np.where(mask, distance, 0).astype(np.float32), reflectance, mask, SENSOR)
+    return RangeImage(np.where(mask, distance, 0).astype(np.float32), reflectance, mask, sensor)
 
 
 @pytest.fixture(autouse=True)
@@ -177,3 +182,191 @@ def test_beams_that_return_on_one_side_only_are_told_and_all_of_them_are_no_numb
     assert any("of 64 beams return on one side only" in note for note in report.warnings)
     lower = image.keep(~above)
     assert ls.evaluate([upper], [lower], "bev-1").values["range, per beam"] is None
+
+
+SAME = "samples and reference are the same images"
+KITTI = SENSORS["hdl-64e-kitti"].resized(width=64)
+
+
+def told(report: Report, words: str) -> list[str]:
+    return [note for note in report.warnings if words in note]
+
+
+def test_an_empty_pixel_of_lidargens_code_is_no_return(tmp_path: Path):
+    """Its program adds 0.1 mm before the logarithm, so that empty pixels are not 0; and judges from 0.5 m on."""
+    image, folder = street(3), tmp_path / "published"
+    folder.mkdir()
+    code = np.log2(image.range + np.float32(1e-4) + 1) / 6
+    assert code.min() > 2e-5
+    raw = code + np.where(image.mask, 0, np.random.default_rng(0).uniform(-0.04, 0.04, code.shape)).astype(np.float32)
+    for name, channel in (("0.pth", code), ("1.pth", raw)):
+        torch.save(torch.from_numpy(np.stack([channel, image.reflectance])), folder / name)
+    for i in (0, 1):
+        found = image_set(folder).image(i, SENSOR, "spherical")
+        np.testing.assert_array_equal(found.mask, image.mask)
+        assert not found.range[~image.mask].any() and not found.reflectance[~image.mask].any()
+    assert ls.evaluate(folder, [image, image], "iln-2022").values["range MAE"] == pytest.approx(0, abs=1e-3)
+    near = torch.full((2, 64, 64), float(np.log2(1.6001) / 6))
+    torch.save(near, folder / "1.pth")
+    assert image_set(folder).image(1, get_sensor(LIDARGEN.sensor).resized(width=64), "spherical").mask.all(), "0.6 m"
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_pairs_of_which_one_side_has_no_reflectance_have_no_error_of_it(side: int):
+    lit, dark = street(3, SENSORS["hdl-64e-kitti"]), street(4, SENSORS["hdl-64e-kitti"])
+    dark = replace(dark, reflectance=np.zeros_like(dark.reflectance))
+    pair = [[dark], [lit]] if side == 0 else [[lit], [dark]]
+    report = ls.evaluate(*pair, "street-upsampling-1")
+    assert report.values["range MAE"] > 0 and report.classes is None
+    for row in report.results[1:]:
+        assert row.value is None and row.reason == f"the {('samples have', 'reference has')[side]} no reflectance"
+    some = ls.evaluate([lit, *pair[0]], [lit, *pair[1]], "street-upsampling-1")
+    assert some.values["reflectance MAE"] is not None
+    name = ("samples", "reference")[side]
+    assert told(some, "no reflectance") == [f"1 of 2 images of the {name} have no reflectance, which counts as 0"]
+    assert not told(ls.evaluate([lit], [lit], "street-upsampling-1"), "no reflectance")
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_set_of_which_some_images_have_no_reflectance_is_told(side: int):
+    lit = [street(seed, SENSORS["hdl-64e-kitti"]) for seed in range(2)]
+    mixed = [lit[0], replace(lit[1], reflectance=np.zeros_like(lit[1].reflectance))]
+    report = ls.evaluate(*((mixed, lit) if side == 0 else (lit, mixed)), "street-1")
+    assert report.values["FRD"] is not None
+    name = ("samples", "reference")[side]
+    assert told(report, "no reflectance") == [f"1 of 2 images of the {name} have no reflectance, which counts as 0"]
+    assert not told(ls.evaluate(lit, lit, "street-1"), "no reflectance")
+    assert not told(ls.evaluate(mixed, lit), "no reflectance"), "which bev-1 does not look at"
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (0, 2, 1)])
+@pytest.mark.parametrize("side", [0, 1])
+def test_images_of_several_sensors_in_one_set_are_told_and_have_no_rows_per_beam(order, side: int, tmp_path: Path):
+    images = [street(0), street(1), street(2, KITTI)]
+    mixed, real = [images[i] for i in order], [street(seed) for seed in range(10, 13)]
+    report = ls.evaluate(*((mixed, real) if side == 0 else (real, mixed)))
+    name = ("samples", "reference")[side]
+    (note,) = told(report, "other beams than")
+    of = "1 of 3" if order[0] != 2 else "2 of 3"
+    first = ("hdl-64e", "hdl-64e-kitti")[order[0] == 2]
+    assert note == f"{of} images of the {name} are of other beams than those of {first}, which all are judged as"
+    assert report.values["no return, per beam"] is None and report.values["range, per beam"] is None
+    assert report.beams is None and report.values["JSD x1e2"] is not None
+    assert not told(ls.evaluate(real, real), "other beams")
+
+
+def test_several_sensors_are_told_of_merged_parts_too(tmp_path: Path):
+    (tmp_path / "mixed").mkdir()
+    for i, image in enumerate((street(0), street(1), street(2), street(2, KITTI))):
+        write(tmp_path / f"mixed/{i}.npz", image)
+    parts = [tmp_path / f"{i}.safetensors" for i in (1, 2)]
+    for i, part in enumerate(parts, 1):
+        gather_part(tmp_path / "mixed", f"{i}/2", part)
+    report = ls.evaluate(parts, [street(seed) for seed in range(10, 14)])
+    assert told(report, "1 of 4 images of the samples are of other beams") and report.beams is None
+
+
+def test_pairs_of_other_beams_are_told():
+    for samples, told_of in (([street(0, KITTI)] * 2, 2), ([street(0), street(0, KITTI)], 1)):
+        for protocol in ("r2dm-upsampling-2024", "iln-2022"):
+            (note,) = told(ls.evaluate(samples, [street(0), street(1)], protocol), "other beams")
+            of = "hdl-64e-kitti against hdl-64e"
+            assert note == f"{told_of} of 2 samples are of other beams than their reference, first {of}"
+    assert not told(ls.evaluate([street(0)], [street(1)], "iln-2022"), "other beams")
+
+
+def test_images_of_other_points_or_sensors_are_not_the_same():
+    """Their ranges alone are."""
+    image = street(3)
+    ahead = image.points()
+    turned = replace(image, xyz=np.stack([-ahead[..., 1], ahead[..., 0], ahead[..., 2]], -1))
+    other = replace(image, sensor=KITTI)
+    for samples in (turned, other):
+        report = ls.evaluate([samples], [image])
+        assert report.values["JSD x1e2"] > 1 and not told(report, SAME)
+        assert report.hashes["samples"] != report.hashes["reference"]
+    assert told(ls.evaluate([replace(image, xyz=ahead)], [image]), SAME), "the points of its rays are no other ones"
+
+
+@pytest.mark.parametrize("protocol", ["lidm-2024", "lidm-reconstruction-2024"])
+def test_the_same_images_are_not_at_zero_where_one_side_is_drawn_again(protocol: str, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(accumulation, "URLS", dict.fromkeys(accumulation.URLS, (tmp_path / "nowhere").as_uri()))
+    real = saved(tmp_path / "real", range(2))
+    copy = Path(shutil.copytree(real, tmp_path / "copy"))
+    images = [street(seed) for seed in range(2)]
+    reports = [ls.evaluate(*sides, protocol) for sides in ((real, real), (copy, real), (images, images))]
+    for report in reports:
+        (note,) = told(report, SAME)
+        assert note.endswith("takes the reference otherwise than samples: distances are what that costs, or 0")
+        assert report.values == reports[0].values and next(v for v in report.values.values() if v is not None) > 0
+    assert not told(ls.evaluate(images, [street(seed) for seed in (8, 9)], protocol), SAME)
+    (plain,) = told(ls.evaluate(images, images), SAME)
+    assert plain.endswith("distances are 0, or as far as chance goes")
+
+
+def test_points_of_an_image_that_are_not_as_far_as_its_range_are_refused(tmp_path: Path):
+    image, folder = street(3), tmp_path / "images"
+    folder.mkdir()
+    real = [street(5)]
+    for form, xyz in (("twice", 2 * image.points()), ("shifted", image.points() + np.float32([0, 0, 1.73]))):
+        stored(folder / "a.npz", xyz=xyz)
+        with pytest.raises(
+            ValueError, match=r"a\.npz: expected a range of \|x, y, z\| in metres, found another in"
+        ) as no:
+            ls.evaluate(folder, real)
+        assert "\n" not in str(no.value), form
+    some = image.points() * (np.arange(64)[:, None] % 4 == 0)
+    stored(folder / "a.npz", xyz=some)
+    assert ls.evaluate(folder, real).counts["samples"] == 1, "filled pixels have no points of their own"
+
+
+@pytest.mark.parametrize("name", ["hdl-64e", "hdl-64e-kitti", "os1-64", "pandar64", "vlp-16"])
+def test_images_of_recorded_points_are_judged(name: str):
+    """Beams leave some centimetres off the origin; a range is that of the point all the same."""
+    sensor = get_sensor(name)
+    image = street(3, sensor)
+    moved = image.points()[image.mask] + np.float32([0.02, -0.01, 0.15])
+    drawn = ls.project(Scan(moved, image.reflectance[image.mask]), sensor, "spherical")
+    assert drawn.xyz is not None
+    assert ls.evaluate([drawn], [drawn]).counts["samples"] == 1
+
+
+def test_iln_counts_the_points_within_the_sensors_limits():
+    """1.45 and 80 m of an hdl-64e, both included, of the truth as of the result; its MAE is of all pixels."""
+    truth = street(3)
+    empty, limits = ~truth.mask, (truth.sensor.min_range, truth.sensor.max_range)
+    spots = np.flatnonzero(empty)[:4]
+    for outside in ((1.0, 1.44), (80.5, 99.0)):
+        distance, mask = truth.range.copy(), truth.mask.copy()
+        distance.flat[spots], mask.flat[spots] = np.resize(outside, 4), True
+        other = replace(truth, range=distance, mask=mask)
+        for pair in ((other, truth), (truth, other)):
+            values = ls.evaluate([pair[0]], [pair[1]], "iln-2022").values
+            assert [values[f"voxel {row}"] for row in ("IoU", "precision", "recall", "F1")] == [100] * 4
+            assert values["range MAE"] > 0
+    distance.flat[spots[:2]] = limits
+    edge = replace(truth, range=distance, mask=mask)
+    assert ls.evaluate([edge], [truth], "iln-2022").values["voxel precision"] < 100
+
+
+def test_tensors_are_looked_at_wherever_they_come(tmp_path: Path):
+    protocol = replace(STREET_1, networks=(), rows=BEV_1.rows)
+    real, mixed = saved(tmp_path / "real", range(2)), saved(tmp_path / "mixed", range(2))
+    image = street(3, KITTI)
+    whole = np.stack([image.range, *np.moveaxis(image.points(), -1, 0), image.reflectance])
+    torch.save(torch.from_numpy(whole), mixed / "7.pth")
+    torch.save(torch.from_numpy(np.stack([np.log2(image.range + 1) / 6, image.reflectance])), mixed / "8.pth")
+    for sides in ((mixed, real), (real, mixed)):
+        notes = told(ls.evaluate(*sides, protocol), "tensors")
+        assert len(notes) == 2 and "degrees off the beams of hdl-64e" in notes[0] and "without points" in notes[1]
+
+
+@pytest.mark.parametrize("protocol", ["bev-1", "iln-2022", "lidm-reconstruction-2024"])
+@pytest.mark.parametrize("shape", [(3, 64, 64), (5, 63, 64), (64, 64)])
+def test_a_tensor_of_another_shape_is_named(shape: tuple[int, ...], protocol: str, tmp_path: Path):
+    real, folder = saved(tmp_path / "real", range(1)), tmp_path / "other"
+    folder.mkdir()
+    torch.save(torch.zeros(shape), folder / "0.pth")
+    for sides in ((folder, real), (real, folder)):
+        with pytest.raises(ValueError, match=r"other/0\.pth: expected .*found"):
+            ls.evaluate(*sides, protocol)

@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.distance import cdist
 
 from lidarsynth.metrics.neighbours import (
+    Fidelity,
     coverage,
     distance_matrix,
     fidelity,
@@ -94,6 +95,13 @@ def test_fidelity_of_equal_and_of_distant_sets():
     assert (far.precision, far.recall, far.density, far.coverage) == (0, 0, 0, 0)
 
 
+def test_fidelity_of_equal_sets_of_duplicates_is_not_one():
+    """Balls are open: that of a feature with k others at its place is empty, as in the program of Naeem et al."""
+    x = np.repeat(normal(10, 1), 4, axis=0)
+    assert fidelity(x, x, k=3) == Fidelity(0, 0, 0, 0)
+    assert fidelity(x, x, k=4).precision == 1
+
+
 def test_precision_falls_with_noise_and_recall_with_missing_modes():
     real = np.concatenate([normal(60, 1), normal(60, 2, shift=20)])
     noisy = fidelity(real + 5 * normal(120, 3), real)
@@ -113,3 +121,6 @@ def test_errors_say_both_sides():
         minimum_matching_distance(np.ones((0, 3)))
     with pytest.raises(ValueError, match="more than k = 5"):
         fidelity(np.ones((5, 2)), np.ones((9, 2)))
+    for odd, message in (({"k": 0}, "a k of at least 1, found 0"), ({"block": 0}, "a block of at least 1, found 0")):
+        with pytest.raises(ValueError, match=message):
+            fidelity(normal(9, 1), normal(9, 2), **odd)

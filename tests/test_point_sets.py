@@ -74,3 +74,5 @@ def test_errors_say_both_sides():
         earth_movers_distance(np.ones((4, 3)), np.ones((5, 3)))
     with pytest.raises(ValueError, match=r"\(..., 3\), got \(4, 2\)"):
         sphere_counts(np.ones((4, 2)))
+    with pytest.raises(ValueError, match="a number of bins of at least 2, found 1"):
+        sphere_counts(np.ones((4, 3)), 1)

@@ -214,6 +214,17 @@ def test_knn_keeps_a_uniform_surface_and_separates_by_range():
         knn_labels(ranges, labels, row, column, ranges, search=4)
 
 
+@pytest.mark.parametrize(("row", "column"), [(3, 16), (3, 20), (3, -1), (8, 3), (-1, 3)])
+def test_points_outside_the_image_have_no_pixel_there(row: int, column: int):
+    ranges, labels = torch.full((8, 16), 10.0), torch.full((8, 16), 13)
+    inside = knn_labels(ranges, labels, torch.tensor([7]), torch.tensor([15]), torch.tensor([10.0]))
+    assert inside.tolist() == [13]
+    with pytest.raises(ValueError, match=f"expected pixels of an image of 8 x 16, found row {row}, column {column}$"):
+        knn_labels(ranges, labels, torch.tensor([7, row]), torch.tensor([15, column]), torch.tensor([10.0, 10.0]))
+    nothing = torch.zeros(0)
+    assert knn_labels(ranges, labels, nothing, nothing, nothing).shape == (0,)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -93,6 +93,28 @@ def test_iou_axioms():
             confusion_matrix(labels, np.where(labels == 1, wrong_label, labels), 4)
 
 
+@pytest.mark.parametrize("label", [-1, 4, 1.5])
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_label_that_is_none_is_named(label: float, side: int):
+    labels = np.random.default_rng(0).integers(0, 4, (8, 8))
+    both = [labels, np.where(labels == 1, label, labels)]
+    expected = "labels of whole numbers" if label % 1 else "labels 0-3"
+    with pytest.raises(ValueError, match=rf"expected .*{expected}, found {label}$"):
+        confusion_matrix(*(both if side else both[::-1]), 4)
+
+
+def test_numbers_that_make_no_sense_are_refused():
+    points = np.ones((4, 3))
+    for size in (0, -0.1, np.nan):
+        with pytest.raises(ValueError, match=f"expected a size above 0, found {size}"):
+            voxel_errors(points, points, size=size)
+    for threshold in (-1, np.nan):
+        with pytest.raises(ValueError, match=f"expected a threshold of at least 0, found {threshold}"):
+            point_errors(points, points, threshold=threshold)
+    with pytest.raises(ValueError, match="expected a confusion of at least one pixel, found none"):
+        weighted_iou(np.zeros((20, 20), np.int64))
+
+
 def test_point_distances_equal_scipy():
     a, b = cloud(80, 1), cloud(70, 2)
     between = cdist(a, b)

@@ -15,7 +15,7 @@ from typing import Literal, TypeAlias
 from lidarsynth.data.cache import sha256 as sha256_of_file
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
-from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized, sensor_of
+from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized
 from lidarsynth.evaluation.notes import (
     one_set,
     tensors_taken,
@@ -37,6 +37,7 @@ from lidarsynth.networks.device import check_device
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
+GATHERED = 2  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
@@ -114,7 +115,7 @@ class _Run:
 
     def sensor_of(self, images: ImageSet, fallback: Sensor) -> Sensor:
         """Of a set by its first image; lists of points are judged as the protocol's own sensor draws them."""
-        return self.fallback() if self.protocol.clouds else sensor_of(images.item(0), fallback)
+        return self.fallback() if self.protocol.clouds else images.sensor(fallback)
 
     def notes(self, judged: ImageSet | None, truth: ImageSet | None, drawn: Sensor) -> tuple[str, ...]:
         """What is unlike in the images that were read, or statistics stand for, and judged as those of `drawn`."""
@@ -135,7 +136,7 @@ class _Run:
     def pairs(self, judged: ImageSet, truth: ImageSet, sensor: Sensor, loaded: Loaded) -> Pairs:
         """All images beside their truths; stopped, the next call goes on."""
         pairs, projection = Pairs(self.protocol, classes_of(loaded.networks)), self.protocol.projection
-        identity = [definition(self.protocol), sensor.to_dict(), judged.stamp, truth.stamp, loaded.weights]
+        identity = [definition(self.protocol), sensor.to_dict(), judged.stamp, truth.stamp, loaded.weights, GATHERED]
         key = sha256(repr(identity).encode()).hexdigest()[:16]
         stamped = judged.stamp and truth.stamp
         unfinished = cache_folder() / "statistics" / f"unfinished-{self.protocol.name}-{key}.json" if stamped else None
@@ -178,7 +179,7 @@ class _Run:
         """Gathered, or where they are of the reference, taken from and left in the cache folder; and their file."""
         chosen = select(self.protocol, role, images.names, count)
         numbers = part_of(chosen.numbers(), part)
-        identity = [definition(self.protocol), role, sensor.to_dict(), images.stamp, loaded.weights, numbers]
+        identity = [definition(self.protocol), role, sensor.to_dict(), images.stamp, loaded.weights, numbers, GATHERED]
         identity += [] if sensor.width >= 1024 else [f"{THINNED}, {self.projection(sensor)}"]  # drawn otherwise before
         limits = [sorted(part) for part in (chosen.features, chosen.bev, chosen.sets)]
         key = sha256(repr([*identity, *limits]).encode()).hexdigest()[:16]
@@ -232,7 +233,8 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
         real_files = [kept] if kept else []
     assert real
     report = report_of(fake, real, loaded.missing, seed, run.on_images)
-    warnings += run.notes(judged, truth, fake.sensor) + one_set(judged, truth, report.hashes)
+    warnings += run.notes(judged, truth, fake.sensor)
+    warnings += one_set(judged, truth, report.hashes, run.protocol)
     if real_files:
         told["reference statistics"] = ", ".join(map(str, real_files))
         hashes["reference statistics"] = ", ".join(map(sha256_of_file, real_files))
@@ -249,13 +251,13 @@ def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> 
     if len(judged) != len(truth):
         raise ValueError(f"{run.protocol.title} compares sample i with reference i: expected as many of both, found "
                          f"{len(judged)} and {len(truth)}")  # fmt: skip
-    sensor = sensor_of(judged.item(0), sensor_of(truth.item(0), run.fallback()))
+    sensor = judged.sensor(truth.sensor(run.fallback()))
     loaded = run.networks(sensor)
     pairs = run.pairs(judged, truth, sensor, loaded)
     report = pairs.report(loaded.missing, loaded.weights)
     sources = {"samples": judged.source, "reference": truth.source}
     warnings = report.warnings + run.notes(judged, truth, sensor) + unlike_pairs(judged.names, truth.names)
-    warnings += one_set(judged, truth, report.hashes)
+    warnings += one_set(judged, truth, report.hashes, run.protocol)
     return replace(report, sources=sources, warnings=warnings, images=_size_of(sensor))
 
 

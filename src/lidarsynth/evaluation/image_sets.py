@@ -17,7 +17,7 @@ from torch import Tensor
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.data.folder import scans_below
 from lidarsynth.evaluation.protocol import Clouds
-from lidarsynth.evaluation.sample_tensors import check_points, from_tensor
+from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import MAX_BYTES, check_metres
 from lidarsynth.files.formats import READERS, holds_image, naming, read, read_image
@@ -30,6 +30,14 @@ from lidarsynth.networks.tensors import read_pickle
 
 TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen
 Item: TypeAlias = RangeImage | Scan | Tensor
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The points of an image or scan, float32 metres: `xyz` (n, 3) as a protocol takes them, `held` (m, 3) all."""
+
+    xyz: np.ndarray
+    held: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -63,17 +71,23 @@ class ImageSet:
         except ValueError as error:
             raise self._named(i, error) from None
 
-    def points(self, i: int, sensor: Sensor, clouds: Clouds, real: bool) -> Scan:
-        """The points of image i as the record takes those of real scans or of samples; no reflectance.
+    def sensor(self, fallback: Sensor) -> Sensor:
+        """Of the first image, as `sensor_of`. Raises ValueError that begins with its name."""
+        try:
+            return sensor_of(self.item(0), fallback)
+        except ValueError as error:
+            raise self._named(0, error) from None
+
+    def points(self, i: int, sensor: Sensor, clouds: Clouds, real: bool) -> Cloud:
+        """The points of image i as the record takes those of real scans or of samples.
 
         sensor  of tensors, at their size
         Raises ValueError that begins with the image's name, also for a scan without any point in range.
         """
         try:
-            xyz = points_of(judged(self.item(i)), sensor, clouds, real)
+            return points_of(judged(self.item(i)), sensor, clouds, real)
         except ValueError as error:
             raise self._named(i, error) from None
-        return Scan(xyz, np.zeros(len(xyz), np.float32))
 
     def _named(self, i: int, error: ValueError) -> ValueError:
         text = str(error)
@@ -191,8 +205,8 @@ def _read_tensor(path: Path) -> Tensor:
 
 
 def judged(item: Item) -> Item:
-    """What counts of a stored form: an empty pixel holds nothing. Raises ValueError for a tensor whose depth is not
-    that of its points, and for ranges that are no metres."""
+    """What counts of a stored form: an empty pixel holds nothing. Raises ValueError for a tensor or image whose ranges
+    are not those of its points, and for ranges that are no metres."""
     if isinstance(item, Tensor):
         check_points(item)
         if item.ndim == 3 and len(item) == 5:
@@ -200,7 +214,10 @@ def judged(item: Item) -> Item:
         return item
     if isinstance(item, RangeImage):
         check_metres(item.range[item.mask])
-        return emptied(item)
+        image = emptied(item)
+        if image.xyz is not None:
+            check_distances("range", image.range, image.xyz)
+        return image
     return item
 
 
@@ -225,8 +242,8 @@ def as_image(
     return item if item.shape == size else thin(item, *size, resizing)
 
 
-def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> np.ndarray:
-    """(n, 3) float32 metres of any stored form, as `ImageSet.points`. Raises ValueError for NaN, or none in range."""
+def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> Cloud:
+    """The points of any stored form, as `ImageSet.points`. Raises ValueError for NaN, or none in range."""
     if isinstance(item, Tensor):
         item = from_tensor(item, sensor_of(item, sensor))
     xyz = (item.xyz if isinstance(item, Scan) else item.points()[item.mask]).astype(np.float32)
@@ -237,10 +254,10 @@ def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> np.ndar
     if not within.any():
         raise ValueError(f"expected points between {clouds.near:g} and {clouds.far:g} m, found none of {len(xyz)}")
     if not (real and clouds.redrawn):
-        return xyz[within] if clouds.gated and not real else xyz
+        return Cloud(xyz[within] if clouds.gated and not real else xyz, xyz)
     if isinstance(item, RangeImage) and item.xyz is None and on_corner_grid(item.sensor):
-        return decoded(item.range * item.mask, clouds.near, clouds.far)  # drawn once already
-    return drawn_and_coded(xyz, clouds.near, clouds.far)
+        return Cloud(decoded(item.range * item.mask, clouds.near, clouds.far), xyz)  # drawn once already
+    return Cloud(drawn_and_coded(xyz, clouds.near, clouds.far), xyz)
 
 
 def _divides(size: tuple[int, int], larger: tuple[int, int]) -> bool:

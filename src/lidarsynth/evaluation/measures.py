@@ -65,6 +65,9 @@ def _beam_range(row: Row, samples: Statistics, real: Statistics, seed: int) -> f
 def _beams(samples: Statistics, real: Statistics) -> BeamReport:
     if not samples.beams or not real.beams:
         raise ValueError(f"{samples.protocol.title} does not count beams")
+    for side, name in ((samples, "samples"), (real, "reference")):
+        if side.others:
+            raise ValueError(f"images of the {name} are of several sensors, so that rows are no one's beams")
     return compare_beams(samples.beams, real.beams)
 
 

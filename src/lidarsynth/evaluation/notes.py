@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from torch import Tensor
 
-from lidarsynth.evaluation.image_sets import ImageSet, stem_of
+from lidarsynth.evaluation.image_sets import ImageSet, Item, stem_of
+from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.sample_tensors import beams_off
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 
 METRES = 1.5  # no outdoor scan ends so near
-LOOKED_AT = 8  # scans of a set, from everywhere, whether all are of one sensor
+LOOKED_AT = 8  # scans or tensors of a set, at least and from everywhere, whether all are of one sensor
 GRID = "R2DM's grid is hdl-64e"
 Sides = Mapping[str, ImageSet | None]  # what is judged, in words -> its images; None where statistics stand for them
 
@@ -41,22 +42,24 @@ def unlike_sensors(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
 
 def _sensors_of(images: ImageSet) -> list[str]:
     """The sensors of those that are points, of some from everywhere, as recognised."""
-    some = (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
-    return list(dict.fromkeys(name for scan in some if isinstance(scan, Scan) and (name := recognise(scan)[0])))
+    scans = (scan for scan in _some(images) if isinstance(scan, Scan))
+    return list(dict.fromkeys(name for scan in scans if (name := recognise(scan)[0])))
+
+
+def _some(images: ImageSet) -> Iterator[Item]:
+    return (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
 
 
 def tensors_taken(sides: Sides, rays: Sensor, named: str | None) -> tuple[str, ...]:
-    """Notes where a side, by its first, is of tensors whose rows are other beams than the sensor's they are taken for;
-    or, unless a sensor was named for them, which rays those have that hold no points."""
+    """Notes where a side, by some from everywhere, has tensors whose rows are other beams than the sensor's they are
+    taken for; or, unless a sensor was named for them, which rays those have that hold no points."""
     told = []
     for side, images in sides.items():
-        first = images.item(0) if images else None
-        if not isinstance(first, Tensor):
-            continue
-        if len(first) == 5 and (off := beams_off(first, rays)):
+        tensors = [t for t in _some(images) if isinstance(t, Tensor) and t.ndim == 3] if images else []
+        if off := max((beams_off(tensor, rays) for tensor in tensors if len(tensor) == 5), default=0.0):
             told.append(f"the points of {side}, which are tensors, lie {off:.1f} degrees off the beams of {rays.name}, "
                         f"for whose rows they are taken: --sensor names theirs ({GRID})")  # fmt: skip
-        if len(first) == 2 and named is None:
+        if named is None and any(len(tensor) == 2 for tensor in tensors):
             told.append(f"{side} are tensors without points, taken for the rays of {rays.name}: --sensor names others "
                         f"({GRID})")  # fmt: skip
     return tuple(told)
@@ -88,9 +91,16 @@ def unlike_metres(sides: Sides) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def one_set(judged: ImageSet | None, truth: ImageSet | None, hashes: Mapping[str, str]) -> tuple[str, ...]:
+def one_set(
+    judged: ImageSet | None, truth: ImageSet | None, hashes: Mapping[str, str], protocol: EvaluationProtocol
+) -> tuple[str, ...]:
     """A note where both sides are the same images: of one place, or copies, by the hashes of what was read."""
     one, other = ((images.stamp, images.names) if images else ("", ()) for images in (judged, truth))
     if (one != other or not one[0]) and hashes["samples"] != hashes["reference"]:
         return ()
-    return ("samples and reference are the same images: distances are 0, or as far as chance goes",)
+    same, p = "samples and reference are the same images", protocol
+    if p.reproject or ("samples" in p.gated) != ("real" in p.gated) or (p.clouds and p.clouds.redrawn):
+        return (
+            f"{same}, and {p.title} takes the reference otherwise than samples: distances are what that costs, or 0",
+        )
+    return (f"{same}: distances are 0, or as far as chance goes",)

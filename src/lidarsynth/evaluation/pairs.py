@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from lidarsynth.evaluation.image_sets import points_of
+from lidarsynth.evaluation.image_sets import Cloud, points_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
-from lidarsynth.evaluation.report import Report, Result
+from lidarsynth.evaluation.report import Report, Result, dark
 from lidarsynth.evaluation.statistics import hash_of, hash_of_points
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.metrics.reconstruction import (
     Errors,
@@ -38,6 +38,7 @@ class Pairs:
     """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None.
 
     `seen`, where given, keeps the classes of each truth by its hash, for others that are compared with the same ones.
+    `others` are the sensors, in words, of pairs of unlike beams.
     Of bounded size but for a few numbers per pair; `merge` adds what another process gathered, `state` and `restore`
     are for files.
     """
@@ -53,7 +54,8 @@ class Pairs:
         self.chamfer: list[float] | None = [] if any(row.measure == "chamfer" for row in protocol.rows) else None
         self.voxels: list[list[float]] | None = [] if any(row.measure in VOXELS for row in protocol.rows) else None
         self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
-        self.lit = False
+        self.others: list[str] = []
+        self._lit = [0, 0]  # images with any reflectance, of results and of truths
         self._digests = [0, 0]
 
     def update(self, results: Sequence[RangeImage], truths: Sequence[RangeImage]) -> None:
@@ -61,24 +63,32 @@ class Pairs:
         for result, truth in zip(results, truths, strict=True):
             self.errors.append(reconstruction_errors(result, truth))
             if self.chamfer is not None:
-                self.chamfer.append(_chamfer(self._points(result, False), self._points(truth, True)))
+                self.chamfer.append(_chamfer(*self._points(result, truth)))
             if self.voxels is not None:
                 self.voxels.append(_voxels(result, truth))
-            self.lit |= bool(result.reflectance.any())
+            self._lit = [n + bool(i.reflectance.any()) for n, i in zip(self._lit, (result, truth), strict=True)]
+            if result.sensor.elevations != truth.sensor.elevations:
+                self.others.append(f"{result.sensor.name} against {truth.sensor.name}")
             self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:
             self.confusion += confusion_matrix(self._labels_of_truths(truths), self._labels(results))
 
-    def update_points(self, results: Sequence[Scan], truths: Sequence[Scan]) -> None:
+    def update_points(self, results: Sequence[Cloud], truths: Sequence[Cloud]) -> None:
         """Take in a batch of point lists, as the protocol's `clouds` have them, and their truths."""
         assert self.chamfer is not None
         for result, truth in zip(results, truths, strict=True):
             self.chamfer.append(_chamfer(result.xyz, truth.xyz))
             self._add_digests([hash_of_points(result), hash_of_points(truth)])
 
-    def _points(self, image: RangeImage, real: bool) -> np.ndarray:
-        assert self.protocol.clouds is not None
-        return points_of(image, image.sensor, self.protocol.clouds, real)
+    def _points(self, result: RangeImage, truth: RangeImage) -> list[np.ndarray]:
+        clouds = self.protocol.clouds
+        assert clouds is not None
+        return [points_of(image, image.sensor, clouds, real).xyz for image, real in ((result, False), (truth, True))]
+
+    @property
+    def lit(self) -> bool:
+        """Whether both sides have any reflectance."""
+        return all(self._lit)
 
     @property
     def count(self) -> int:
@@ -98,7 +108,8 @@ class Pairs:
         """Plain lists and numbers, for a file; the inverse of `restore`."""
         errors = [list(asdict(e).values()) for e in self.errors]
         digests = [f"{digest:032x}" for digest in self._digests]
-        state = {"errors": errors, "confusion": self.confusion.tolist(), "lit": self.lit, "digests": digests}
+        state = {"errors": errors, "confusion": self.confusion.tolist(), "lit": self._lit, "digests": digests}
+        state["others"] = self.others
         more = {"chamfer": self.chamfer, "voxels": self.voxels}
         return state | {name: values for name, values in more.items() if values is not None}
 
@@ -106,7 +117,8 @@ class Pairs:
         """Take in what `state` of another gave."""
         self.errors += [Errors(*values) for values in state["errors"]]
         self.confusion += np.array(state["confusion"], np.int64)
-        self.lit |= state["lit"]
+        self._lit = [own + its for own, its in zip(self._lit, state["lit"], strict=True)]
+        self.others += state["others"]
         if self.chamfer is not None:
             self.chamfer += state["chamfer"]
         if self.voxels is not None:
@@ -144,8 +156,9 @@ class Pairs:
             reason = ""
             if row.network and not self.classes:
                 reason = (missing or {}).get(row.network, f"no {row.network} is here")
-            elif (row.network or row.measure == "reflectance-mae") and not self.lit:
-                reason = "the samples have no reflectance"
+            elif row.network or row.measure == "reflectance-mae":
+                lacking = [side for n, side in zip(self._lit, ("samples have", "reference has"), strict=True) if not n]
+                reason = f"the {lacking[0]} no reflectance" if lacking else ""
             value = None if reason else MEASURES[row.measure](mean, self.confusion, each) * row.scale
             results.append(Result(row.name, value, row.unit, row.digits, reason))
         counts = {"samples": self.count, "reference": self.count}
@@ -153,7 +166,18 @@ class Pairs:
         hashes = {name: f"{digest:032x}" for name, digest in zip(names, self._digests, strict=True)}
         iou = class_iou(self.confusion, (0,)).tolist() if self.classes and self.lit else []
         classes = {name: value for (name, _), value in zip(CLASSES[1:], iou[1:], strict=False)} or None
-        return Report(self.protocol, tuple(results), counts, {**hashes, **(weights or {})}, {}, classes=classes)
+        hashes |= weights or {}
+        return Report(self.protocol, tuple(results), counts, hashes, {}, self._notes(), classes=classes)
+
+    def _notes(self) -> tuple[str, ...]:
+        told = []
+        if any(row.network or row.measure == "reflectance-mae" for row in self.protocol.rows):
+            sides = zip(self._lit, ("samples", "reference"), strict=True)
+            told += [dark(self.count - n, self.count, name) for n, name in sides if 0 < n < self.count]
+        if self.others:
+            told.append(f"{len(self.others)} of {self.count} samples are of other beams than their reference, first "
+                        f"{self.others[0]}")  # fmt: skip
+        return tuple(told)
 
 
 def _chamfer(points: np.ndarray, truth: np.ndarray) -> float:
@@ -162,12 +186,15 @@ def _chamfer(points: np.ndarray, truth: np.ndarray) -> float:
 
 
 def _voxels(result: RangeImage, truth: RangeImage) -> list[float]:
-    """`VOXELS` of a pair, of the points that lie on their pixels' rays; 0 where either has none."""
+    """`VOXELS` of a pair, of the points that lie on their pixels' rays, from the least to the greatest range of the
+    truth's sensor; 0 where either has none."""
     full = [np.where(image.mask, np.minimum(image.range, FULL), FULL) for image in (result, truth)]
     mae = float(np.abs(full[0] - full[1]).mean())
-    if not (result.mask.any() and truth.mask.any()):
+    near, far = truth.sensor.min_range, truth.sensor.max_range
+    kept = [image.mask & (image.range >= near) & (image.range <= far) for image in (result, truth)]
+    if not all(mask.any() for mask in kept):
         return [mae, 0.0, 0.0, 0.0, 0.0]
-    points, true = (image.sensor.points(image.range)[image.mask] for image in (result, truth))
+    points, true = (i.sensor.points(i.range)[mask] for i, mask in zip((result, truth), kept, strict=True))
     return [mae, *asdict(voxel_errors(points, true)).values()]
 
 

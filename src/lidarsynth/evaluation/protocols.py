@@ -148,6 +148,7 @@ _VOXELS = "of the voxels of 0.1 m that points occupy, of each scan, averaged"
 ILN = replace(
     R2DM_UPSAMPLING,
     name="iln-2022",
+    version=2,
     source="Kwon, Sung & Yoon, Implicit LiDAR network, ICRA 2022, and its program; TULIP (CVPR 2024) has the same IoU",
     rows=(
         Row("range MAE", "range-mae-full", "mean over all pixels, cut at 100 m, no return as 100 m", unit="m"),

@@ -127,9 +127,21 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     if protocol.measured and real.measured < real.count:
         told.append(f"{real.count - real.measured:,} of the reference hold no measured points (a cache keeps none): x, "
                     "y, z are those of the pixels' rays, in the official program the points' own")  # fmt: skip
+    for statistics, name in ((samples, "samples"), (real, "reference")):
+        total = max(statistics.count, statistics.bev.count if statistics.bev else 0)
+        if statistics.others:
+            told.append(f"{statistics.others:,} of {total:,} images of the {name} are of other beams than those of "
+                        f"{statistics.sensor.name}, which all are judged as")  # fmt: skip
+        if "rangenet" in statistics.moments and 0 < statistics.lit < statistics.count:
+            told.append(dark(statistics.count - statistics.lit, statistics.count, name))
     if samples.sensor.elevations != real.sensor.elevations:
         told.append(f"samples are of {samples.sensor.name}, the reference of {real.sensor.name}: other beams")
     return tuple(told)
+
+
+def dark(count: int, total: int, name: str) -> str:
+    """The note that so many images of a side have no reflectance, and others do."""
+    return f"{count:,} of {total:,} images of the {name} have no reflectance, which counts as 0"
 
 
 @dataclass(frozen=True)
@@ -234,7 +246,7 @@ def report_of(
     """The whole report of two sets of statistics, but for wall time and sources. Raises ValueError as `results_of`."""
     results = results_of(samples, real, missing, seed, on_row)
     beams = None
-    if samples.beams and real.beams:
+    if samples.beams and real.beams and not (samples.others or real.others):
         with suppress(ValueError):  # of other beams; the rows say so
             beams = compare_beams(samples.beams, real.beams)
     counts = {"samples": samples.count, "reference": real.count}

@@ -6,11 +6,13 @@ import numpy as np
 from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import GRIDS, Sensor
 
 OVERSHOOT = 0.05  # what comes out of a network may pass its limits by so much, and is clipped; other codes by far more
 NEAR, SHARE = 0.05, 0.02  # metres, and share of the depth: how far it may be from |x, y, z|
 FEW = 0.01  # share of the pixels in which it may be farther
+# Metres. LiDARGen codes r + 0.1 mm, so that what is empty is not 0, and judges from here on; 0 +- OVERSHOOT is nearer.
+NEAREST = GRIDS["hdl-64e-lidargen"].min_range
 ENOUGH = 5  # points of a row whose elevation is told
 
 
@@ -18,8 +20,9 @@ def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
     """A published sample as a range image of the sensor.
 
     (5, H, W): depth, x, y, z in metres, reflectance, as the official R2DM program saves; (2, H, W): LiDARGen's range
-    code log2(r + 1) / 6, clipped to 63 m, and reflectance, both in [0, 1]. Raises ValueError for another shape, NaN,
-    infinity, or values that are not so coded: outside their limits, or a code beyond the sensor's farthest range.
+    code log2(r + 1) / 6, clipped to 63 m, and reflectance, both in [0, 1]; of NEAREST or less nothing returned. Raises
+    ValueError for another shape, NaN, infinity, or values that are not so coded: outside their limits, or a code beyond
+    the sensor's farthest range.
     """
     size = (sensor.height, sensor.width)
     if tensor.ndim != 3 or tensor.shape[0] not in (2, 5) or tuple(tensor.shape[1:]) != size:
@@ -33,6 +36,7 @@ def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
     else:
         farthest = max(1.0, float(np.log2(sensor.max_range + 1) / 6))
         distance = np.exp2(6 * _within("a range code log2(r + 1) / 6", values[0], farthest).clip(0, 1)) - 1
+        distance *= distance > NEAREST
     mask = distance > 0
     xyz = np.moveaxis(values[1:4], 0, -1).copy() if len(values) == 5 else None
     return RangeImage(distance, reflectance * mask, mask, sensor, xyz=xyz)
@@ -49,16 +53,20 @@ def _within(what: str, values: np.ndarray, high: float) -> np.ndarray:
 
 def check_points(tensor: Tensor) -> None:
     """Raises ValueError for a (5, H, W) tensor whose depth is not the distance of its points; other shapes pass."""
-    if tensor.ndim != 3 or tensor.shape[0] != 5:
-        return
-    depth, *xyz = tensor.detach().double().numpy()[:4]
-    distance = np.sqrt(sum(axis**2 for axis in xyz))
+    if tensor.ndim == 3 and tensor.shape[0] == 5:
+        depth, *xyz = tensor.detach().double().numpy()[:4]
+        check_distances("depth", depth, np.stack(xyz, -1))
+
+
+def check_distances(what: str, depth: np.ndarray, xyz: np.ndarray) -> None:
+    """Raises ValueError unless depths (H, W) are those of the points (H, W, 3), where there is one, of nearly all."""
+    distance = np.linalg.norm(xyz.astype(np.float64), axis=-1)
     there = distance > 0
     off = there & (np.abs(distance - depth) > NEAR + SHARE * np.maximum(distance, depth))
     if off.sum() > FEW * there.sum():
         row, column = np.argwhere(off)[off.sum() // 2]
         raise ValueError(
-            f"expected a depth of |x, y, z| in metres, found another in {off.sum() / there.sum():.0%} of the pixels: "
+            f"expected a {what} of |x, y, z| in metres, found another in {off.sum() / there.sum():.0%} of the pixels: "
             f"{depth[row, column]:.4g} at row {row}, column {column} for a point {distance[row, column]:.4g} m away"
         )
 

@@ -16,9 +16,10 @@ from safetensors.torch import save as serialized
 from torch import Tensor, nn
 
 from lidarsynth.evaluation.features import cloud_features, drawn_again, features, gated
+from lidarsynth.evaluation.image_sets import Cloud
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Side
 from lidarsynth.evaluation.protocols import get_protocol
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, from_dict
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
 from lidarsynth.lidar.whole_file import write_whole
@@ -42,6 +43,7 @@ class Statistics:
     count     images so far, for features; `bev.count` is that of the histograms
     lit       images with any reflectance above 0
     measured  images that hold the measured points themselves; those of others lie on their pixels' rays
+    others    images of other beams than the sensor's, so that rows of the image are no beam's
     digest    hexadecimal hash of all images, whatever their order
 
     Two sets of different images merge into what one pass over all of them gives.
@@ -58,7 +60,7 @@ class Statistics:
         self.protocol, self.sensor = protocol, sensor
         self.role: Side = role
         self.networks, self.weights = dict(networks or {}), dict(weights or {})
-        self.count = self.lit = self.measured = self._digest = 0
+        self.count = self.lit = self.measured = self.others = self._digest = 0
         self.moments: dict[str, Moments] = {}
         self._kept: dict[str, list[Tensor]] = {}
         self._sets: list[Tensor] = []
@@ -87,7 +89,7 @@ class Statistics:
         return torch.cat([torch.zeros(0, size, 3), *self._sets]).numpy()
 
     def update_clouds(
-        self, scans: Sequence[Scan], features: Sequence[bool], counted: Sequence[bool], matched: Sequence[bool]
+        self, scans: Sequence[Cloud], features: Sequence[bool], counted: Sequence[bool], matched: Sequence[bool]
     ) -> None:
         """Take in a batch of scans; which of them count for the networks, for the JSD, for the matching distance.
 
@@ -113,6 +115,7 @@ class Statistics:
         """
         for image in images:
             self._check(image)
+            self.others += image.sensor.elevations != self.sensor.elevations
             self._digest = (self._digest + hash_of(image)) % (1 << 128)
         self.update_features([i for i, n in zip(images, features, strict=True) if n],
                              [b for b, n in zip(bev, features, strict=True) if n])  # fmt: skip
@@ -190,6 +193,7 @@ class Statistics:
         self.count, self.lit, self.measured = (
             self.count + other.count, self.lit + other.lit, self.measured + other.measured
         )  # fmt: skip
+        self.others += other.others
         self._digest = (self._digest + other._digest) % (1 << 128)
         for kind, moments in other.moments.items():
             self.moments[kind].merge(moments)
@@ -208,6 +212,7 @@ class Statistics:
     def tensors(self) -> dict[str, Tensor]:
         """Everything counted, by name."""
         state = {"counts": torch.tensor([self.count, self.lit, self.measured])}
+        state |= {"others": torch.tensor([self.others])} if self.others else {}
         for kind, moments in self.moments.items():
             state |= {f"{kind}.moments.{name}": value.cpu() for name, value in moments.state().items()}
             state[f"{kind}.features"] = self.features(kind)
@@ -227,6 +232,7 @@ class Statistics:
     def restore(self, state: Mapping[str, Tensor], digest: str) -> None:
         """Fill a new object with what `tensors` and `digest` of another gave."""
         self.count, self.lit, self.measured = state["counts"].tolist()
+        self.others = int(state["others"]) if "others" in state else 0
         self._digest = int(digest, 16)
         for kind in [name.removesuffix(".features") for name in state if name.endswith(".features")]:
             self.moments[kind] = Moments.from_state(_under(state, f"{kind}.moments."))
@@ -249,14 +255,18 @@ class Statistics:
 
 
 def hash_of(image: RangeImage) -> int:
-    """128 bits of range, reflectance and mask; the sum of those of a set is the same in any order."""
-    content = b"".join(np.ascontiguousarray(v).tobytes() for v in (image.range, image.reflectance, image.mask))
+    """128 bits of range, reflectance, mask, points, and of the beams and limits of the sensor, whatever its name; the
+    sum of those of a set is the same in any order."""
+    s = image.sensor
+    told = repr((s.elevations, s.offsets, s.edges, s.min_range, s.max_range)).encode()
+    arrays = image.range, image.reflectance, image.mask, image.points()[image.mask]
+    content = told + b"".join(np.ascontiguousarray(v).tobytes() for v in arrays)
     return int(blake2b(content, digest_size=16).hexdigest(), 16)
 
 
-def hash_of_points(scan: Scan) -> int:
-    """128 bits of a scan's points; as `hash_of`."""
-    return int(blake2b(np.ascontiguousarray(scan.xyz, np.float32).tobytes(), digest_size=16).hexdigest(), 16)
+def hash_of_points(scan: Cloud) -> int:
+    """128 bits of all points of a scan, which are the same whether it is judged or the reference; as `hash_of`."""
+    return int(blake2b(np.ascontiguousarray(scan.held, np.float32).tobytes(), digest_size=16).hexdigest(), 16)
 
 
 def _under(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.distributions import Array, as_tensor
+from lidarsynth.metrics.distributions import Array, as_tensor, check_above_0, check_least
 
 
 def bev_histograms(
@@ -24,8 +24,10 @@ def bev_histograms(
 
     Points with near < |xyz| < far (strict) are counted, in cells of 2 * extent / bins metres over +-extent; the last
     cell includes its right edge, as in numpy. Removed points may stand at the origin. Raises ValueError for another
-    shape, NaN or infinity.
+    shape, NaN or infinity, no bin, or an extent of 0.
     """
+    check_least("a number of bins", bins, 1)
+    check_above_0("an extent", extent)
     points = as_tensor(xyz)
     if points.ndim != 3 or points.shape[-1] != 3:
         raise ValueError(f"xyz must be (B, N, 3), got {tuple(points.shape)}")

@@ -38,6 +38,18 @@ def _tensor(values: Array) -> Tensor:
     return torch.from_numpy(np.require(values, values.dtype.newbyteorder("="), requirements=["C", "W"]))
 
 
+def check_least(name: str, number: float, least: float) -> None:
+    """Raises ValueError by name, with its article, for a number below `least`, or NaN."""
+    if not number >= least:
+        raise ValueError(f"expected {name} of at least {least:g}, found {number}")
+
+
+def check_above_0(name: str, number: float) -> None:
+    """Raises ValueError by name, with its article, for a number that is not above 0."""
+    if not number > 0:
+        raise ValueError(f"expected {name} above 0, found {number}")
+
+
 class Moments:
     """Count, mean and covariance of features that arrive in batches; float64 sums of bounded size.
 
@@ -155,8 +167,10 @@ def kernel_distance(generated: Array, real: Array, rng: Random, subsets: int = 1
 
     The mean over `subsets` pairs of subsets of min(N, M, size) features without replacement; `rng` draws the generated
     ones first. Features may be memory maps: only the drawn ones are read. Raises ValueError for fewer than two, other
-    shapes, NaN or infinity.
+    shapes, NaN or infinity, no subset.
     """
+    check_least("a number of subsets", subsets, 1)
+    check_least("a size", size, 2)
     if generated.ndim != 2 or real.ndim != 2 or generated.shape[1] != real.shape[1]:
         raise ValueError(f"features must be (N, D) and (M, D), got {tuple(generated.shape)} and {tuple(real.shape)}")
     count = min(len(generated), len(real), size)
@@ -180,8 +194,10 @@ def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> f
 
     x (N, ...) and y (M, ...) are histograms of one shape, each divided by its sum here. `block` of them at a time
     become float32, so 10,000 histograms of 100x100 counts need little more memory than themselves. Zero, to 1e-8, for
-    equal sets. Raises ValueError for other shapes, negative counts, or a histogram without any.
+    equal sets. Raises ValueError for other shapes, negative counts, a histogram without any, or a width of 0.
     """
+    check_above_0("a width", width)
+    check_least("a block", block, 1)
     first, second = _rows(x), _rows(y)
     if not len(first) or not len(second) or tuple(x.shape[1:]) != tuple(y.shape[1:]):
         raise ValueError(f"expected two sets of histograms of one shape, found {tuple(x.shape)} and {tuple(y.shape)}")

@@ -31,10 +31,11 @@ def knn_labels(
     distance      (N,) metres, range of each point
     search        odd side of the window; of its pixels, those farther than CUTOFF have no vote
 
-    Raises ValueError when k exceeds the window or the window has no middle.
+    Raises ValueError when k exceeds the window, the window has no middle, or a point lies outside the image.
     """
     ranges, labels, rows, columns, own = map(torch.as_tensor, (image_range, image_label, row, column, distance))
     _check_window(k, search)
+    _check_pixels(rows, columns, tuple(ranges.shape))
     pixel = rows.long() * ranges.shape[1] + columns.long()
     near = _windows(ranges, search)[:, pixel]
     near = torch.where(near < 0, torch.inf, near)
@@ -68,6 +69,13 @@ def smooth_labels(
 def _check_window(k: int, search: int) -> None:
     if search % 2 != 1 or not 1 <= k <= search**2:
         raise ValueError(f"expected an odd window and k within its pixels, found search {search} and k {k}")
+
+
+def _check_pixels(row: Tensor, column: Tensor, shape: tuple[int, ...]) -> None:
+    outside = (row < 0) | (row >= shape[0]) | (column < 0) | (column >= shape[1])
+    if outside.any():
+        found = f"row {int(row[outside][0])}, column {int(column[outside][0])}"
+        raise ValueError(f"expected pixels of an image of {shape[0]} x {shape[1]}, found {found}")
 
 
 def _inverse_gaussian(size: int) -> Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.distributions import Array, as_tensor
+from lidarsynth.metrics.distributions import Array, as_tensor, check_least
 
 
 def distance_matrix(a: Sequence | np.ndarray, b: Sequence | np.ndarray, distance: Callable[..., float]) -> np.ndarray:
@@ -70,7 +70,11 @@ def _matrix(distances: Array) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How real the generated features are, and how much of the real ones they reach; each is 1 for equal sets."""
+    """How real the generated features are, and how much of the real ones they reach.
+
+    Of equal sets each is 1 where no distances are equal. Balls are open: that of a feature with k duplicates or more
+    holds nothing, not even itself, so that equal sets of duplicates score less, down to 0.
+    """
 
     precision: float  # share of generated features inside the real balls (Kynkaanniemi et al. 2019)
     recall: float  # share of real features inside the generated balls
@@ -82,8 +86,10 @@ def fidelity(generated: Array, real: Array, k: int = 5, block: int = 1024) -> Fi
     """Precision, recall, density and coverage of features (N, D) and (M, D), with balls to the k-th neighbour.
 
     `block` rows of the matrix of distances exist at a time. Raises ValueError for other shapes, sets of at most k
-    features, NaN or infinity.
+    features, NaN or infinity, a k or block below 1.
     """
+    check_least("a k", k, 1)
+    check_least("a block", block, 1)
     fake, true = as_tensor(generated).double(), as_tensor(real).double()
     if fake.ndim != 2 or true.ndim != 2 or fake.shape[1] != true.shape[1] or min(len(fake), len(true)) <= k:
         raise ValueError(f"expected features (N, D) and (M, D) of more than k = {k}, "

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.metrics.distributions import Array, as_tensor
+from lidarsynth.metrics.distributions import Array, as_tensor, check_least
 
 
 def farthest_points(xyz: Array, count: int, clear: float = 1e-3) -> np.ndarray:
@@ -60,8 +60,10 @@ def sphere_counts(points: Array, bins: int = 28) -> np.ndarray:
     """(cells,) int64: how many of `points` (..., 3) lie nearest to each point of a grid within a sphere.
 
     The grid has `bins` points a side over [-0.5, 0.5]^3, without those farther than 0.5 from the origin (Achlioptas et
-    al. 2018); points outside count at its rim. Raises ValueError for another shape or NaN; ImportError without scipy.
+    al. 2018); points outside count at its rim. Raises ValueError for another shape or NaN, or fewer than two bins;
+    ImportError without scipy.
     """
+    check_least("a number of bins", bins, 2)
     flat = as_tensor(points).cpu().numpy()
     if flat.shape[-1] != 3:
         raise ValueError(f"points must be (..., 3), got {flat.shape}")

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.metrics.distributions import Array
+from lidarsynth.metrics.distributions import Array, check_above_0, check_least
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,9 @@ class PointErrors:
 def point_errors(result: Array, truth: Array, threshold: float = 0.2) -> PointErrors:
     """Chamfer and Hausdorff distance, and F-score at `threshold` metres, of points (N, 3) and (M, 3).
 
-    F-score: Knapitsch et al. 2017. Raises ValueError for other shapes, no points or NaN.
+    F-score: Knapitsch et al. 2017. Raises ValueError for other shapes, no points or NaN, a threshold below 0.
     """
+    check_least("a threshold", threshold, 0)
     there, back = nearest_distances(result, truth), nearest_distances(truth, result)
     precision, recall = float((there <= threshold).mean()), float((back <= threshold).mean())
     return PointErrors(
@@ -120,8 +121,10 @@ class VoxelErrors:
 def voxel_errors(result: Array, truth: Array, size: float = 0.1) -> VoxelErrors:
     """Overlap of the voxels floor(x / size) that points (N, 3) and (M, 3) in metres occupy; one scan (ILN, TULIP).
 
-    Means over scans are taken of these. Raises ValueError for other shapes, no points or NaN.
+    Means over scans are taken of these. Raises ValueError for other shapes, no points or NaN, a size that is not above
+    0.
     """
+    check_above_0("a size", size)
     first, second = (np.unique(np.floor(_points(p) / size).astype(np.int64), axis=0) for p in (result, truth))
     both = len(first) + len(second) - len(np.unique(np.concatenate([first, second]), axis=0))
     precision, recall = both / len(first), both / len(second)
@@ -136,9 +139,10 @@ def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.nd
     """
     rows, columns = (v.cpu().numpy() if isinstance(v, Tensor) else np.asarray(v) for v in (truth, predicted))
     both = np.concatenate([rows.ravel(), columns.ravel()])
-    if rows.shape != columns.shape or not rows.size or not both.min() >= 0 or not both.max() < classes:
-        raise ValueError(f"expected two images of one shape with labels 0-{classes - 1}, "
-                         f"found {rows.shape} and {columns.shape}")  # fmt: skip
+    if rows.shape != columns.shape or not rows.size:
+        raise ValueError(f"expected two images of one shape, found {rows.shape} and {columns.shape}")
+    if (other := ~((both >= 0) & (both < classes))).any():
+        raise ValueError(f"expected labels 0-{classes - 1}, found {both[other][0]:g}")
     if both.dtype.kind == "f" and (both % 1).any():
         raise ValueError(f"expected labels of whole numbers, found {both[both % 1 != 0][0]:g}")
     both = both.astype(np.int64)
@@ -164,7 +168,12 @@ def mean_iou(confusion: np.ndarray, without: tuple[int, ...] = (0,)) -> float:
 
 
 def weighted_iou(confusion: np.ndarray) -> float:
-    """Mean of `class_iou` of all classes, weighted by their true pixels (LiDARGen: jaccard_score, `weighted`)."""
+    """Mean of `class_iou` of all classes, weighted by their true pixels (LiDARGen: jaccard_score, `weighted`).
+
+    Raises ValueError for a confusion of no pixels.
+    """
+    if not confusion.any():
+        raise ValueError("expected a confusion of at least one pixel, found none")
     return float(np.average(class_iou(confusion), weights=confusion.sum(1)))
 
 
