@@ -1,11 +1,15 @@
 """How good the classes are that `--labels` gives: of generated scans by another network, of known ones by the truth.
 
-python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--model default] [--by-class] [--least P...]
+python benchmarks/labels.py --generated 16 --streets 16 --real FOLDER... [--inside 48] [--model default] [--by-class]
+    [--least P...]
 
 generated  scans from noise: how often street-1's RangeNet, which saw the same scan, gives the same class
 streets    held-out worlds as hdl-64e-kitti sees them: whole, and of every fourth beam alone, against the truth; beside
            them the RangeNet on the whole scans
 real       folders of labelled real scans, read as `benchmarks/street.py --classes` reads them
+inside     held-out buildings, seen by virtual sensors of which nobody says how they stand: returns that get their
+           class, furniture none; and how many of these scans, of streets of virtual sensors, and of the scans of
+           `streets` and `real` are taken for the inside of a building, as they have floors
 by-class   the IoU of each class, of streets and real scans that are wholly known
 least      of streets and real scans: how many pixels keep a class with so much confidence, and how many are right
 
@@ -24,9 +28,12 @@ import torch
 from street import HELD_OUT, SENSOR, WORD, labelled, streets
 
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.semantic_kitti import CLASSES
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.metrics.reconstruction import class_iou, confusion_matrix
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.streets.interiors import interiors
+from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.streets.world import POSES
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.naming import named
 from lidarsynth.systems.cascade.response import response_of
@@ -90,6 +97,32 @@ def rows(model: ScanModel, args: argparse.Namespace) -> Iterator[str]:
         yield from (f"| {name}, {least:g} | {sure_cells(model, images, least)} |" for least in args.least)
 
 
+def buildings(count: int) -> list[RangeImage]:
+    """As many buildings, each by a virtual sensor."""
+    seen = (interiors(HELD_OUT, POSES * count).image(POSES * k) for k in range(count))
+    return [replace(image, sensor=replace(image.sensor, mount=1.73, tilt=(0.0, 0.0))) for image in seen]
+
+
+def inside(model: CascadeModel, count: int, others: dict[str, list[RangeImage]]) -> Iterator[str]:
+    """Lines of a Markdown table: of each class in buildings, how many of its returns get it, and IoU; and how many
+    scans of each kind are taken for the inside of a building."""
+    floor, counts, taken = CLASS_NUMBER["other-ground"], np.zeros((20, 20), np.int64), []
+    wide = VirtualStreets(HELD_OUT, POSES * count)
+    sets = {f"{count} buildings": buildings(count), f"{count} streets": [wide.image(POSES * k) for k in range(count)]}
+    for name, images in (sets | others).items():
+        answers = [answered(model.into(image.sensor).with_labels(), image).label for image in images]
+        taken.append((name, sum(bool((label == floor).any()) for label in answers if label is not None), len(images)))
+        for image, label in zip(images, answers, strict=True) if len(taken) == 1 else ():
+            assert image.label is not None and label is not None
+            np.add.at(counts, (image.label[image.mask], label[image.mask]), 1)
+    yield f"| inside: {100 * np.trace(counts) / counts.sum():.1f} % right | right | IoU |\n|---|---:|---:|"
+    iou = np.diag(counts) / np.maximum(counts.sum(0) + counts.sum(1) - np.diag(counts), 1)
+    for k in np.flatnonzero(counts.sum(1)):
+        word = "furniture: none" if k == 0 else CLASSES[k][0]
+        yield f"| {word} | {100 * counts[k, k] / counts[k].sum():.1f} % | {iou[k]:.2f} |"
+    yield "; ".join(f"{name}: {found} of {total} taken for the inside of a building" for name, found, total in taken)
+
+
 def sure_cells(model: ScanModel, images: Sequence[RangeImage], least: float) -> str:
     """Two cells: how many labelled pixels keep a class of so much confidence, and how many of these are right."""
     assert isinstance(model, CascadeModel) and model.network.classes is not None
@@ -105,13 +138,20 @@ def main() -> None:
     parser.add_argument("--generated", type=int, default=0, help="how many scans")
     parser.add_argument("--streets", type=int, default=0, help="how many scans")
     parser.add_argument("--real", type=Path, nargs="+", default=[], help="folders of labelled scans")
+    parser.add_argument("--inside", type=int, default=0, help="how many scans")
     parser.add_argument("--model", default="default")
     parser.add_argument("--by-class", action="store_true")
     parser.add_argument("--least", type=float, nargs="+", default=[])
     args = parser.parse_args()
     torch.set_num_threads(1)
-    for line in rows(load(args.model).into(SENSOR).with_labels(), args):
+    model = load(args.model).into(SENSOR).with_labels()
+    for line in rows(model, args):
         print(line, flush=True)
+    if args.inside:
+        assert isinstance(model, CascadeModel)
+        others = {f"{args.streets} of KITTI's sensor": list(streets(HELD_OUT, args.streets))} if args.streets else {}
+        for line in inside(model, args.inside, others | {folder.name: labelled(folder) for folder in args.real}):
+            print(line, flush=True)
 
 
 if __name__ == "__main__":

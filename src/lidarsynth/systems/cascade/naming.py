@@ -32,11 +32,12 @@ THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 2
 # than learned, and right more often (docs/training-default.md).
 FAIR = 0.5
 # Of a network of the insides of buildings, what these weigh in learning; furniture is unlabeled.
-INSIDE = {"unlabeled": 1.5, "car": 2.0, "person": 6.0, "other-ground": 1.2, "building": 1.2}
-GROUNDS = ("road", "parking", "sidewalk", "other-ground", "terrain")
-# Share of the returns of a ground that are of a floor, and of all returns that are of a ground, from which on a scan is
-# of the inside of a building (docs/training-default.md).
-FLOOR, SOME = 0.75, 0.02
+INSIDE = {"unlabeled": 1.5, "car": 2.0, "person": 12.0, "other-ground": 1.2, "building": 1.2}
+# What is only inside, floors and furniture, and only outside; share of the former in both, and of both in all returns,
+# from which on a scan is of the inside of a building (docs/training-default.md).
+INDOORS = ("unlabeled", "other-ground")
+OUTDOORS = ("road", "parking", "sidewalk", "fence", "vegetation", "trunk", "terrain", "pole", "traffic-sign")
+MOSTLY, SOME = 0.7, 0.02
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
 # is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": 0.45, "terrain": 0.6}
@@ -125,12 +126,12 @@ def _without(logits: Tensor, off: np.ndarray) -> Tensor:
 
 
 def _inside(logits: Tensor, image: RangeImage) -> Tensor | None:
-    """The logits (20, H, W) of the network of insides, if most of the ground that it sees is a floor; else None."""
+    """The logits (20, H, W) of the network of insides, if by these the image is of one; else None."""
     logits = _without(logits, FAIR * np.log(inside_weights()))
     count = np.bincount(_likeliest(logits, image, 0, False)[image.mask], minlength=len(logits))
-    ground = count[[CLASS_NUMBER[word] for word in GROUNDS]].sum()
-    is_inside = ground > SOME * count.sum() and count[CLASS_NUMBER["other-ground"]] > FLOOR * ground
-    return logits if is_inside else None
+    within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
+    telling = within + without
+    return logits if telling > SOME * count.sum() and within > MOSTLY * telling else None
 
 
 def _likeliest(logits: Tensor, image: RangeImage, least: float, alone: bool) -> np.ndarray:
