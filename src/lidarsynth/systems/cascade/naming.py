@@ -109,13 +109,13 @@ def named(
     off = FAIR * np.log(weights())
     for word, logit in (more or {}).items():
         off[CLASS_NUMBER[word]] -= logit
-    rays, labels = response.told(rays_told(sensor)), []
-    with torch.autocast(next(network.parameters()).device.type, torch.bfloat16, enabled=precision == "bf16"):
+    rays, device, labels = response.told(rays_told(sensor)), next(network.parameters()).device, []
+    with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
         for image in images:
-            even = response.even(image.reflectance)
-            logits = None if inside is None else _inside(_logits(inside, image, even, rays), image)
+            told = _told(image, response.even(image.reflectance), rays, device)
+            logits = None if inside is None else _inside(_logits(inside, told, image.shape), image)
             if logits is None:
-                logits = _without(_logits(network, image, even, rays), off)
+                logits = _without(_logits(network, told, image.shape), off)
                 logits[0] = -math.inf  # 0 is no answer
             labels.append(_likeliest(logits, image, least, alone) * image.mask)
     return [replace(image, label=label) for image, label in zip(images, labels, strict=True)]
@@ -128,7 +128,7 @@ def _without(logits: Tensor, off: np.ndarray) -> Tensor:
 def _inside(logits: Tensor, image: RangeImage) -> Tensor | None:
     """The logits (20, H, W) of the network of insides, if by these the image is of one; else None."""
     logits = _without(logits, FAIR * np.log(inside_weights()))
-    count = np.bincount(_likeliest(logits, image, 0, False)[image.mask], minlength=len(logits))
+    count = np.bincount(_likeliest(logits, image, 0, True)[image.mask], minlength=len(logits))
     within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
     telling = within + without
     return logits if telling > SOME * count.sum() and within > MOSTLY * telling else None
@@ -160,19 +160,21 @@ def of_surfaces(chances: Tensor, metres: Tensor) -> Tensor:
     return total / count
 
 
-def _logits(network: ClassUNet, image: RangeImage, even: np.ndarray, rays: Rays) -> Tensor:
-    """(20, H, W) of every ray, told reflectances (H, W) as the streets' sensor would report
-    them. One image at a time: four at once take a quarter longer, and longer sums may round otherwise.
-    """
-    device, size = next(network.parameters()).device, (rays.elevation.shape[2], rays.elevation.shape[3])
+def _told(image: RangeImage, even: np.ndarray, rays: Rays, device: torch.device) -> Tensor:
+    """(1, C, H', W') `class_inputs` of every ray, told reflectances (H, W) as the streets' sensor would report them."""
+    size = rays.elevation.shape[2], rays.elevation.shape[3]
     known = known_of(image.range[None], even[None], image.mask[None], True, size)
-    (height, width), columns = image.shape, np.arange(size[1]) % image.shape[1]
-    around = surroundings(_on_true_beams(image))[None][..., columns]
-    around = np.pad(around, ((0, 0), (0, 0), (0, size[0] - height), (0, 0)))
+    around = surroundings(_on_true_beams(image))[None][..., np.arange(size[1]) % image.shape[1]]
+    around = np.pad(around, ((0, 0), (0, 0), (0, size[0] - len(image.range)), (0, 0)))
     parts = known.metres, known.reflectance, torch.from_numpy(around), *rays
     metres, shade, near, *told = (part.to(device) for part in parts)
-    logits = network(around_the_turn(class_inputs(metres, shade, near, Rays(*told))))
-    return logits[0, :, :height, :width].float().cpu()
+    return around_the_turn(class_inputs(metres, shade, near, Rays(*told)))
+
+
+def _logits(network: ClassUNet, told: Tensor, size: tuple[int, int]) -> Tensor:
+    """(20, H, W) of an image of that size. One at a time: four at once take a quarter longer, and longer sums may round
+    otherwise."""
+    return network(told)[0, :, : size[0], : size[1]].float().cpu()
 
 
 def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
