@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import lidarsynth as ls
 from lidarsynth.cli.main import main
 from lidarsynth.data.layouts import nuscenes
 from lidarsynth.data.street_sets import write_streets
 from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.floors import SMALLEST, Opening, draw_rooms, wall, walls_between
@@ -17,9 +19,10 @@ from lidarsynth.streets.frame import FURNITURE, LabelledStreets, Options
 from lidarsynth.streets.furniture import KINDS
 from lidarsynth.streets.interiors import building, buildings, interiors
 from lidarsynth.streets.raycast import Caster
+from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.shapes import join
 from lidarsynth.streets.weather import Weather
-from lidarsynth.streets.world import visible
+from lidarsynth.streets.world import POSES, visible
 from lidarsynth.training.examples import open_images, words_of
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
@@ -213,3 +216,23 @@ def test_mixed_words_and_folders_are_refused_by_name(tmp_path):
         ValueError, match="expected streets of one sensor, such as synthetic, for the network conditional-unet"
     ):
         open_images("synthetic,interiors", preset("tiny"))
+
+
+@pytest.mark.parametrize(("own", "floors"), [(False, True), (True, False)])
+def test_a_room_is_named_by_the_network_of_insides_unless_a_model_has_classes_of_its_own(own: bool, floors: bool):
+    """A robot's scan: `default` says what is floor; what was learned from a user's own labels stands."""
+    image = interiors(77, 3 * POSES).image(2 * POSES)
+    model = ls.load("default").into(image.sensor)
+    if own:
+        model = replace(model, experiment=with_fields(model.experiment, {"model.own_classes": True}))
+    named = model.label(replace(image, label=None).to_scan()).label
+    truth = image.to_scan().label
+    assert named is not None and truth is not None
+    assert bool(np.mean(named[truth == FLOOR] == FLOOR) > 0.9) is floors
+    assert bool(np.mean(named == truth) > 0.7) is floors
+
+
+def test_no_street_is_taken_for_the_inside_of_a_building():
+    image = SyntheticStreets(77, 16).image(3)
+    named = ls.load("default").into(image.sensor).label(replace(image, label=None).to_scan()).label
+    assert named is not None and not (named == FLOOR).any() and named.min() >= 1

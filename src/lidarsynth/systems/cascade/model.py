@@ -19,7 +19,6 @@ from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.class_unet import ClassUNet
 from lidarsynth.networks.coarse_unet import ROWS, grid_rays
 from lidarsynth.networks.device import each_usually
 from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
@@ -197,7 +196,7 @@ class CascadeModel(AnySensorModel):
         filled = replace(filled, reflectance=unit.read(shade, filled) * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
-        return own._named([filled], inside=self.network.inside)[0]
+        return own._named([filled], recorded=True)[0]
 
     def upsampled(
         self,
@@ -251,7 +250,7 @@ class CascadeModel(AnySensorModel):
         model = model.suited_to(scan) if sensor is None else model.into(sensor)
         pixels = pixel_of_points(scan, model.sensor, projection)
         image = check_seen(project(scan, model.sensor, projection, pixels=pixels), len(scan))
-        (image,) = model._as_found(image, image.mask)._named([image], least, self.network.inside)
+        (image,) = model._as_found(image, image.mask)._named([image], least, recorded=True)
         return replace(image, completed=replace(scan, label=class_of_points(scan.xyz, image, pixels)))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
@@ -293,11 +292,13 @@ class CascadeModel(AnySensorModel):
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         return self._named(recorded)
 
-    def _named(self, images: list[RangeImage], least: float = 0.0, inside: ClassUNet | None = None) -> list[RangeImage]:
-        """The images with the classes that `network.classes` sees in them, or without any that nobody asked for."""
+    def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
+        """The images with the classes that `network.classes` sees in them, or without any that nobody asked for; of
+        `recorded` ones of the insides of buildings, those of `network.inside`, unless the scans' own were learned."""
         if not self.labelled:
             return [replace(image, label=None) for image in images]
         assert self.network.classes is not None
+        inside = self.network.inside if recorded and not self.experiment.model.own_classes else None
         told = self.network.classes, images, self.response, self.sensor, self.precision, least
         return named(*told, inside=inside)
 
