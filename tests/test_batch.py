@@ -244,6 +244,28 @@ def test_shards_are_the_whole(scans: Path, tmp_path: Path):
             parse_shard(wrong)
 
 
+@pytest.mark.parametrize("verb", ["project", "complete"])
+def test_where_only_broken_files_are_left_they_are_counted(
+    verb: str, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """So that a job that goes on where it was stopped, and a shard, end as the whole run does."""
+    words = [verb, str(scans / "d1"), "--out", str(tmp_path / "o"), *WORDS]
+    words += ["--model", "bilinear"] if verb == "complete" else []
+    for skipped in (0, 2):
+        main([*words, "--skip-existing"])
+        report = told(tmp_path / "o")
+        assert (report["done"], report["failed"], report["skipped"]) == (2 - skipped, 1, skipped)
+        assert len(report["scans"]) == 3
+    said = capsys.readouterr()
+    assert "2 were there already; 1 failed: 001" in said.out and said.err.count("001.pcd: expected") == 2
+    words[3] = str(tmp_path / "parts")
+    for part in (1, 2, 3, 2):
+        main([*words, "--shard", f"{part}/3"])
+    assert capsys.readouterr().err.count("001.pcd: expected") == 2
+    merged = told(tmp_path / "parts")
+    assert (merged["done"], merged["failed"], merged["skipped"]) == (2, 1, 0) and len(merged["scans"]) == 3
+
+
 def test_globs_folders_and_files_are_alike(scans: Path):
     count = [inputs_of(paths).count for paths in ([scans], [scans / "d1", scans / "d2"], [scans / "*" / "*.pcd"])]
     assert count == [5, 5, 5]
@@ -264,6 +286,27 @@ def test_all_broken_is_a_refusal_and_leaves_nothing(tmp_path: Path, capsys: pyte
         main(["project", str(tmp_path / "in"), "--out", str(tmp_path / "o"), *WORDS])
     assert "found all 2 broken; the first: " in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_shards_that_are_all_broken_end_as_a_refusal_of_the_last(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "in").mkdir()
+    for name in ("a.pcd", "b.pcd"):
+        (tmp_path / "in" / name).write_bytes(b"no points")
+    words = ["project", str(tmp_path / "in"), "--out", str(tmp_path / "o"), *WORDS, "--shard"]
+    main([*words, "1/2"])
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "2/2"])
+    assert "report.json: expected scans, found all 2 of 2 shards broken" in capsys.readouterr().err
+
+
+def test_a_broken_shard_does_not_speak_for_the_scans_of_another_recipe(scans: Path, tmp_path: Path):
+    words = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS, "--shard", "1/2", "--width"]
+    main([*words, "256"])
+    first = told(tmp_path / "o", "report-1-of-2.json")
+    (scans / "d2" / "000.pcd").write_bytes(b"no points")
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "512"])
+    assert told(tmp_path / "o", "report-1-of-2.json") == first
 
 
 def test_points_of_another_frame_come_back_where_they_were(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -291,6 +334,20 @@ def test_points_of_another_frame_come_back_where_they_were(tmp_path: Path, capsy
     assert (~old).sum() > 500 and np.all(filled.extra["ambient"][~old] == 0)
     ground = filled.xyz[~old][:, 2]
     assert abs(np.median(ground[ground < 1])) < 0.3, "new points lie on the file's ground, not 1.73 m below it"
+
+
+@pytest.mark.parametrize("count", [1, 200])
+def test_what_fails_is_said_in_the_words_of_the_command_line(
+    count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Not in those of Python, and without what would be said of a completion that there is none of."""
+    rng = np.random.default_rng(0)
+    write(tmp_path / "a.ply", Scan(rng.uniform(1, 20, (count, 3)).astype(np.float32), rng.random(count, np.float32)))
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(tmp_path / "a.ply"), "--out", str(tmp_path / "o.ply"), WORDS[0]])
+    error = capsys.readouterr().err
+    assert error.startswith(f"lidarsynth: {tmp_path / 'a.ply'}: expected ") and error.count("expected") == 1
+    assert error.endswith("with --sensor\n")
 
 
 def test_processes_answer_in_order():

@@ -3,6 +3,7 @@
 import resource
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from broken import BODY, BROKEN, points
 from lidarsynth.files import formats as files
 from lidarsynth.files.formats import read, read_image, read_with_report, write
 from lidarsynth.files.labels import read_labels
-from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import MOST, SENSORS
 
 
 def refuse(path: Path, *words: str) -> str:
@@ -217,3 +219,69 @@ def test_write_refuses_what_is_no_scan(tmp_path: Path):
     with pytest.raises(files.FileError, match=r"scan.bin: expected a Scan or a RangeImage, found ndarray"):
         files.write(tmp_path / "scan.bin", np.zeros((5, 4), np.float32))  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
+
+
+def test_write_refuses_what_would_not_come_back(tmp_path: Path):
+    """One line before anything is written: the file and what is beside it stay as they are."""
+    numbers, n = np.arange(len(SCAN)), len(SCAN)
+    named, bare = (".pcd", ".ply", ".npz"), (".bin", ".npy")
+    wrong: list[tuple[tuple[str, ...], str, dict]] = [
+        (named, "expected ring numbers of 0-4095 in .*, found 70000", {"ring": numbers + 70000}),
+        (named, "expected ring numbers of 0-4095 in .*, found -1", {"ring": numbers - 1}),
+        (named[:2], "expected label numbers of 0-65535 in .*, found -1", {"label": numbers - 1}),
+        (named[:2], "expected label numbers of 0-65535 in .*, found 65536", {"label": numbers + 65536}),
+        (named[:2], "expected times in seconds in .*, of which float64 loses digits", {"time": numbers + (1 << 60)}),
+        (named, "expected one number a point, .*, found late of .1,.", {"late": np.ones(1)}),
+        (named[:2], "expected fields of numbers in .*, found q of (float128|longdouble)", {"q": np.ones(n, "g")}),
+        (bare, "expected labels of 0-19, .*, found -1; ", {"label": numbers - 1}),
+        (bare, "expected labels of 0-19, .*, found 255; ", {"label": numbers + 255}),
+        (bare, "expected raw labels of 0-4294967295, found -1", {"raw_label": numbers - 1}),
+        (bare, "expected raw labels of 0-4294967295, found 0.5", {"raw_label": numbers + 0.5}),
+        (bare, "expected whole numbers as raw labels, found <U1", {"raw_label": np.full(n, "a")}),
+        (bare, "expected new of 0 and 1, at most 255, found 300", {"new": np.full(n, 300)}),
+        (bare, "expected numbers as confidence, found <U1", {"confidence": np.full(n, "a")}),
+        (bare, "expected one number a point, .*, found new of .3,.", {"new": np.zeros(3, np.uint8)}),
+    ]
+    for kind in ("U2", "O", "c16", "M8[s]"):
+        wrong.append((named, "expected fields of numbers in .*, found note of ", {"note": np.zeros(n, kind)}))
+    marked = replace(SCAN, label=numbers % 20, extra={"new": np.zeros(n, np.uint8)})
+    for suffixes, words, fields in wrong:
+        own = {name: values for name, values in fields.items() if name in ("ring", "label", "time")}
+        scan = replace(SCAN, **own, extra={})
+        scan.extra.update({name: values for name, values in fields.items() if name not in own})  # type: ignore[attr-defined]
+        for suffix in suffixes:
+            path = tmp_path / f"a{suffix}"
+            write(path, marked)
+            before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+            with pytest.raises(files.FileError, match=words) as error:
+                write(path, scan)
+            assert str(error.value).startswith(f"{path}: expected ") and "\n" not in str(error.value)
+            assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+    with pytest.raises(files.FileError, match=r"b.label: expected labels of 0-19"):
+        files.write_labels(tmp_path / "b.label", replace(SCAN, label=numbers + 20))
+
+
+def test_write_refuses_an_image_that_could_not_be_read(tmp_path: Path):
+    sensor = SENSORS["vlp-16"].resized(width=32)
+    mask = np.ones((16, 32), bool)
+    image = RangeImage(np.full(mask.shape, 9.0), np.full(mask.shape, 0.5), mask, sensor)
+    for fields, words in (
+        ({"label": np.full(mask.shape, 255)}, "label of 0 to 19, found 512 such as 255"),
+        ({"label": np.full(mask.shape, 0.0)}, "label of whole numbers, found float64"),
+        ({"reflectance": np.full(mask.shape, 7.0)}, "reflectance of 0 to 1, found 512 such as 7.0"),
+        ({"range": np.full(mask.shape, 1e5)}, "range of 0 to 10000, found 512"),
+    ):
+        with pytest.raises(files.FileError, match=f"a.npz: expected (finite )?{words}"):
+            write(tmp_path / "a.npz", replace(image, **fields))
+    assert not list(tmp_path.iterdir())
+    write(tmp_path / "a.npz", replace(image, mask=mask & False, label=np.full(mask.shape, 255)))  # no ray returned
+    assert not read_image(tmp_path / "a.npz").label.any()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npz"])
+def test_as_many_rings_come_back_as_an_image_may_have_beams(suffix: str, tmp_path: Path):
+    scan = replace(SCAN, ring=np.arange(len(SCAN)) + MOST - len(SCAN), label=np.full(len(SCAN), 255))
+    write(tmp_path / f"a{suffix}", scan)
+    found = read(tmp_path / f"a{suffix}")
+    assert found.ring is not None and set(found.ring) <= set(range(MOST))
+    np.testing.assert_array_equal(found.extra["label"], scan.label)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -130,6 +131,21 @@ def test_what_cannot_be_exported_is_said_in_a_line(tmp_path: Path):
     with pytest.raises(ValueError, match="without tilt and blocked rays"):
         graph_of(tilted, open_columns=True)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_folder_of_the_file_is_made_and_what_is_no_file_is_refused_at_once(tmp_path: Path):
+    (tmp_path / "x.onnx").mkdir()
+    (tmp_path / "file").touch()
+    for name, found in (("x.onnx", "that ends in .onnx, found a folder"), ("x.pt", "that ends in .onnx, found 'x.pt'"),
+                        ("file/x.onnx", f"a writable folder, found a file at {tmp_path / 'file'}")):  # fmt: skip
+        with pytest.raises(ValueError, match=re.escape(found)) as error:
+            export_onnx(cascade(), tmp_path / name)
+        assert str(error.value).startswith(f"{tmp_path / name}: expected ")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "x.onnx"]
+    done = export_onnx(cascade(), tmp_path / "new" / "folder" / "x.onnx")
+    assert done.path.stat().st_size == done.size > 0
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from full_scan import N, full_scan, same
 
+from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import read, read_with_report
 from lidarsynth.files.lzf import decompress
 from lidarsynth.lidar.scan import Scan
@@ -176,6 +177,26 @@ def test_npz_of_one_table(name: str, scan: Scan, tmp_path: Path):
     table = np.column_stack([scan.xyz, scan.reflectance])
     np.savez_compressed(tmp_path / "scan.npz", **{name: np.asfortranarray(table)})
     same(read(tmp_path / "scan.npz"), scan, ("xyz", "reflectance"))
+
+
+def test_npz_of_one_array_in_rows(scan: Scan, tmp_path: Path):
+    """As the same array in .npy; beside it (H, W) are fields of its points, a pose and other matrices are none."""
+    table = np.column_stack([scan.xyz, scan.reflectance]).reshape(10, -1, 4)
+    np.save(tmp_path / "scan.npy", table)
+    np.savez(tmp_path / "scan.npz", points=table)
+    same(read(tmp_path / "scan.npz"), read(tmp_path / "scan.npy"))
+    same(read(tmp_path / "scan.npz"), scan, ("xyz", "reflectance"))
+    more = {"ring": scan.ring.reshape(10, -1), "pose": np.eye(4), "wide": np.zeros((3, 20))}
+    np.savez(tmp_path / "scan.npz", points=table, **more)
+    same(read(tmp_path / "scan.npz"), scan, ("xyz", "reflectance", "ring"))
+    np.savez(tmp_path / "scan.npz", points=table, pose=np.eye(4))
+    same(read(tmp_path / "scan.npz"), scan, ("xyz", "reflectance"))
+    boxes = np.zeros((7, 8, 3))
+    np.savez(tmp_path / "scan.npz", points=table.reshape(-1, 4), boxes=boxes)
+    same(read(tmp_path / "scan.npz"), scan, ("xyz", "reflectance"))
+    np.savez(tmp_path / "scan.npz", points=table, boxes=boxes)
+    with pytest.raises(FileError, match="expected the fields x, y, z, found no x, y, z in only points, boxes"):
+        read(tmp_path / "scan.npz")
 
 
 def test_npy_tables(scan: Scan, tmp_path: Path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarsynth.files.fields import FileError
-from lidarsynth.files.formats import read
+from lidarsynth.files.formats import read, read_with_report
 from lidarsynth.files.text import read_text
 
 ROWS = "1 2 3 0.5\n4 5 6 0.25\n"
@@ -53,12 +53,30 @@ def test_an_empty_cell_is_a_lost_point(tmp_path):
     assert len(read(tmp_path / "p.xyz")) == 1
 
 
+def test_a_named_file_may_begin_with_lost_points(tmp_path):
+    """As pandas writes rows of NaN, and organised clouds begin; between tabs the first and last cells may be empty."""
+    header, rows = (
+        ["x", "y", "z", "intensity", "ring"],
+        [[""] * 5, ["1", "2", "3", "0.5", "0"], ["", "", "", "0.5", ""]],
+    )
+    for separator in (",", ";", "\t"):
+        text = "\n".join(separator.join(row) for row in [header, *rows, ["4", "5", "6", "0.25", "1"]]) + "\n"
+        (tmp_path / "p.csv").write_text(text)
+        found, dropped = read_with_report(tmp_path / "p.csv")
+        np.testing.assert_array_equal(found.xyz, [[1, 2, 3], [4, 5, 6]])
+        np.testing.assert_array_equal(found.ring, [0, 1])
+        assert dropped == 2
+    (tmp_path / "p.csv").write_text("x\ty\tz\tintensity\n1\t2\t3\t0.5\t\n\t\n")  # a tab after each number
+    np.testing.assert_array_equal(read(tmp_path / "p.csv").xyz, [[1, 2, 3]])
+
+
 @pytest.mark.parametrize(
     ("data", "words"),
     [
         (b"hello", "names them, found 'hello'"),
         (b"a,b,c\n1,2,3", "names them"),
         (b"1 2 3\n1 2", "3 numbers a line, found 2"),
+        (b",,\n1,2,3\n", "names them, found ',,'"),
         (b"x y z i\n1 2 3\n", "a number for each of x, y, z, i"),
         (b"1 2 3\n1 2 b\n", "expected numbers, found"),
         (b"\xff\xfe\x00", "as text"),

@@ -142,6 +142,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         report_of,
         report_path,
         rows_before,
+        same,
         shard_reports,
         write_report,
     )
@@ -160,7 +161,9 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
         results = _done(job, model, _again(first, stream), many, count, report, settings)
         seconds = time.perf_counter() - begun
-        if all(result.error is not None for result in results) and results:
+        others = report.is_file() and not same(report, settings["recipe"], told=False)  # of a part, to be kept
+        nothing = results and not skipped and all(result.error is not None for result in results)
+        if nothing and (shard[1] == 1 or others):  # else the other parts may be whole
             _refuse_all(results)
         out.mkdir(parents=True, exist_ok=True)
         before = rows_before([*replaced, report], skipped)
@@ -175,6 +178,8 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         warn(f"{report}: of this run's scans now, in place of {', '.join(path.name for path in replaced[:NAMED])}"
              f"{', ...' if replaced[NAMED:] else ''}, of shards that were made here before")  # fmt: skip
     _summary(results, len(skipped), seconds, merged or report)
+    if merged is not None:
+        _check_any(merged)
     return results
 
 
@@ -335,8 +340,6 @@ def _tell_of_many(result: Result, picture: bool, each: bool, number: int) -> Non
 
 def _summary(results: list[Result], skipped: int, seconds: float, where: Path) -> None:
     failed = [result for result in results if result.error is not None]
-    if results and len(failed) == len(results):
-        _refuse_all(results)
     if failed and failed[0] is results[0]:
         warn(_named(failed[0]))
     done = len(results) - len(failed)
@@ -353,6 +356,16 @@ def _named(result: Result) -> str:
     text, name = str(result.error).removeprefix(f"{result.source}: "), Path(result.name).name
     one_of_many = not result.source.name.startswith(name) and name not in text
     return text if str(result.source) in text else f"{result.source}: {f'{name}: ' if one_of_many else ''}{text}"
+
+
+def _check_any(merged: Path) -> None:
+    """Raises ValueError where the report of all shards tells that every scan failed."""
+    from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
+
+    report = read_json(merged, LARGEST_INDEX)
+    if report["failed"] and not report["done"] + report["skipped"]:
+        raise ValueError(f"{merged}: expected scans, found all {report['failed']} of {report['settings']['shards']} "
+                         "shards broken")  # fmt: skip
 
 
 def _refuse_all(failed: list[Result]) -> NoReturn:

@@ -141,18 +141,18 @@ POSES = ((3, 3), (3, 4), (4, 4))
 
 def read_npz(data: bytes) -> Fields:
     """Our own scan (xyz, reflectance, ring, time, label), our own range image (`image_of`), columns under the usual
-    names, or a single array of points under any name (`read_npy`) and what else there is of each of them; beside it
-    matrices of the size of a pose are none. Arrays (H, W, 3) and (H, W) are flattened."""
+    names, or a single array of points under any name, also in rows (`read_npy`), and what else there is of each of
+    them; beside it matrices of the size of a pose are none. Arrays (H, W, 3) and (H, W) are flattened."""
     arrays = unzip(data)
     if "sensor" in arrays and "mask" in arrays:
         return scan_fields(image_of(arrays).to_scan())
     if "xyz" not in arrays:
-        tables = [array for array in arrays.values() if array.ndim == 2 or array.dtype.names]
-        tables = [table for table in tables if table.shape not in POSES] if tables[1:] else tables
-        if len(tables) != 1:
+        table = _points_among(arrays)
+        if table is None:
             return dict(arrays)
-        points = fields_of(tables[0])
-        return points | {name: array for name, array in arrays.items() if array.shape == tables[0].shape[:1]}
+        cells = table.shape if table.dtype.names else table.shape[:-1]
+        more = {name: array for name, array in arrays.items() if array.shape == cells and array is not table}
+        return fields_of(table) | {name: array.reshape(-1) for name, array in more.items()}
     xyz = arrays.pop("xyz")
     if xyz.ndim < 2 or xyz.shape[-1] != 3:
         raise FileError(f"expected xyz of (N, 3) or (H, W, 3), found {xyz.shape}")
@@ -161,6 +161,18 @@ def read_npz(data: bytes) -> Fields:
     if xyz.ndim == 3 and (ring := rings_of_grid(points, xyz.shape[:2])) is not None:
         points["ring"] = ring
     return points
+
+
+def _points_among(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
+    """The only array of points, poses apart: a table or structured, or, where none could be one, in rows (H, W, 3 to
+    10). None where there is no such array, or several."""
+    tables = [array for array in arrays.values() if array.ndim == 2 or array.dtype.names]
+    rows = [array for array in arrays.values() if array.ndim == 3 and 3 <= array.shape[2] <= 10]
+    if tables[1:] or len(rows) == 1:
+        tables = [table for table in tables if table.shape not in POSES]
+    if len(rows) == 1 and not any(table.dtype.names or 3 <= table.shape[1] <= 10 for table in tables):
+        return rows[0]
+    return tables[0] if len(tables) == 1 else None
 
 
 def unzip(data: bytes) -> dict[str, np.ndarray]:
@@ -240,6 +252,13 @@ def _checked(name: str, array: np.ndarray, returned: np.ndarray) -> np.ndarray:
         found = array[off]
         raise FileError(f"expected finite {name} of {low:g} to {high:g}, found {len(found)} such as {found[0]}")
     return array
+
+
+def check_saved(image: RangeImage) -> None:
+    """Raises FileError for numbers of an image that `image_of` would refuse."""
+    for name in IMAGE:
+        if (array := getattr(image, name)) is not None:
+            _checked(name, array, image.mask)
 
 
 def _like(returned: np.ndarray, array: np.ndarray) -> np.ndarray:

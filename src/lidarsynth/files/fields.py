@@ -6,9 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from lidarsynth.files.whole_numbers import EXACT, stray
 from lidarsynth.lidar.plural import plural, was
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import MOST, SENSORS
 
 Fields = dict[str, np.ndarray]  # what a format's reader returns: one (N,) array per field, under the file's own names
 
@@ -18,7 +19,8 @@ MAX_BYTES = 1 << 28  # of one file, and of one array packed in a file
 # scan's are, is half a millimetre off at most.
 MAX_METRES = 10_000.0
 EARTH = 2e7  # metres; no coordinate of a map is greater
-MAX_RINGS = 1024
+MAX_RINGS = MOST  # as many as an image may have beams: its rings come back
+SHORTS = 1 << 16  # whole numbers that the labels of a table have
 LONGEST = 10.0  # seconds that a turn may last
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
 SCALED = "reflectance by the format"  # a further field: intensities as 0-1, of formats that fix their scale; for "auto"
@@ -341,10 +343,35 @@ def written_names(names: Iterable[str], taken: Iterable[str]) -> list[str]:
     return written
 
 
+def check_table(scan: Scan, suffix: str) -> None:
+    """Raises FileError for what would not come back from a file with named fields: ring numbers that no reader takes,
+    and, but for `.npz` (`suffix`), labels and times in other types than a table's; further fields that are no numbers,
+    or not one a point."""
+    own_types = suffix == ".npz"
+    label, time = (None, None) if own_types else (scan.label, scan.time)
+    for name, values, limit in (("ring", scan.ring, MAX_RINGS), ("label", label, SHORTS)):
+        if values is not None and (found := stray(values, limit - 1)) is not None:
+            raise FileError(f"expected {name} numbers of 0-{limit - 1} in {suffix}, found {found}")
+    if time is not None and time.dtype.kind in "iu":
+        found = max(int(time.max(initial=0)), int(time.min(initial=0)), key=abs)
+        if abs(found) > EXACT:
+            raise FileError(f"expected times in seconds in {suffix}, found {found}, of which float64 loses digits")
+    for name, column in scan.extra.items():
+        if column.dtype.kind not in "biuf" or (column.dtype.itemsize > 8 and not own_types):
+            raise FileError(f"expected fields of numbers in {suffix}, found {name} of {column.dtype}")
+        check_length(name, column, len(scan))
+
+
+def check_length(name: str, column: np.ndarray, count: int) -> None:
+    """Raises FileError for a column that is not (count,), as a scan's `extra` may have it that was changed later."""
+    if np.shape(column) != (count,):
+        raise FileError(f"expected one number a point, ({count},), found {name} of {np.shape(column)}")
+
+
 def scan_table(scan: Scan) -> np.ndarray:
     """Packed structured array (N,): x y z intensity float32; ring uint16, timestamp float64, label uint16 if known.
 
-    Further fields follow in their own types, under `written_names`.
+    Further fields follow in their own types, under `written_names`. Numbers are expected as `check_table` has them.
     """
     columns = {axis: scan.xyz[:, i].astype("<f4") for i, axis in enumerate("xyz")}
     columns["intensity"] = scan.reflectance.astype("<f4")

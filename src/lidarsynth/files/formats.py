@@ -14,10 +14,18 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.files import arrays, e57, feather, las, pcd, ply, text
-from lidarsynth.files.fields import INTENSITIES, MAX_BYTES, Fields, FileError, scan_from_fields
-from lidarsynth.files.labels import label_path, read_labels, read_words
+from lidarsynth.files.fields import (
+    INTENSITIES,
+    MAX_BYTES,
+    Fields,
+    FileError,
+    check_length,
+    check_table,
+    scan_from_fields,
+)
+from lidarsynth.files.labels import label_path, read_labels, read_words, words_of
+from lidarsynth.files.whole_numbers import stray
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.whole_file import whole_file
 
 READERS: dict[str, Callable[[bytes], Fields]] = {
@@ -138,8 +146,9 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     a filled one `new` beside them in a `.new` file, a byte a point, and `confidence` in a `.confidence` file, a float32
     a point; such marks of another scan that would be taken for this one's are removed. The others hold ring, time,
     label and every further field too. The file appears whole or not at all: it is written beside its place, then
-    renamed. Raises FileError, also for anything else, such as an array, and for a `.bin` of no point: it would be a
-    file of no byte, which `read` takes for one that was cut off.
+    renamed. Raises FileError, before anything is written, for anything else, such as an array, for numbers that would
+    not come back (a ring of -1, a class of 20, text as a field), and for a `.bin` of no point: it would be a file of no
+    byte, which `read` takes for one that was cut off.
     """
     path = Path(path)
     if not isinstance(scan, Scan | RangeImage):
@@ -153,6 +162,8 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     if isinstance(content, Scan) and suffix == ".bin" and not len(content):
         raise FileError(f"{path}: expected points for .bin, whose file would be empty, found none: .npy, .npz, .pcd "
                         "and .ply say so themselves")  # fmt: skip
+    with naming(path):
+        _check(content, suffix)
     if isinstance(content, Scan) and suffix in BARE:  # before the file itself: where that stands, all is whole
         _without_marks(path, content)
         for name, kind in BESIDE.items():
@@ -167,6 +178,23 @@ def write(path: str | Path, scan: Scan | RangeImage) -> None:
     _put(path, lambda file: WRITERS[suffix](file, content))
 
 
+def _check(content: Scan | RangeImage, suffix: str) -> None:
+    """Raises FileError for what would not come back from the file, or from those beside it."""
+    if isinstance(content, RangeImage):
+        return arrays.check_saved(content)
+    if suffix not in BARE:
+        return check_table(content, suffix)
+    words_of(content)
+    for name, marks in content.extra.items():
+        if name not in BESIDE:
+            continue
+        check_length(name, marks, len(content))
+        if marks.dtype.kind not in "biuf":
+            raise FileError(f"expected numbers as {name}, found {marks.dtype}")
+        if name == "new" and (found := stray(marks, 255)) is not None:
+            raise FileError(f"expected {name} of 0 and 1, at most 255, found {found}")
+
+
 def write_labels(path: str | Path, scan: Scan) -> None:
     """Save the labels of a scan as SemanticKITTI's `.label`: its `extra["raw_label"]`, or its classes' raw ids.
 
@@ -174,9 +202,10 @@ def write_labels(path: str | Path, scan: Scan) -> None:
     """
     if scan.label is None and "raw_label" not in scan.extra:
         raise ValueError(f"{path}: expected a scan with labels, found one without")
-    words = scan.extra.get("raw_label", None if scan.label is None else RAW[scan.label])
+    with naming(path):
+        words = words_of(scan)
     assert words is not None
-    _put(Path(path), lambda file: file.write(words.astype("<u4").tobytes()))
+    _put(Path(path), lambda file: file.write(words.tobytes()))
 
 
 def _put(path: Path, write_to: Callable[[BufferedIOBase], object]) -> None:

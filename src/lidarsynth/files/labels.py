@@ -6,8 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.files.fields import FileError
-from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW
+from lidarsynth.files.fields import FileError, check_length
+from lidarsynth.files.whole_numbers import stray
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW, RAW
+
+WORDS = 1 << 32  # that 4 bytes tell apart
 
 
 def read_labels(path: str | Path, n: int) -> np.ndarray:
@@ -31,6 +35,25 @@ def read_words(path: str | Path, n: int) -> np.ndarray:
     if len(data) != 4 * n:
         raise FileError(f"{path}: expected {4 * n} bytes, one label of 4 for each of {n} points, found {len(data)}")
     return np.frombuffer(data, "<u4")
+
+
+def words_of(scan: Scan) -> np.ndarray | None:
+    """(N,) uint32 words of a scan's `.label` file: its `extra["raw_label"]`, else its classes' raw ids; None where it
+    has neither. Raises FileError (without the path) for what is no such word, or no class."""
+    if "raw_label" in scan.extra:
+        words = scan.extra["raw_label"]
+        check_length("raw_label", words, len(scan))
+        if words.dtype.kind not in "biuf":
+            raise FileError(f"expected whole numbers as raw labels, found {words.dtype}")
+        if (found := stray(words, WORDS - 1)) is not None:
+            raise FileError(f"expected raw labels of 0-{WORDS - 1}, found {found}")
+        return words.astype("<u4")
+    if scan.label is None:
+        return None
+    if (found := stray(scan.label, len(RAW) - 1)) is not None:
+        raise FileError(f"expected labels of 0-{len(RAW) - 1}, SemanticKITTI's training classes, for a .label file, "
+                        f'found {found}; extra["raw_label"] takes other ids')  # fmt: skip
+    return RAW[scan.label].astype("<u4")
 
 
 def label_path(scan: Path) -> Path:

@@ -172,8 +172,6 @@ def write_ply(file: BufferedIOBase, scan: Scan) -> None:
     nanoseconds, stay int64 or uint64, which not all readers know.
     """
     table = _narrowed(scan_table(scan))
-    if other := [n for n in table.dtype.names or () if table.dtype[n].str[1:] not in WRITTEN]:
-        raise FileError(f"expected fields of numbers in .ply, found {other[0]} of {table.dtype[other[0]]}")
     properties = [f"property {WRITTEN[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
     header = [
         "ply",

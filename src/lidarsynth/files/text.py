@@ -28,9 +28,10 @@ def read_text(data: bytes) -> Fields:
     for start, line in enumerate(lines):
         separator = _separator(line)
         words = _words(line.lstrip("#/% "), separator)
-        if _numeric(words) and len(words) >= 3 and not line.startswith(COMMENT):
+        empty = names is not None and not any(words)  # of a point without a return
+        if (_numeric(words) or empty) and len(words) >= 3 and not line.startswith(COMMENT):
             break
-        if {"x", "y", "z"} <= {_ours(word) for word in words}:
+        if _names(words):
             names = [_without_unit(word) or word for word in words]
         elif not (line.startswith(COMMENT) or (len(words) == 1 and words[0].isdecimal())) or start >= HEADER_LINES:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
@@ -69,7 +70,10 @@ def _lines(data: bytes) -> list[str]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FileError(f"expected lines of numbers as text, found bytes: {data[:12]!r}") from None
-    lines = [line for line in map(str.strip, text.splitlines()) if line]
+    rows = text.splitlines()
+    first = [row.strip() for row in rows[:HEADER_LINES]]
+    tabs = next((row.count("\t") for row in first if _separator(row) == "\t" and _names(row.split("\t"))), 0)
+    lines = [line for line in (_without_blanks(row, tabs) for row in rows) if line]
     if len(lines) > MAX_POINTS:
         raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {len(lines)} lines")
     return lines
@@ -81,6 +85,18 @@ def _separator(line: str) -> str | None:
 
 def _words(line: str, separator: str | None) -> list[str]:
     return [word.strip().strip("\"'") for word in line.split(separator)]
+
+
+def _without_blanks(line: str, tabs: int) -> str:
+    """A line without blanks around it; the tabs of a line of as many as there are between the names (0: none) stay, for
+    the first and last of its cells may be empty."""
+    whole = line.strip(" ")
+    return whole if tabs and whole.count("\t") == tabs else line.strip()
+
+
+def _names(words: list[str]) -> bool:
+    """Whether a line names columns."""
+    return {"x", "y", "z"} <= {_ours(word.strip("#/% \"'")) for word in words}
 
 
 def _ours(word: str) -> str:

@@ -1,5 +1,5 @@
-"""Whole numbers in text: of 64 bits, such as times in nanoseconds, where float64 does not tell neighbours apart, and of
-the types that headers declare."""
+"""Whole numbers: of 64 bits in text, such as times in nanoseconds, where float64 does not tell neighbours apart, of the
+types that headers declare, and those that a type does not hold."""
 
 from __future__ import annotations
 
@@ -35,3 +35,10 @@ def typed(column: np.ndarray, words: Sequence[bytes] | Sequence[str], dtype: np.
     low, high = max(limits.min, -EXACT), min(limits.max, EXACT)
     inside = (low <= column) & (column <= high) & (column == np.floor(column))
     return column.astype(dtype) if inside.all() else column
+
+
+def stray(values: np.ndarray, most: int) -> np.generic | None:
+    """The first of numbers (N,) that is no whole one from 0 to `most`, or None."""
+    off = ~((values >= 0) & (values <= most))
+    off |= values != np.floor(values) if values.dtype.kind == "f" else False
+    return values[off][0] if off.any() else None

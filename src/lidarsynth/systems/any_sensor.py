@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
+
+
 class AnySensorModel(ScanModel, ABC):
     """A frozen record with `sensor` and `experiment`, whose network knows none of them."""
 
@@ -45,7 +48,7 @@ class AnySensorModel(ScanModel, ABC):
             if sensor is None and lies_on(scan, self.sensor):
                 sensor = self.sensor  # the user's own, on which the model was tuned
             if sensor is None:
-                raise ValueError(f"{reason}, or take model.into(sensor)")
+                raise ValueError(f"{reason}{IN_PYTHON}")
             sensor = own_beams(scan, get_sensor(sensor))
         return self.into(sensor)
 

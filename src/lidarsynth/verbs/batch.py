@@ -28,6 +28,7 @@ from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
+from lidarsynth.systems.any_sensor import IN_PYTHON
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL, check_companions
@@ -174,8 +175,9 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         loaded = work.item.read()
         with_points(loaded.scan, str(work.item.path))
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
-        warning = warning or _viewpoint_warning(job, work) or _caution(loaded.scan, job, work)
+        warning = warning or _viewpoint_warning(job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
+        warning = warning or _caution(loaded.scan, job, work)  # of what was made: not said where nothing is
         cloud, beside = None, ()
         if work.target is None:
             points = _points(done, loaded, job.transform)
@@ -186,7 +188,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     except (ValueError, FloatingPointError) as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT):
             raise  # that is no fault of the scan, and the next ones would not fit either
-        text = str(error) if warning is None or warning == str(error) else f"{warning}; as they are: {error}"
+        text = str(error).replace(IN_PYTHON, "")
+        text = text if warning is None or warning == text else f"{warning}; as they are: {text}"
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, text)
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors

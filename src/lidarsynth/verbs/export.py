@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -47,22 +48,34 @@ def export_onnx(model: ScanModel, path: str | Path, sensor: str | None = None, o
     open_columns  inputs may have any number of columns, in multiples of 16, up to 4,096
 
     The file's metadata name the sensor (JSON), what inputs and outputs are, the model and its licence.
-    Raises ValueError for other models, for a name without .onnx, and where the extra `onnx` is missing.
+    A folder that is not there is made. Raises ValueError for other models, for a name without .onnx, and where the
+    extra `onnx` is missing.
     """
     path = Path(path)
-    if path.suffix.lower() != ".onnx" or path.is_dir() or not path.absolute().parent.is_dir():
-        raise ValueError(f"{path}: expected the name of a file in an existing folder that ends in .onnx")
+    _check_writable(path)
     model = model if sensor in (None, model.sensor.name) else model.into(get_sensor(sensor))
     graph = graph_of(model, open_columns)
     proto = _program(graph)
     shapes = _shapes(proto.graph.input), _shapes(proto.graph.output)
     _describe(proto, model, graph)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, proto.SerializeToString())
     except OSError as error:
         raise ValueError(f"{path}: expected a writable folder with room, found: {error.strerror}") from None
     opset = next(entry.version for entry in proto.opset_import if not entry.domain)
     return Exported(path, graph.does, opset, model.sensor, *shapes, graph.says, path.stat().st_size)
+
+
+def _check_writable(path: Path) -> None:
+    """Raises ValueError, before the minute that it takes, for what is no name of a file to write."""
+    if path.suffix.lower() != ".onnx" or path.is_dir():
+        found = "a folder" if path.is_dir() else repr(path.name[-20:])
+        raise ValueError(f"{path}: expected the name of a file that ends in .onnx, found {found}")
+    parent = next(folder for folder in path.absolute().parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        found = "a file" if parent.is_file() else "no right"
+        raise ValueError(f"{path}: expected a writable folder, found {found} at {parent}")
 
 
 def _program(graph: Graph) -> Any:
