@@ -127,7 +127,9 @@ def _without(logits: Tensor, off: np.ndarray) -> Tensor:
 
 def _inside(logits: Tensor, image: RangeImage) -> Tensor | None:
     """The logits (20, H, W) of the network of insides, if by these the image is of one; else None."""
-    logits = _without(logits, FAIR * np.log(inside_weights()))
+    off = FAIR * np.log(inside_weights())
+    off[CLASS_NUMBER["person"]] = 0  # a chair that is taken for a person is better than a person that is not seen
+    logits = _without(logits, off)
     count = np.bincount(_likeliest(logits, image, 0, True)[image.mask], minlength=len(logits))
     within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
     telling = within + without
