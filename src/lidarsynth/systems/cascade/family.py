@@ -43,7 +43,7 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
     classes = ClassUNet(model.class_channels, classes=model.classes) if model.classes else None
     judge = GridJudge(model.judge_channels) if model.judge_channels else None
-    inside = ClassUNet(model.inside_channels) if model.inside_channels else None
+    inside = ClassUNet(model.inside_channels) if model.classes and model.inside_channels else None
     return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside)
 
 
