@@ -161,12 +161,17 @@ def dense(name: str, models: Sequence[str], stance: Mapping[str, Any], count: in
     yield from (f"| {word} | {a:.3f} | {b:.4f} |" for word, (a, b) in totals.items())
 
 
+def buildings(count: int) -> list[RangeImage]:
+    """As many buildings that nothing was trained on, each by a virtual sensor that is not told how it stands."""
+    reader = interiors(HELD_OUT, POSES * count)
+    seen = (reader.image(POSES * k) for k in range(count))
+    return [replace(image, sensor=replace(image.sensor, mount=1.73, tilt=(0.0, 0.0))) for image in seen]
+
+
 def inside(models: Sequence[str], count: int = 24) -> Iterator[str]:
     """Metres / reflectance of hidden pixels, and of those that returned, in as many buildings; nobody is told how the
     sensor stands."""
-    reader = interiors(HELD_OUT, POSES * count)
-    seen = (reader.image(POSES * k) for k in range(count))
-    images = [replace(image, sensor=replace(image.sensor, mount=1.73, tilt=(0.0, 0.0))) for image in seen]
+    images = buildings(count)
     yield f"| {count} buildings | " + " | ".join((*RIVALS, *models)) + " |"
     yield "|---" * (len(RIVALS) + len(models) + 1) + "|"
     patterns: dict[str, Callable[[RangeImage, int], np.ndarray]] = {

@@ -23,6 +23,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import any_sensor
 import numpy as np
 import torch
 from street import HELD_OUT, SENSOR, WORD, labelled, streets
@@ -31,7 +32,6 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.metrics.reconstruction import class_iou, confusion_matrix
 from lidarsynth.networks.rangenet import RangeNet
-from lidarsynth.streets.interiors import interiors
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.streets.world import POSES
 from lidarsynth.systems.cascade.model import CascadeModel
@@ -97,18 +97,15 @@ def rows(model: ScanModel, args: argparse.Namespace) -> Iterator[str]:
         yield from (f"| {name}, {least:g} | {sure_cells(model, images, least)} |" for least in args.least)
 
 
-def buildings(count: int) -> list[RangeImage]:
-    """As many buildings, each by a virtual sensor."""
-    seen = (interiors(HELD_OUT, POSES * count).image(POSES * k) for k in range(count))
-    return [replace(image, sensor=replace(image.sensor, mount=1.73, tilt=(0.0, 0.0))) for image in seen]
-
-
 def inside(model: CascadeModel, count: int, others: dict[str, list[RangeImage]]) -> Iterator[str]:
     """Lines of a Markdown table: of each class in buildings, how many of its returns get it, and IoU; and how many
     scans of each kind are taken for the inside of a building."""
     floor, counts, taken = CLASS_NUMBER["other-ground"], np.zeros((20, 20), np.int64), []
-    wide = VirtualStreets(HELD_OUT, POSES * count)
-    sets = {f"{count} buildings": buildings(count), f"{count} streets": [wide.image(POSES * k) for k in range(count)]}
+    wide = VirtualStreets(any_sensor.HELD_OUT, POSES * count)
+    sets = {
+        f"{count} buildings": any_sensor.buildings(count),
+        f"{count} streets": [wide.image(POSES * k) for k in range(count)],
+    }
     for name, images in (sets | others).items():
         answers = [answered(model.into(image.sensor).with_labels(), image).label for image in images]
         taken.append((name, sum(bool((label == floor).any()) for label in answers if label is not None), len(images)))

@@ -34,7 +34,8 @@ def calmed(reflectance: Tensor, metres: Tensor, lit: Tensor, share: float = SHAR
     reach = min(REACH, (width - 1) // 2)
     far = torch.where(lit, metres.clamp_min(0.1).log(), math.inf)
     around = zip(*(_moved(ring(part, reach), width) for part in (reflectance, far)), strict=True)
-    there, values = zip(*(((away - far).abs() < ALIKE, value) for value, away in around), strict=True)  # not nan
+    # what is not lit is infinitely far, and alike to nothing: infinity less infinity is nan
+    there, values = zip(*(((away - far).abs() < ALIKE, value) for value, away in around), strict=True)
     ranked = _lowest([torch.where(near, value, math.inf) for near, value in zip(there, values, strict=True)], reach + 1)
     middle = ((torch.stack(there).sum(0) - 1) // 2).clamp_min(0)
     median = ranked.gather(0, middle[None])[0]
