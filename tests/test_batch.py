@@ -66,6 +66,19 @@ def test_one_broken_file_is_named_and_counted(scans: Path, tmp_path: Path, capsy
     assert all(row["seconds"] > 0 for row in report["scans"])
 
 
+def test_a_file_of_an_earlier_run_is_told_where_its_scan_fails_now(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    words = ["project", str(scans), "--out", str(tmp_path / "o"), *WORDS]
+    main(words)
+    (scans / "d2" / "000.pcd").write_bytes(b"no points")
+    main([*words, "--width", "256"])
+    old = tmp_path / "o" / "d2" / "000.npz"
+    assert f"; {old} is of an earlier run" in capsys.readouterr().err and old.exists()
+    errors = {row["name"]: row["error"] for row in told(tmp_path / "o")["scans"] if "error" in row}
+    assert "earlier run" in errors["d2/000"] and "earlier run" not in errors["d1/001"]
+
+
 @pytest.mark.parametrize("name", ["x.db3", "y.pcap", "z.las", "d3.zip", "w.csv", "v.tar.gz", "U.E57"])
 def test_a_kind_that_is_not_written_is_no_folder(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str

@@ -190,6 +190,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
             raise  # that is no fault of the scan, and the next ones would not fit either
         text = str(error).replace(IN_PYTHON, "")
         text = text if warning is None or warning == text else f"{warning}; as they are: {text}"
+        if work.target is not None and work.target.exists():
+            text += f"; {work.target} is of an earlier run"
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, text)
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
