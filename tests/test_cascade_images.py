@@ -14,7 +14,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import draw_coherent, draw_noise
 from lidarsynth.networks.rays import decode_range, encode_range
-from lidarsynth.systems.cascade.hanging import connected, landed
+from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.images import TEXTURE, agreed, as_read, noisy, with_doubts
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.surfaces import along_rings, evened
@@ -141,13 +141,6 @@ def test_a_drawn_scan_is_rough_where_greenery_is_seen_in_it(monkeypatch: pytest.
     smooth, rough = (np.abs(np.diff(image.range, 2, axis=1))[:, 8:-8] for image in seen)
     assert (seen[0].mask == seen[1].mask).all()
     assert np.median(rough[rough > 0]) > 2 * np.median(smooth[smooth > 0])
-
-
-def test_cells_are_connected_through_others():
-    least = connected(np.array([5, 3, 8, 1]), np.array([3, 2, 9, 0]), 10)
-    assert least.tolist() == [0, 0, 2, 2, 4, 2, 6, 7, 8, 8]
-    chain = np.random.default_rng(0).permutation(999)
-    assert not connected(chain, chain + 1, 1000).any()
 
 
 def test_three_tenths_of_what_hangs_are_taken_away_and_what_stands_stays():

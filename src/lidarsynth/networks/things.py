@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.lidar.pieces import connected
 from lidarsynth.networks.fill_unet import draw_noise
 from lidarsynth.networks.rays import Rays
 
@@ -34,7 +35,7 @@ def things(metres: Tensor, rays: Rays) -> np.ndarray:
     step = np.maximum(elevation[:, :-1] - elevation[:, 1:], 1e-4)
     below = hit[:, :-1] & hit[:, 1:] & _alike(far[:, :-1], far[:, 1:], step)
     first, second = np.r_[place[right], place[:, :-1][below]], np.r_[np.roll(place, -1, 2)[right], place[:, 1:][below]]
-    return np.where(hit, _joined(far.size, first, second).reshape(count, height, width), NONE)
+    return np.where(hit, connected(first, second, far.size).reshape(count, height, width), NONE)
 
 
 def draw_on_things(of: np.ndarray, rng: torch.Generator | None = None, ground: float = 1.0) -> Tensor:
@@ -60,17 +61,3 @@ def _smooth(height: int, width: int, rng: torch.Generator | None) -> Tensor:
 def _alike(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> np.ndarray:
     far, near = np.maximum(a, b), np.minimum(a, b)
     return np.arctan2(near * np.sin(angle), far - near * np.cos(angle)) > STEEPEST
-
-
-def _joined(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(count,) the least number of all that are joined by pairs, each of `first` with that of `second`."""
-    least = np.arange(count)
-    while True:
-        a, b = least[first], least[second]
-        apart = a != b
-        if not apart.any():
-            return least
-        first, second = first[apart], second[apart]
-        np.minimum.at(least, np.maximum(a, b)[apart], np.minimum(a, b)[apart])
-        while not np.array_equal(shorter := least[least], least):
-            least = shorter

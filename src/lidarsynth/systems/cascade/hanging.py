@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from lidarsynth.lidar.pieces import connected
 from lidarsynth.networks.column_neighbours import Grid
 from lidarsynth.networks.rays import decode_range, encode_range
 
@@ -48,19 +49,6 @@ def _hanging(metres: np.ndarray) -> np.ndarray:
     hangs[thing[returned.ravel() & clear.ravel() & (row == lowest[thing])]] = True
     hangs &= (size >= SIZES[0]) & (size <= SIZES[1])
     return np.where(returned & hangs[thing].reshape(metres.shape), 1 + thing.reshape(metres.shape), 0)
-
-
-def connected(one: np.ndarray, other: np.ndarray, count: int) -> np.ndarray:
-    """(count,) for each of `count` cells the least number of all that it is connected with, by pairs (N,) of cells."""
-    least = np.arange(count)
-    while len(one):
-        a, b = least[one], least[other]
-        apart = a != b
-        one, other, a, b = one[apart], other[apart], a[apart], b[apart]
-        np.minimum.at(least, np.maximum(a, b), np.minimum(a, b))
-        while not np.array_equal(least, least[least]):
-            least = least[least]
-    return least
 
 
 def _without(taken: np.ndarray, metres: np.ndarray, shade: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

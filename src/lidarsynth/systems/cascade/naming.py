@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarsynth.lidar.pieces import pieces
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
@@ -38,7 +39,9 @@ INSIDE = {"unlabeled": 1.5, "car": 2.0, "person": 12.0, "other-ground": 1.2, "bu
 INDOORS = ("unlabeled", "other-ground")
 OUTDOORS = ("road", "parking", "sidewalk", "fence", "vegetation", "trunk", "terrain", "pole", "traffic-sign")
 MOSTLY, SOME = 0.7, 0.02
-PEOPLE = 0.5  # logit that people get there: their IoU in held-out insides is 0.27 for 0.24
+# Inside, people are told from furniture piece by piece: by the logarithm of their chance there, so much of what the
+# network of streets says, and as much more as brings their IoU to most in held-out insides.
+ALSO, PEOPLE = 0.5, 2.0
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
 # is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": 0.45, "terrain": 0.6}
@@ -107,43 +110,77 @@ def named(
     alone   each pixel by itself, instead of with those beside it on its surface
     inside  says of images of the insides of buildings what is there, furniture of class 0
     """
-    off = FAIR * np.log(weights())
+    off = _fair(weights())
     for word, logit in (more or {}).items():
         off[CLASS_NUMBER[word]] -= logit
     rays, device, labels = response.told(rays_told(sensor)), next(network.parameters()).device, []
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
         for image in images:
             told = _told(image, response.even(image.reflectance), rays, device)
-            logits = None if inside is None else _inside(_logits(inside, told, image.shape), image)
-            if logits is None:
-                logits = _without(_logits(network, told, image.shape), off)
-                logits[0] = -math.inf  # 0 is no answer
-            labels.append(_likeliest(logits, image, least, alone) * image.mask)
+            chances = None if inside is None else _inside(inside, network, told, image)
+            chances = _outside(network, told, image, off, alone) if chances is None else chances
+            labels.append(_likeliest(chances, least) * image.mask)
     return [replace(image, label=label) for image, label in zip(images, labels, strict=True)]
+
+
+def _fair(weight: np.ndarray) -> np.ndarray:
+    """(20,) what is taken off the logits of a network that has learned with these weights."""
+    return FAIR * np.log(weight)
 
 
 def _without(logits: Tensor, off: np.ndarray) -> Tensor:
     return logits - torch.from_numpy(off)[:, None, None].float()
 
 
-def _inside(logits: Tensor, image: RangeImage) -> Tensor | None:
-    """The logits (20, H, W) of the network of insides, if by these the image is of one; else None."""
-    off = FAIR * np.log(inside_weights())
-    off[CLASS_NUMBER["person"]] -= PEOPLE
-    logits = _without(logits, off)
-    count = np.bincount(_likeliest(logits, image, 0, True)[image.mask], minlength=len(logits))
+def _outside(network: ClassUNet, told: Tensor, image: RangeImage, off: np.ndarray, alone: bool = False) -> Tensor:
+    """(20, H, W) chances of the classes of streets, 0 of none."""
+    logits = _without(_logits(network, told, image.shape), off)
+    logits[0] = -math.inf  # 0 is no answer
+    return logits.softmax(0) if alone else of_surfaces(logits.softmax(0), _metres(image))
+
+
+def _inside(network: ClassUNet, streets: ClassUNet, told: Tensor, image: RangeImage) -> Tensor | None:
+    """(20, H, W) chances of what is inside buildings, 0 being furniture, if by these the image is of one; else None.
+
+    streets  the network of streets, which has its say on people
+    """
+    logits = _without(_logits(network, told, image.shape), _fair(inside_weights()))
+    count = np.bincount(logits.argmax(0).numpy()[image.mask], minlength=len(logits))
     within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
     telling = within + without
-    return logits if telling > SOME * count.sum() and within > MOSTLY * telling else None
+    if telling <= SOME * count.sum() or within <= MOSTLY * telling:
+        return None
+    chances = of_surfaces(logits.softmax(0), _metres(image))
+    return _with_people(chances, _outside(streets, told, image, _fair(weights())), image)
 
 
-def _likeliest(logits: Tensor, image: RangeImage, least: float, alone: bool) -> np.ndarray:
-    """(H, W) classes by logits (20, H, W); 0 where all are less likely than `least`."""
-    chances = logits if alone else of_surfaces(logits.softmax(0), torch.from_numpy(image.range * image.mask))
-    label = chances.argmax(0)
-    if least > 0:
-        label = label * ((logits.softmax(0) if alone else chances).amax(0) >= least)
-    return label.numpy()
+def _with_people(chances: Tensor, streets: Tensor, image: RangeImage) -> Tensor:
+    """Chances (20, H, W), in which whole pieces of furniture and of people are of the one or the other; those of the
+    network of streets (20, H, W)."""
+    person = CLASS_NUMBER["person"]
+    both, here = chances[0] + chances[person], (chances[person].log() + ALSO * streets[person].log() + PEOPLE).exp()
+    least = 1e-4  # of a chance that counts
+    odds = ((here + least) / (chances[0] + least)).log().numpy()
+    most = chances.index_fill(0, torch.tensor(person), 0).amax(0)
+    stands = image.mask & ((here >= most) | (chances[0] >= torch.maximum(most, here))).numpy()
+    of = pieces(image.range, stands)
+    size = np.bincount(of[stands], minlength=1)
+    share = torch.from_numpy(np.bincount(of[stands], odds[stands], len(size)) / np.maximum(size, 1)).sigmoid().float()
+    chances, whose, on = chances.clone(), share[torch.from_numpy(of)], torch.from_numpy(stands)
+    chances[person] = torch.where(on, both * whose, chances[person])
+    chances[0] = torch.where(on, both * (1 - whose), chances[0])
+    return chances
+
+
+def _metres(image: RangeImage) -> Tensor:
+    """(H, W) of the returns, 0 of none."""
+    return torch.from_numpy(image.range * image.mask)
+
+
+def _likeliest(chances: Tensor, least: float) -> np.ndarray:
+    """(H, W) classes by chances (20, H, W); 0 where all are less likely than `least`."""
+    most, label = chances.max(0)
+    return (label * (most >= least)).numpy() if least > 0 else label.numpy()
 
 
 def of_surfaces(chances: Tensor, metres: Tensor) -> Tensor:
