@@ -101,17 +101,32 @@ def _bag(path: Path) -> Iterator[Put]:
     from rosbags.rosbag1 import Writer
 
     with Writer(path) as writer:
-        connections: dict[str, Any] = {}
+        connections: dict[Any, Any] = {}  # one for each node that published, whose last message may be a latched one
 
         def put(topic: Topic, time: int, data: bytes) -> None:
-            if topic.name not in connections:
-                text = topic.schema[1].decode()
-                connections[topic.name] = writer.add_connection(
-                    topic.name, topic.kind, msgdef=text, md5sum=topic.digest
+            key = topic.name, topic.offered
+            if key not in connections:
+                text, offered = topic.schema[1].decode(), dict(topic.offered)
+                connections[key] = writer.add_connection(
+                    topic.name,
+                    topic.kind,
+                    msgdef=text,
+                    md5sum=topic.digest or _digest(topic.kind, text),
+                    callerid=offered.get("callerid"),
+                    latching=1 if offered.get("latching") == "1" else None,
                 )
-            writer.write(connections[topic.name], time, data)
+            writer.write(connections[key], time, data)
 
         yield put
+
+
+def _digest(kind: str, text: str) -> str:
+    """ROS 1's checksum of a message definition, of a bag that does not tell it, such as an MCAP file."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, kind))
+    return store.generate_msgdef(kind)[1]
 
 
 @contextmanager
@@ -121,14 +136,16 @@ def _mcap(path: Path) -> Iterator[Put]:
     with open(path, "xb") as file:
         writer = Writer(file)
         writer.start(profile="ros2", library="lidarsynth")
-        channels: dict[str, int] = {}
+        channels: dict[Any, int] = {}
 
         def put(topic: Topic, time: int, data: bytes) -> None:
-            if topic.name not in channels:
+            key = topic.name, topic.offered
+            if key not in channels:
                 kind = topic.kind.replace("/msg/", "/") if topic.schema[0] == MSG_ROS1 else topic.kind
                 schema = writer.register_schema(kind, *topic.schema)
-                channels[topic.name] = writer.register_channel(topic.name, topic.encoding, schema)
-            writer.add_message(channels[topic.name], time, data, time)
+                offered = dict(topic.offered)
+                channels[key] = writer.register_channel(topic.name, topic.encoding, schema, metadata=offered)
+            writer.add_message(channels[key], time, data, time)
 
         yield put
         writer.finish()

@@ -7,9 +7,10 @@ until they are asked for, so that a bag of any size passes in the memory of one 
 from __future__ import annotations
 
 import heapq
+import sqlite3
 import struct
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,6 +37,8 @@ class Topic:
     schema    (its own encoding, its text): the message definition
     count     messages, or 0 where the bag does not tell
     digest    checksum of the definition, ROS 1 and 2 only
+    offered   how it was published, as words of the bag: `latching` and `callerid` of ROS 1, the quality of service of
+              ROS 2; without them a latched message, as of /tf_static, is not played back as one
     """
 
     name: str
@@ -44,6 +47,7 @@ class Topic:
     schema: tuple[str, bytes]
     count: int
     digest: str = ""
+    offered: tuple[tuple[str, str], ...] = ()
 
 
 class Message(NamedTuple):
@@ -172,8 +176,9 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
     from rosbags.rosbag2 import Reader as Reader2
 
     first = path.suffix.lower() == ".bag"
+    offered = {} if first else _qualities(path)
     with (Reader1 if first else Reader2)(path) as reader:
-        topics = {c.id: _topic(c, "ros1" if first else "cdr") for c in reader.connections}
+        topics = {c.id: _topic(c, "ros1" if first else "cdr", offered) for c in reader.connections}
         parts = _files_of(reader)
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
@@ -183,7 +188,17 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
                 yield Message(topics[connection.id], time, bytes(data))
 
         duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
-        yield Bag(path, tuple(topics.values()), duration, messages)
+        yield Bag(path, _by_name(topics.values()), duration, messages)
+
+
+def _by_name(topics: Iterable[Topic]) -> tuple[Topic, ...]:
+    """One of each name, with the messages of all: a topic has a connection for each node that published it, and so
+    one more where a driver was started anew."""
+    found: dict[str, Topic] = {}
+    for topic in topics:
+        before = found.get(topic.name)
+        found[topic.name] = topic if before is None else replace(before, count=before.count + topic.count)
+    return tuple(found.values())
 
 
 def _files_of(reader: Any) -> list[Any]:
@@ -200,10 +215,24 @@ def _files_of(reader: Any) -> list[Any]:
     return parts
 
 
-def _topic(connection: Any, encoding: str) -> Topic:
+def _qualities(path: Path) -> dict[str, str]:
+    """Topic -> the quality of service that its publishers offered, in the words of the databases at `path`."""
+    found: dict[str, str] = {}
+    for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
+        with suppress(sqlite3.Error), closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as base:
+            found |= dict(base.execute("SELECT name, offered_qos_profiles FROM topics"))
+    return found
+
+
+def _topic(connection: Any, encoding: str, qualities: dict[str, str]) -> Topic:
     kind = {"ros1": "ros1msg"}.get(encoding, "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg")
-    text = connection.msgdef.data.encode()
-    return Topic(connection.topic, connection.msgtype, encoding, (kind, text), connection.msgcount, connection.digest)
+    text, name = connection.msgdef.data.encode(), connection.topic
+    if encoding == "ros1":
+        told = {"callerid": connection.ext.callerid, "latching": connection.ext.latching}
+    else:
+        told = {"offered_qos_profiles": qualities.get(name)}
+    offered = tuple((key, str(word)) for key, word in told.items() if word is not None)
+    return Topic(name, connection.msgtype, encoding, (kind, text), connection.msgcount, connection.digest, offered)
 
 
 def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
@@ -212,12 +241,7 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
     with ExitStack() as stack:
         parts = sorted((_mcap_part(stack.enter_context(open(file, "rb"))) for file in files), key=lambda p: p.first)
-        topics: dict[str, Topic] = {}
-        for part in parts:
-            for topic in part.topics:
-                before = topics.get(topic.name, topic)
-                more = topic.count if before is not topic else 0
-                topics[topic.name] = replace(before, count=before.count + more)
+        topics = {topic.name: topic for topic in _by_name(topic for part in parts for topic in part.topics)}
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             for together in _overlapping(parts):
@@ -275,7 +299,7 @@ def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
     parts = name.split("/")
     kind = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name  # ROS 1 leaves out msg
     text = (schema.encoding, schema.data) if schema else ("", b"")
-    return Topic(channel.topic, kind, channel.message_encoding, text, count)
+    return Topic(channel.topic, kind, channel.message_encoding, text, count, offered=tuple(channel.metadata.items()))
 
 
 def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
@@ -294,8 +318,9 @@ def library_errors() -> tuple[type[Exception], ...]:
     from rosbags.rosbag1 import ReaderError as Error1
     from rosbags.rosbag2 import ReaderError as Error2
     from rosbags.serde import SerdeError
+    from rosbags.typesys import TypesysError
 
-    return McapError, Error1, Error2, SerdeError, zstandard.ZstdError
+    return McapError, Error1, Error2, SerdeError, TypesysError, zstandard.ZstdError
 
 
 def _packages() -> None:

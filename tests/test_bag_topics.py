@@ -1,0 +1,115 @@
+"""What a bag says of its topics is kept where they are copied: who published them, and how they are played back."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarsynth.cli.main import main
+from lidarsynth.data.bag_writer import message_of, points_topic, write_bag
+from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, open_bag, typestore
+
+pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
+STRING = "std_msgs/msg/String"
+SUM = "992ce8a1687cec8c8bd883ec73ca41d1"  # of std_msgs/String, as `rosmsg md5` prints it
+QUALITY = "- history: 3\n  durability: 1"  # transient local: what /tf_static offers
+CLOUD = Cloud(0, "lidar", 0, {axis: np.ones(3, np.float32) for axis in "xyz"})
+NOTE = b"\2\0\0\0hi"
+
+
+def restarted(path: Path) -> Path:
+    """A ROS 1 bag in which two nodes published the points, one after the other, and two latched a note."""
+    from rosbags.rosbag1 import Writer
+
+    store = typestore("ros1")
+    with Writer(path) as writer:
+        for number, node in enumerate(("/first", "/second")):
+            points = writer.add_connection("/points", POINTS, typestore=store, callerid=node, latching=0)
+            note = writer.add_connection("/note", STRING, typestore=store, callerid=node, latching=1)
+            writer.write(note, number, NOTE)
+            for time in range(2):
+                writer.write(points, 10 * number + time, message_of(CLOUD, "ros1"))
+    return path
+
+
+def notes(path: Path) -> list[tuple[str | None, int | None, str, int]]:
+    from rosbags.rosbag1 import Reader
+
+    with Reader(path) as reader:
+        found: list[Any] = [c for c in reader.connections if c.topic == "/note"]
+        return [(c.ext.callerid, c.ext.latching, c.digest, c.msgcount) for c in found]
+
+
+def test_a_driver_that_was_started_anew_is_one_topic(tmp_path: Path):
+    with open_bag(restarted(tmp_path / "drive.bag")) as bag:
+        assert {t.name: t.count for t in bag.topics} == {"/points": 4, "/note": 2} and len(bag.topics) == 2
+        assert bag.point_topic() == "/points"
+        assert [m.time for m in bag.messages(frozenset(["/points"]))] == [0, 1, 10, 11]
+
+
+@pytest.mark.parametrize("by_way_of", [".bag", ".mcap"])
+def test_latched_messages_of_every_node_stay_latched(by_way_of: str, tmp_path: Path):
+    paths = [restarted(tmp_path / "drive.bag"), tmp_path / f"one{by_way_of}", tmp_path / "two.bag"]
+    for source, copied in pairwise(paths):
+        with open_bag(source) as bag, write_bag(copied) as writer:
+            for message in bag.messages(frozenset(["/note"])):
+                writer.copy(message)
+        with open_bag(copied) as bag:
+            assert [m.data for m in bag.messages()] == [NOTE, NOTE]
+    if by_way_of == ".bag":  # a topic of MCAP has one publisher
+        assert notes(paths[-1]) == notes(paths[0]) == [("/first", 1, SUM, 1), ("/second", 1, SUM, 1)]
+    assert {(latching, digest) for _, latching, digest, _ in notes(paths[-1])} == {(1, SUM)}
+
+
+def database(folder: Path) -> Path:
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store, never = typestore("cdr"), QosTime(0, 0)
+    quality = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
+                  QosLiveliness.AUTOMATIC, never, False)  # fmt: skip
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        note = writer.add_connection("/note", STRING, typestore=store, offered_qos_profiles=[quality])
+        writer.write(note, 7, store.serialize_cdr(store.types[STRING]("hi"), STRING))
+    return folder
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_the_quality_of_service_of_a_database_is_kept(alone: bool, tmp_path: Path):
+    folder = database(tmp_path / "drive")
+    with open_bag(next(folder.glob("*.db3")) if alone else folder) as bag, write_bag(tmp_path / "new.mcap") as writer:
+        for message in bag.messages():
+            writer.copy(message)
+    with open_bag(tmp_path / "new.mcap") as bag:
+        ((key, words),) = bag.topics[0].offered
+    assert key == "offered_qos_profiles" and "durability: transient_local" in words
+
+
+def test_the_quality_of_service_of_mcap_is_kept(tmp_path: Path):
+    schema = ("ros2msg", b"string data\n")
+    topic = Topic("/tf_static", STRING, "cdr", schema, 0, offered=(("offered_qos_profiles", QUALITY),))
+    for path, source in ((tmp_path / "a.mcap", None), (tmp_path / "b.mcap", tmp_path / "a.mcap")):
+        with write_bag(path) as writer:
+            if source is None:
+                writer.copy(Message(topic, 5, b"\0\1\0\0\3\0\0\0hi\0"))
+            else:
+                with open_bag(source) as bag:
+                    for message in bag.messages():
+                        writer.copy(message)
+    with open_bag(tmp_path / "b.mcap") as bag:
+        assert bag.topics[0].offered == topic.offered
+
+
+def test_a_definition_that_lacks_a_part_is_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Of ROS 1 in MCAP, whose checksum a `.bag` needs."""
+    odd = Topic("/odd", "my_msgs/msg/Odd", "ros1", ("ros1msg", b"other_msgs/Thing thing\n"), 0)
+    with write_bag(tmp_path / "in.mcap") as writer:
+        writer.put(odd, 5, b"")
+        writer.put(points_topic("/points", "cdr"), 6, message_of(CLOUD, "cdr"))
+    words = ["--keep-topics", "--model", "bilinear", "--sensor", "vlp-16"]
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(tmp_path / "in.mcap"), "--out", str(tmp_path / "new.bag"), *words])
+    assert "Thing' is unknown" in capsys.readouterr().err and not (tmp_path / "new.bag").exists()
