@@ -10,6 +10,7 @@ import pytest
 from lidarsynth.cli.main import main
 from lidarsynth.data.bag_writer import message_of, points_topic, write_bag
 from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, open_bag, typestore
+from lidarsynth.files.fields import FileError
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
 pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
@@ -113,3 +114,54 @@ def test_a_definition_that_lacks_a_part_is_a_line(tmp_path: Path, capsys: pytest
     with pytest.raises(SystemExit, match="2"):
         main(["complete", str(tmp_path / "in.mcap"), "--out", str(tmp_path / "new.bag"), *words])
     assert "Thing' is unknown" in capsys.readouterr().err and not (tmp_path / "new.bag").exists()
+
+
+def two_topics(path: Path) -> Path:
+    """Points, and a map of the same type whose coordinates are no metres from a sensor."""
+    around = np.radians(np.arange(0, 360, 0.5, dtype=np.float32))
+    scan = {"x": 9 * np.cos(around), "y": 9 * np.sin(around), "z": 0 * around, "intensity": 0 * around}
+    with write_bag(path) as writer:
+        for time in range(3):
+            writer.write_cloud("/map", Cloud(0, "map", time, scan | {"x": scan["x"] + 450_000}))
+            writer.write_cloud("/points", Cloud(0, "lidar", time, scan))
+    return path
+
+
+def test_a_topic_that_is_no_scan_is_told_beside_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    main(["info", str(two_topics(tmp_path / "in.mcap"))])
+    told = capsys.readouterr().out
+    assert "/map: fault" in told and "coordinate of 4.5e+05" in told and "/points: range" in told
+    with write_bag(tmp_path / "map.mcap") as writer, open_bag(tmp_path / "in.mcap") as bag:
+        for message in bag.messages(frozenset(["/map"])):
+            writer.copy(message)
+    with pytest.raises(SystemExit, match="2"):
+        main(["info", str(tmp_path / "map.mcap")])
+    assert "map.mcap: /map: expected metres from the sensor" in capsys.readouterr().err
+
+
+def test_what_a_killed_recorder_left_is_told_as_that(tmp_path: Path):
+    whole = two_topics(tmp_path / "in.mcap").read_bytes()
+    for length in (8, 12, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.mcap").write_bytes(whole[:length])
+        words = r"cut.mcap: expected a whole MCAP file, found one that is cut off"
+        with pytest.raises(FileError, match=words), open_bag(tmp_path / "cut.mcap"):
+            pass
+
+
+def test_a_bit_that_a_disk_lost_is_no_point(tmp_path: Path):
+    """An uncompressed chunk, in which every other bit is a coordinate; its checksum tells."""
+    from mcap.writer import CompressionType, Writer
+
+    with open_bag(two_topics(tmp_path / "in.mcap")) as bag, open(tmp_path / "bad.mcap", "wb") as file:
+        messages = list(bag.messages(frozenset(["/points"])))
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        channel = writer.register_channel("/points", "cdr", writer.register_schema(POINTS, *messages[0].topic.schema))
+        for message in messages:
+            writer.add_message(channel, message.time, message.data, message.time)
+        writer.finish()
+    bad = bytearray((tmp_path / "bad.mcap").read_bytes())
+    bad[bad.index(messages[0].data) + 500] ^= 1
+    (tmp_path / "bad.mcap").write_bytes(bad)
+    with open_bag(tmp_path / "bad.mcap") as bag, pytest.raises(FileError, match=r"bad.mcap: expected a bag .*crc"):
+        list(bag.clouds("/points"))

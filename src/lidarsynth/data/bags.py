@@ -21,6 +21,7 @@ from lidarsynth.files.point_cloud2 import decode
 from lidarsynth.lidar.small_file import check_regular
 
 POINTS = "sensor_msgs/msg/PointCloud2"
+MAGIC = b"\x89MCAP0\r\n"  # the first and the last bytes of an MCAP file (mcap.dev/spec)
 SUFFIXES = (".bag", ".mcap", ".db3")
 BROKEN = (
     OSError, ValueError, LookupError, EOFError, RuntimeError, AssertionError, TypeError, OverflowError, struct.error
@@ -240,7 +241,8 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
     from contextlib import ExitStack
 
     with ExitStack() as stack:
-        parts = sorted((_mcap_part(stack.enter_context(open(file, "rb"))) for file in files), key=lambda p: p.first)
+        streams = [_whole(stack.enter_context(open(file, "rb")), file) for file in files]
+        parts = sorted(map(_mcap_part, streams), key=lambda part: part.first)
         topics = {topic.name: topic for topic in _by_name(topic for part in parts for topic in part.topics)}
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
@@ -251,6 +253,19 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
         full = [part for part in parts if part.last]
         seconds = (max(part.last for part in full) - full[0].first) / 1e9 if full else 0.0
         yield Bag(path, tuple(topics.values()), seconds, messages)
+
+
+def _whole(stream: IO[bytes], file: Path) -> IO[bytes]:
+    """The MCAP file, if it ends as it begins. Raises FileError for one that a killed recorder left."""
+    size = stream.seek(0, 2)
+    stream.seek(0)
+    begun = stream.read(len(MAGIC)) == MAGIC
+    stream.seek(max(size - len(MAGIC), 0))
+    if begun and (size < 2 * len(MAGIC) or stream.read() != MAGIC):
+        raise FileError(f"{file}: expected a whole MCAP file, found one that is cut off, as of a recording that was "
+                        "killed: `mcap recover` makes a whole one of it")  # fmt: skip
+    stream.seek(0)
+    return stream
 
 
 class _Part(NamedTuple):
@@ -288,7 +303,7 @@ def _mcap_part(stream: IO[bytes]) -> _Part:
     stream.seek(0)
     seen: dict[int, list[Any]] = {}
     times = [0, 0]
-    for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+    for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
         times = [min(times[0] or message.log_time, message.log_time), max(times[1], message.log_time)]
         seen.setdefault(channel.id, [channel, schema, 0])[2] += 1
     return _Part(stream, tuple(_mcap_topic(*found) for found in seen.values()), *times)
@@ -306,7 +321,7 @@ def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, T
     from mcap.reader import make_reader
 
     stream.seek(0)
-    reader = make_reader(stream)
+    reader = make_reader(stream, validate_crcs=True)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
         yield Message(topics[channel.topic], message.log_time, message.data)
 

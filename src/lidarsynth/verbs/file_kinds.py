@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bags import POINTS, Cloud, is_bag, open_bag
+from lidarsynth.data.bags import POINTS, Bag, Cloud, is_bag, open_bag
 from lidarsynth.data.capture import datagrams, is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report
@@ -136,12 +136,26 @@ def _bag(path: Path, reading: Reading) -> Lines:
             rate = f", {(topic.count - 1) / bag.seconds:.1f} a second" if bag.seconds > 0 and topic.count > 1 else ""
             lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
         clouds = [topic.name for topic in bag.topics if topic.kind == POINTS]
-        for name in clouds:
-            first = next(bag.clouds(name), None)
-            if isinstance(first, Cloud):
-                scan, dropped = scan_from_fields(first.fields, _scale(first), reading.rings)
-                lines |= {f"{name}: {key}": text for key, text in scan_lines(scan, dropped, reading).items()}
+        told = [_first_of_topic(bag, name, reading) for name in clouds]
+    if told and all(fault is not None for _, fault in told):
+        raise FileError(f"{path}: {clouds[0]}: {told[0][1]}")
+    for name, (found, fault) in zip(clouds, told, strict=True):
+        lines |= {f"{name}: {key}": text for key, text in found.items()} | ({f"{name}: fault": fault} if fault else {})
     return lines
+
+
+def _first_of_topic(bag: Bag, name: str, reading: Reading) -> tuple[Lines, str | None]:
+    """What there is to say of the first scan of a topic, and what is wrong with it: others may be sound, as beside a
+    topic of a map."""
+    try:
+        first = next(bag.clouds(name), None)
+        if isinstance(first, FileError):
+            return {}, str(first).removeprefix(f"{bag.path}: {name}: ")
+        if first is None:
+            return {}, None
+        return scan_lines(*scan_from_fields(first.fields, _scale(first), reading.rings), reading), None
+    except ValueError as error:
+        return {}, str(error).removeprefix(f"{bag.path}: ")
 
 
 def _scale(cloud: Cloud) -> str:
