@@ -114,6 +114,59 @@ def test_velodyne_turns_are_cut_at_azimuth_0():
     assert len(both["x"]) == 6 * 32, "of two returns the last one"
 
 
+def spun(first: int, count: int, step: int = 40) -> list[Datagram]:
+    """Packets of a VLP-16 from azimuth `first` on, each told from the others by its time."""
+    return [
+        Datagram(0, 2368, velodyne_packet(0x22, first + i * 12 * step, step, 5000)[:1200] + struct.pack("<I", i)
+                 + b"\x37\x22") for i in range(count)
+    ]  # fmt: skip
+
+
+def test_packets_that_come_twice_or_late_make_no_turn():
+    packets = spun(30000, 190)
+    one, other = velodyne.turns(packets)
+    swapped = list(packets)
+    swapped[12], swapped[13] = swapped[13], swapped[12]  # 35760 to 36200, and the next one
+    for stream in ([p for p in packets for _ in range(2)], swapped):
+        found = list(velodyne.turns(stream))
+        assert len(found) == 2
+        assert abs(len(found[0]["x"]) - len(one["x"])) <= 12 * 32
+        for name, column in other.items():
+            np.testing.assert_array_equal(found[1][name], column)
+
+
+@pytest.mark.parametrize("ends", [16000, 30000])
+def test_a_sensor_that_is_set_to_a_sector_has_turns(ends: int):
+    """From 100 degrees to less or more than half a turn on; packets go on over what is left out."""
+    step, blocks = 40, []
+    for _ in range(6):
+        blocks += list(range(10000, ends, step))
+    packets = []
+    for i in range(0, len(blocks) - 11, 12):
+        payload = bytearray(velodyne_packet(0x22, 0, step, 5000))
+        for number, azimuth in enumerate(blocks[i : i + 12]):
+            payload[100 * number + 2 : 100 * number + 4] = struct.pack("<H", azimuth)
+        packets.append(Datagram(i, 2368, bytes(payload)))
+    found = list(velodyne.turns(packets))
+    assert len(found) in (5, 6)
+    for turn in found:
+        azimuth = np.degrees(np.arctan2(-turn["y"], turn["x"])) % 360
+        assert azimuth.min() > 99.9 and azimuth.max() < ends / 100 + 0.5
+
+
+@pytest.mark.parametrize("kind", ["pcap", "pcapng"])
+def test_turns_before_a_broken_record_come_and_it_is_told(kind: str, tmp_path: Path):
+    frames = [udp(packet.payload, 2368) for packet in spun(0, 190)]
+    content = bytearray(pcap(frames) if kind == "pcap" else pcapng(frames))
+    at = content.index(frames[160]) - (8 if kind == "pcap" else 24)
+    content[at : at + 4] = b"\xff" * 4
+    (tmp_path / f"c.{kind}").write_bytes(content)
+    stream = capture_turns(tmp_path / f"c.{kind}")
+    assert [len(next(stream)["x"]) for _ in range(2)] == [900 * 32, 900 * 32]
+    with pytest.raises(FileError, match=rf"c.{kind}: expected records of .* found one of 4294967295"):
+        next(stream)
+
+
 def test_what_a_capture_cuts_at_its_ends_is_no_turn():
     def left(*shares: float) -> list[float]:
         return [turn["x"].tolist()[0] for turn in whole_turns((s, {"x": np.array([s])}) for s in shares)]

@@ -46,7 +46,8 @@ def is_capture(path: str | Path) -> bool:
 def datagrams(path: str | Path) -> Iterator[Datagram]:
     """The UDP packets over IPv4 of a capture, in order, in flat memory; anything else in it is passed over.
 
-    A record cut short at the end of the file ends it. Raises FileError for a file that is no capture.
+    A record cut short at the end of the file ends it. Raises FileError for a file that is no capture, and, after the
+    packets before it, where a record is longer than any packet.
     """
     path = Path(path)
     fragments: dict[bytes, dict[int, bytes]] = {}
@@ -81,9 +82,17 @@ def _records(file: IO[bytes], order: str, nano: bool) -> Iterator[tuple[int, int
     link = struct.unpack(order + "I", header[16:])[0] & 0xFFFF
     while len(head := file.read(16)) == 16:
         seconds, part, size, _ = struct.unpack(order + "4I", head)
-        if size > MAX_RECORD or len(frame := file.read(size)) < size:
+        _check_record(file, size)
+        if len(frame := file.read(size)) < size:
             return
         yield seconds * 10**9 + part * (1 if nano else 1000), link, frame
+
+
+def _check_record(file: IO[bytes], size: int, least: int = 0) -> None:
+    """Raises FileError for the size of a record that is none: where the next one begins, nobody knows."""
+    if not least <= size <= MAX_RECORD:
+        raise FileError(f"{file.name}: expected records of {least} to {MAX_RECORD} bytes, found one of {size} before "
+                        f"byte {file.tell()}: the capture is broken there")  # fmt: skip
 
 
 class _Interface(NamedTuple):
@@ -108,7 +117,8 @@ def _blocks(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
             order, interfaces = ("<" if magic == b"\x4d\x3c\x2b\x1a" else ">"), []
             file.seek(-4, 1)
         kind, size = struct.unpack(order + "2I", head)
-        if not 12 <= size <= MAX_RECORD or len(body := file.read(size - 8)) < size - 8:
+        _check_record(file, size, 12)
+        if len(body := file.read(size - 8)) < size - 8:
             return
         body = body[:-4]  # the size once more
         if kind == INTERFACE and len(body) >= 8:

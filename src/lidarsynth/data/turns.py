@@ -51,12 +51,24 @@ def senders(path: Path, metadata: Path | None = None) -> list[str]:
     return _listed(path, _kind(path, metadata, None)[0])
 
 
+def sound_datagrams(path: Path) -> Iterator[Datagram]:
+    """The packets before a capture is broken; that it is, is said where they are read for their turns."""
+    come = False
+    try:
+        for packet in datagrams(path):
+            come = True
+            yield packet
+    except FileError:
+        if not come:
+            raise
+
+
 def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, Turns]:
     """How the packets of a LiDAR are told, and what makes turns of them: a Velodyne where one sends, else an Ouster."""
-    large = [p for p in islice(datagrams(path), 2 * LOOKED_AT) if len(p.payload) > LARGE]
+    large = [p for p in islice(sound_datagrams(path), 2 * LOOKED_AT) if len(p.payload) > LARGE]
     large = [p for p in large if sender in (None, p.sender)] or large
     if not large:
-        large = list(islice((p for p in datagrams(path) if len(p.payload) > LARGE), 1))
+        large = list(islice((p for p in sound_datagrams(path) if len(p.payload) > LARGE), 1))
     if not large:
         raise FileError(f"{path}: expected packets of a LiDAR, found none")
     if any(velodyne.is_velodyne(packet.payload) for packet in large):
@@ -68,9 +80,9 @@ def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, 
 
 def _listed(path: Path, belongs: Test) -> list[str]:
     """ADDRESS:PORT of those whose packets belong."""
-    found = list(dict.fromkeys(p.sender for p in islice(filter(belongs, datagrams(path)), LOOKED_AT)))
+    found = list(dict.fromkeys(p.sender for p in islice(filter(belongs, sound_datagrams(path)), LOOKED_AT)))
     if not found:
-        first = next(len(p.payload) for p in datagrams(path) if len(p.payload) > LARGE)
+        first = next(len(p.payload) for p in sound_datagrams(path) if len(p.payload) > LARGE)
         raise FileError(f"{path}: expected packets of a Velodyne or of the Ouster that the metadata describes, found "
                         f"none; the first large packet has {first} bytes")  # fmt: skip
     return sorted(found)

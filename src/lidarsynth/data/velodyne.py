@@ -6,6 +6,7 @@ valgur/velodyne_decoder (`types.h`, `packet_decoder.cpp`) have them; formulas on
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,6 +20,8 @@ from lidarsynth.files.fields import Fields, FileError
 SIZE = 1206  # bytes of a packet's payload
 FLAG = 0xEEFF  # of a block
 TURN = 36000  # hundredths of a degree
+LATE = 2000  # of them: two packets of the fastest spin; what lies no farther back is late, and begins no turn
+REPEATED = 8  # packets that are looked through for the same one
 BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("return", [("distance", "<u2"), ("light", "u1")], 32)])
 DUAL = 0x39
 NAMES = ("x", "y", "z", "intensity", "ring", "time")
@@ -81,38 +84,44 @@ def is_velodyne(payload: bytes) -> bool:
 def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
     """Turns (`whole_turns`): x y z intensity (0-255) ring time (seconds) of each return, in the order of firing.
 
-    A turn ends where the azimuth passes 0. x forward (azimuth 0), y left, z up; ring 0 is the highest beam. Of two
-    returns the last is taken. Raises FileError for a model that is not in MODELS.
+    A turn ends where the azimuth passes 0, of a sensor that is set to a sector where that ends. x forward (azimuth 0),
+    y left, z up; ring 0 is the highest beam. Of two returns the last is taken. Raises FileError for a model that is not
+    in MODELS.
     """
     return whole_turns(_parts(packets))
 
 
 def _parts(packets: Iterable[Datagram]) -> Iterator[tuple[float, Fields]]:
-    """Share of a turn and points of each."""
+    """Share of a turn and points of each. A packet that comes once more, as from two interfaces, is passed over; one
+    that comes after its next is of the turn that it is in."""
     parts: list[Fields] = []
+    recent: deque[bytes] = deque(maxlen=REPEATED)
     last: int | None = None
     begun = swept = 0
     for packet in packets:
-        if not is_velodyne(packet.payload):
+        if not is_velodyne(packet.payload) or packet.payload in recent:
             continue
+        recent.append(packet.payload)
         points, azimuth = decode(packet.payload, packet.time)
         for first, end in _runs(azimuth):
+            late = last is not None and 0 < (last - int(azimuth[first])) % TURN < LATE
             if last is None:
                 begun = int(azimuth[first])
-            elif int(azimuth[first]) < last - TURN // 2:  # passed 0
+            elif not late and int(azimuth[first]) < last:  # passed 0, or where a sector ends
                 yield swept / TURN, _joined(parts)
                 parts, begun = [], int(azimuth[first])
             inside = (points["block"] >= first) & (points["block"] < end)
             parts.append({name: points[name][inside] for name in NAMES})
-            last = int(azimuth[end - 1])
-            swept = last - begun
+            if not late:
+                last = int(azimuth[end - 1])
+                swept = last - begun
     if parts:
         yield swept / TURN, _joined(parts)
 
 
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
-    """Runs (first block, block after the last) of a packet, cut where the azimuth passes 0."""
-    cuts = [0, *(np.flatnonzero(np.diff(azimuth.astype(int)) < -TURN // 2) + 1).tolist(), len(azimuth)]
+    """Runs (first block, block after the last) of a packet, cut where the azimuth passes 0 or where a sector ends."""
+    cuts = [0, *(np.flatnonzero(np.diff(azimuth.astype(int)) <= -LATE) + 1).tolist(), len(azimuth)]
     return list(pairwise(cuts))
 
 
@@ -162,8 +171,10 @@ def firing_time(model: Model, block: np.ndarray, place: np.ndarray, dual: bool) 
 
 
 def _rate(azimuth: np.ndarray, micros: np.ndarray) -> float:
-    """Hundredths of a degree per microsecond, of this packet."""
-    return float((int(azimuth[-1]) - int(azimuth[0])) % TURN) / float(max(micros[-1] - micros[0], 1e-3))
+    """Hundredths of a degree per microsecond, of this packet, but for what a sector leaves out between blocks."""
+    steps, spent = np.diff(azimuth.astype(int)) % TURN, np.diff(micros)
+    even = steps <= 2 * np.median(steps[spent > 0])
+    return float(steps[even].sum()) / float(max(spent[even].sum(), 1e-3))
 
 
 def _points(model: Model, laser: np.ndarray, azimuth: np.ndarray, distance: np.ndarray) -> Fields:

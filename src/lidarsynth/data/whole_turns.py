@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from itertools import chain
 
-from lidarsynth.files.fields import Fields
+from lidarsynth.files.fields import Fields, FileError
 
 WHOLE, HALF = 0.9, 0.5  # of the turns beside it
 
@@ -15,10 +15,11 @@ def whole_turns(parts: Iterable[tuple[float, Fields]]) -> Iterator[Fields]:
 
     The first and the last, which a capture cuts, come if they are nine tenths as long as the one beside them; those
     between, which may have lost packets, if they are half as long: a sensor may be set to a sector. One that is alone
-    comes from half a turn on.
+    comes from half a turn on. What a broken capture raises comes after the turns before it.
     """
     before, held = 0.0, None
-    for after in chain(parts, [(0.0, None)]):
+    fault: list[FileError] = []
+    for after in chain(_until_broken(parts, fault), [(0.0, None)]):
         if held is not None:
             share, fields = held
             least = WHOLE if before == 0 or after[1] is None else HALF
@@ -28,3 +29,12 @@ def whole_turns(parts: Iterable[tuple[float, Fields]]) -> Iterator[Fields]:
                 yield fields
             before = share
         held = after
+    if fault:
+        raise fault[0]
+
+
+def _until_broken(parts: Iterable[tuple[float, Fields]], fault: list[FileError]) -> Iterator[tuple[float, Fields]]:
+    try:
+        yield from parts
+    except FileError as error:
+        fault.append(error)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.bags import POINTS, Bag, Cloud, is_bag, open_bag
-from lidarsynth.data.capture import datagrams, is_capture
+from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report
-from lidarsynth.data.turns import capture_turns, senders
+from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
@@ -164,7 +164,7 @@ def _scale(cloud: Cloud) -> str:
 
 
 def _capture(path: Path, reading: Reading) -> Lines:
-    sizes = Counter((p.sender, len(p.payload)) for p in islice(datagrams(path), LOOKED_AT))
+    sizes = Counter((p.sender, len(p.payload)) for p in islice(sound_datagrams(path), LOOKED_AT))
     listed = ", ".join(f"{count} of {size} bytes as {sender}" for (sender, size), count in sizes.most_common(6))
     listed += ", ..." if len(sizes) > 6 else ""
     lines = {"kind": "network capture", "packets": f"{listed or 'none'} (of the first {LOOKED_AT})"}
