@@ -312,6 +312,17 @@ def test_a_full_disk_is_no_broken_bag(
     assert [p.name for p in tmp_path.iterdir()] == ["in.mcap"]
 
 
+def test_a_folder_is_no_bag_to_write_and_no_scan_is_worked_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    path, out = clouds_at(tmp_path / "in.mcap", [100]), tmp_path / "out.mcap"
+    out.mkdir()
+    monkeypatch.setattr("lidarsynth.verbs.batch.run", None)
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(path), "--out", str(out), "--model", "bilinear", "--sensor", "vlp-16"])
+    assert "out.mcap: expected the name of a bag to write, found a folder" in capsys.readouterr().err
+
+
 def test_a_bag_is_told_by_its_ending_in_any_case(tmp_path: Path):
     with open_bag(KINDS["bare mcap"](tmp_path)) as bag, write_bag(tmp_path / "NEW.BAG") as writer:
         note = next(bag.messages(frozenset(["/note"])))

@@ -11,6 +11,7 @@ from test_recognise import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.learning import blocked_runs, learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
@@ -171,3 +172,46 @@ def test_kittis_sensor_from_real_scans(shared: Path, tmp_path: Path):
     np.testing.assert_allclose(found.elevations, known.elevations, atol=0.05)
     np.testing.assert_allclose(found.offsets, known.offsets, atol=0.01)
     assert 2050 < found.width < 2250
+
+
+def own_streets(count: int) -> list[Scan]:
+    """Scans of a sensor that is no known one, nose up."""
+    beams = (12.0, 9.0, 7.0, 5.0, *np.linspace(3, -9, 25).tolist(), -11.0, -14.0, -18.0)
+    sensor = Sensor("own", beams, 512, mount=1.2, tilt=(6.0, -4.0))
+    streets = SyntheticStreets(0, count, sensor)
+    return [streets[i] for i in range(count)]
+
+
+def test_a_sensor_that_hangs_has_no_mount_until_it_is_turned(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    flip = np.array([1, -1, -1], np.float32)
+    for number, scan in enumerate(own_streets(3)):
+        assert check_frame(scan).warning() is None
+        hung = replace(scan, xyz=scan.xyz * flip)
+        assert "hangs upside down: try --transform 0:0:0:180:0:0" in str(check_frame(hung).warning())
+        write(tmp_path / f"{number}.pcd", hung)
+    words = ["sensor", str(tmp_path), "--no-picture", "--out"]
+    main([*words, str(tmp_path / "hung.toml")])
+    told = capsys.readouterr()
+    assert "ground above in 3 of 3 scans" in told.err and "how far above the ground is not known" in told.out
+    hung = read_sensor(tmp_path / "hung.toml")
+    assert (hung.mount, hung.tilt) == (Sensor.mount, Sensor.tilt)
+    main([*words, str(tmp_path / "own.toml"), "--transform", "0:0:0:180:0:0"])
+    assert capsys.readouterr().err == ""
+    own = read_sensor(tmp_path / "own.toml")
+    assert own.mount == pytest.approx(1.2, abs=0.15)
+    np.testing.assert_allclose(own.tilt, (6, -4), atol=1.5)
+    np.testing.assert_allclose(own.elevations, [-e for e in hung.elevations[::-1]], atol=0.002)
+
+
+def test_scans_of_two_sensors_and_beams_that_only_see_the_sky_are_told():
+    one = turn(SENSORS["vlp-16"])
+    assert one.ring is not None
+    low = one.ring >= 4
+    less = replace(one, xyz=one.xyz[low], reflectance=one.reflectance[low], ring=one.ring[low] - 4)
+    for others, words in (
+        ([turn(SENSORS["hdl-32e"])] * 2, "16 in 3 of 5, and 32 in"),
+        ([less], "16 in 3 of 4, and 12 in"),
+    ):
+        (line,) = doubts(learn_sensor([one] * 3 + others, "own"))
+        assert f"expected as many rings in every scan, found {words} the others" in line
+    assert doubts(learn_sensor([one] * 9 + [less], "own")) == [], "one odd scan of many is named, and no more"

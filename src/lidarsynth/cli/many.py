@@ -281,6 +281,8 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     if job.verb == "project" or job.corrupt:
         word = "range images" if job.verb == "project" else f"--corrupt {job.corrupt}"
         raise ValueError(f"{out}: expected a file or folder for {word}, found a bag, which holds points")
+    if out.is_dir():
+        raise ValueError(f"{out}: expected the name of a bag to write, found a folder")
     if out.exists() and out.samefile(paths[0]):
         raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
     model, begun, results = _model(job), time.perf_counter(), []

@@ -24,6 +24,10 @@ def sensor(
     ] = None,
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture: it tells all beams.")] = None,
     rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
+    transform: Annotated[
+        str | None, arg(metavar="T", help="brings points into the sensor's frame, as of complete; later verbs take it.")
+    ] = None,
+    axes: Annotated[str, arg(metavar="XYZ", help="where x, y, z of the files point, as of complete.")] = "flu",
     seed: NoSeed = 0,
     intensity: Intensity = "none",
     picture: Picture = True,
@@ -31,7 +35,7 @@ def sensor(
     """Learn a sensor from its scans: beams, columns, limits, mount, tilt, and what its carrier blocks."""
     from lidarsynth.pictures.learned import learned_figure
     from lidarsynth.pictures.render import save_png
-    from lidarsynth.verbs.inputs import Reading, inputs_of, parse_rings
+    from lidarsynth.verbs.inputs import Reading, inputs_of, parse_rings, read_transform
     from lidarsynth.verbs.learned_sensor import doubts, from_metadata, learn, sensor_toml, summary, write_toml
 
     if out.suffix != ".toml":
@@ -42,7 +46,8 @@ def sensor(
         say(f"wrote {out}: {plural(known.height, 'beam')}, {known.width} columns")
         return
     broken: list[str] = []
-    learned = learn(inputs_of(scans, Reading(intensity, topic, metadata, rings=parse_rings(rings))), out.stem, broken)
+    how = Reading(intensity, topic, metadata, read_transform(transform, None, axes), rings=parse_rings(rings))
+    learned = learn(inputs_of(scans, how), out.stem, broken)
     if broken:
         warn(f"{len(broken)} that could not be read {was(len(broken))} left out, the first: {broken[0]}")
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarsynth.lidar.cones import onto_z
 from lidarsynth.lidar.crowding import ORIGINS
-from lidarsynth.lidar.ground import levels, road_axis
+from lidarsynth.lidar.ground import is_above, levels, road_axis
 from lidarsynth.lidar.origin import BESIDE, TILTED, Turned, place_of, rings_of, to_undo, turned
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
@@ -167,12 +167,14 @@ def _known(scan: Scan, up: str, lift: float) -> bool:
 
 
 def _hangs(scan: Scan) -> bool:
-    """Whether the ground is above a known sensor whose beams tell that its own frame is the file's."""
+    """Whether the ground is above: of a known sensor whose beams tell that its own frame is the file's, or as it is
+    only seen where the scan is turned over."""
     below, above = levels(scan.xyz)
-    if above.share <= GROUND or above.share <= UPSIDE * below.share:
-        return False
-    name = recognise(scan, among=SENSORS)[0]
-    return name is not None and f"{name}-inverted" in INVERTED
+    if above.share > GROUND and above.share > UPSIDE * below.share:
+        name = recognise(scan, among=SENSORS)[0]
+        if name is not None and f"{name}-inverted" in INVERTED:
+            return True
+    return is_above(scan.xyz)
 
 
 def _shares(scan: Scan, up: str) -> float:

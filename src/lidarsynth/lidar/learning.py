@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
-from lidarsynth.lidar.ground import lowest_plane
+from lidarsynth.lidar.ground import is_above, lowest_plane
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.recognition import recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
@@ -26,6 +26,7 @@ DENSER, LEAST = 2.0, 30
 SAMPLE = 1500  # points of a ring and scan are enough
 HALVED = 0.5  # of the residual: heights that explain less are bent rings of a moving car
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
+SPLIT = 0.2  # of the scans: so many that have other rings than the others are no chance
 ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
 BLOCKED_SCANS = 5  # what never returned in fewer scans may have looked at the sky
 BLOCKED_RUN = 0.008  # of a turn: shorter runs are chance
@@ -45,6 +46,7 @@ class LearnedSensor:
     merged    how many rings were of another's beam, and are one row with it
     turns     what is to be said of a scan of more than one turn, or None
     afloat    why mount and tilt are not learned but a sensor's default, in words, or None
+    split     what is to be said of scans of several sensors, or of beams that many of them lack, or None
     """
 
     sensor: Sensor
@@ -57,6 +59,7 @@ class LearnedSensor:
     merged: int = 0
     turns: str | None = None
     afloat: str | None = None
+    split: str | None = None
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
@@ -68,14 +71,15 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     never returned in five scans or more. Raises ValueError without rings, with too few points, or where most beams are
     wider than SMEARED.
     """
-    kept, left = _alike(scans)
+    kept, left, split = _alike(scans)
     points = _pooled(kept)
-    steps, depths, grounds = [], [], []
+    steps, depths, grounds, above = [], [], [], 0
     for scan, ring in kept:
         steps.append(_step(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((np.quantile(depth, 0.001), depth.max()))
         grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
+        above += is_above(scan.xyz)
     guessed = _guessed(kept[0][0])
     rings, row_of = _fit_rows(points, FEWEST if guessed else THIN)
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
@@ -87,7 +91,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     order = np.argsort([-ring.elevation for ring in rings])
     rings, returned = [rings[i] for i in order], returned[order]
     heights = tuple(round(ring.height, 3) for ring in rings)
-    mount, tilt, afloat = _standing(grounds, len(kept))
+    mount, tilt, afloat = _standing(grounds, above, len(kept))
     sensor = Sensor(
         name=name,
         elevations=_falling([round(ring.elevation, 3) for ring in rings]),
@@ -100,11 +104,19 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         blocked=blocked_runs(returned, len(kept)),
     )
     turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
-    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), missing, thin, merged, turns, afloat)
+    doubts = turns, afloat, split
+    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), missing, thin, merged, *doubts)
 
 
-def _standing(grounds: list[tuple[float, float, float]], scans: int) -> tuple[float, tuple[float, float], str | None]:
-    """Mount and tilt from (height, pitch, roll) of those scans that show the ground, or a sensor's default and why."""
+def _standing(
+    grounds: list[tuple[float, float, float]], above: int, scans: int
+) -> tuple[float, tuple[float, float], str | None]:
+    """Mount and tilt from (height, pitch, roll) of those scans that show the ground, or a sensor's default and why.
+    `above`: how many show it only when they are turned over."""
+    if 2 * above >= scans:
+        why = f"expected z up, found the ground above in {above} of {scans} scans, as of a sensor that hangs upside " \
+              "down (--transform 0:0:0:180:0:0 turns them)"  # fmt: skip
+        return Sensor.mount, Sensor.tilt, why
     if 2 * len(grounds) < scans:
         why = f"expected scans that show the ground all around, found {len(grounds)} of {scans}"
         return Sensor.mount, Sensor.tilt, why
@@ -142,8 +154,9 @@ def _check_sharp(rings: list[Ring], merged: int, scan: Scan, guessed: bool) -> N
                      f"wider{pieces}: {way}")  # fmt: skip
 
 
-def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[str]]:
-    """(scan, ring of each point) of the scans with the usual number of rings, and in words what was left out."""
+def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[str], str | None]:
+    """(scan, ring of each point) of the scans with the usual number of rings, in words what was left out, and what is
+    to be said where that is much."""
     found: list[tuple[Scan, np.ndarray]] = []
     without: list[Scan] = []
     for scan in scans:
@@ -163,7 +176,13 @@ def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[s
     kept = [pair for pair, count in zip(found, counts, strict=True) if count == usual]
     left = [f"{len(without)} without rings"] if without else []
     left += [f"{len(found) - len(kept)} with other than {usual} rings"] if len(kept) < len(found) else []
-    return kept, left
+    if len(found) - len(kept) < SPLIT * len(found):
+        return kept, left, None
+    others = ", ".join(map(str, np.unique(counts[counts != usual]).tolist()[:6]))
+    told = f"found {usual} in {len(kept)} of {len(found)}, and {others} in the others, which are left out"
+    split = f"expected as many rings in every scan, {told}: are they of two sensors, or do beams see only the sky in " \
+            "some? give scans of one sensor that show all of its beams"  # fmt: skip
+    return kept, left, split
 
 
 def _pooled(kept: list[tuple[Scan, np.ndarray]]) -> list[np.ndarray]:

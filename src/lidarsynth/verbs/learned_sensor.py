@@ -108,7 +108,7 @@ def summary(learned: LearnedSensor) -> str:
 
 def doubts(learned: LearnedSensor) -> list[str]:
     """Why beams or mount are not to be trusted, a line each: points more than SMEARED degrees off some, rings of few
-    points, beams of several rings, scans of several turns, no ground."""
+    points, scans of several sensors, beams of several rings, scans of several turns, no ground."""
     name, known = learned.sensor.name, len(learned.rings)
     smeared = sum(ring.residual > SMEARED for ring in learned.rings)
     found = []
@@ -123,6 +123,8 @@ def doubts(learned: LearnedSensor) -> list[str]:
             f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {few + known - learned.thin} rings, found "
             f"fewer in {few}, which are left out{kept}: give scans of wider places, or more of them"
         )
+    if learned.split:
+        found.append(f"{name}: {learned.split}")
     if learned.afloat:
         found.append(f"{name}: {learned.afloat}: mount and tilt are not learned, {learned.sensor.mount:g} m and level "
                      "are written: set them in the file")  # fmt: skip
