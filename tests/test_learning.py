@@ -17,6 +17,7 @@ from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, read_sensor
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.verbs.description import describe_sensor
 from lidarsynth.verbs.inputs import Inputs, Loaded
 from lidarsynth.verbs.learned_sensor import ENOUGH, doubts, learn, sensor_toml, summary
 
@@ -135,6 +136,11 @@ def test_blocked_rays_are_runs_that_may_wrap():
     assert blocked_runs(returned, 2) == (), "too few scans to tell"
 
 
+def test_what_is_blocked_is_described():
+    told = describe_sensor(Sensor("own", (1.0, -1.0), 100, blocked=((1, 10, 19),)))
+    assert "blocked  5.0% of the rays" in told and "tilt" not in told
+
+
 def test_the_file_is_read_back_as_the_sensor(tmp_path: Path):
     known = SENSORS["hdl-64e-kitti"].rows(range(0, 64, 2), width=300)
     (tmp_path / "own.toml").write_text(sensor_toml(known, ["two", "comments"]))
@@ -198,6 +204,8 @@ def test_a_sensor_that_hangs_has_no_mount_until_it_is_turned(tmp_path: Path, cap
     main([*words, str(tmp_path / "own.toml"), "--transform", "0:0:0:180:0:0"])
     assert capsys.readouterr().err == ""
     own = read_sensor(tmp_path / "own.toml")
+    main(["info", str(tmp_path / "own.toml")])
+    assert f"nose {own.tilt[0]:+g} and left side {own.tilt[1]:+g} degrees up" in capsys.readouterr().out
     assert own.mount == pytest.approx(1.2, abs=0.15)
     np.testing.assert_allclose(own.tilt, (6, -4), atol=1.5)
     np.testing.assert_allclose(own.elevations, [-e for e in hung.elevations[::-1]], atol=0.002)

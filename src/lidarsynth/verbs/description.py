@@ -50,6 +50,10 @@ def describe_sensor(sensor: Sensor) -> str:
         "range": f"{sensor.min_range:g} to {sensor.max_range:g} m",
         "mount": f"{sensor.mount:g} m above the road",
     }
+    if any(sensor.tilt):
+        lines["tilt"] = f"nose {sensor.tilt[0]:+g} and left side {sensor.tilt[1]:+g} degrees up"
+    if sensor.blocked:
+        lines["blocked"] = f"{sensor.blocked_rays().mean():.1%} of the rays, by its carrier"
     return _table(sensor.name, lines)
 
 
