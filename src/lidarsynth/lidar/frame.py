@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarsynth.lidar.cones import onto_z
 from lidarsynth.lidar.crowding import ORIGINS
-from lidarsynth.lidar.ground import is_above, levels, road_axis
+from lidarsynth.lidar.ground import GROUND, UPSIDE, is_above, levels, road_axis
 from lidarsynth.lidar.origin import BESIDE, TILTED, Turned, place_of, rings_of, to_undo, turned
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
@@ -21,9 +21,6 @@ from lidarsynth.lidar.sensor import INVERTED, SENSORS
 
 CLEAR = 0.7  # degrees: cones that fit better leave no doubt of the axis
 CLEARLY = 0.5  # of the residual about z: cones about another axis that fit better are the scan's
-# Times more level ground above than below, and of how many of the cells around: of Argoverse 2's second sensor, which
-# hangs upside down and meets the road from 6 m on, it is 0.59.
-UPSIDE, GROUND = 1.5, 0.45
 TURN = 64  # parts of a turn, whose directions tell which way it goes
 ACROSS = -0.2  # `road_axis` of a road that runs along y; of 133 real scans the lowest is -0.11
 TOLD = 0.05  # metres: shifts that are said
