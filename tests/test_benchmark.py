@@ -21,10 +21,10 @@ from lidarsynth.benchmark.published import PUBLISHED, published, why_not
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.run import benchmark
 from lidarsynth.benchmark.store import Seconds
-from lidarsynth.benchmark.tables import Column, table
+from lidarsynth.benchmark.tables import RANK, Column, protocol_columns, table
 from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import CachedImages, write_cache
-from lidarsynth.evaluation.protocols import R2DM_UPSAMPLING
+from lidarsynth.evaluation.protocols import PROTOCOLS, R2DM_UPSAMPLING
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.corruption import corrupt
@@ -367,6 +367,21 @@ def test_published_values_stand_only_beside_the_papers_data(tmp_path: Path):
     head, row = cells(text, "## r2dm")
     assert row[head.index("range MAE, m")].endswith("(2.110)") and row[head.index("IoU, %")] == "N/A (18.17)"
     assert "KITTI-360 test" in text
+    several = 'protocol = ["r2dm-upsampling-2024", "iln-2022"]\n' + config.read_text()
+    text = benchmark("upsampling", written(config, several), tmp_path / "several", no_model)
+    assert "- published, r2dm-upsampling-2024: in parentheses, Nakashima" in text
+    assert "- published, iln-2022: none" in text
+
+
+def test_shares_of_voxels_are_better_the_more_they_are():
+    """As IoU of classes, coverage, and accuracy near a half: of all other measures the least is best."""
+    more = {row.measure for p in PROTOCOLS.values() for row in p.rows if row.unit == "%"} - {"drop-rate"}
+    assert more == RANK.keys() and all(RANK[measure](60) < RANK[measure](90) for measure in ("sets-1nna",))
+    assert all(RANK[measure](90) < RANK[measure](60) for measure in more - {"sets-1nna"})
+    values = {"voxel IoU": {"value": 20.0}}, {"voxel IoU": {"value": 30.0}}
+    found = [Row(str(i), "", {}, 2, {"iln-2022": {"values": each}}) for i, each in enumerate(values)]
+    column = next(c for c in protocol_columns("iln-2022") if c.heading == "voxel IoU, %")
+    assert column.cells(found) == ["20.00", "**30.00**"]
 
 
 def test_the_best_is_bold_bounds_and_fewer_scans_take_no_part():

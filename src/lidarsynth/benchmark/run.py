@@ -106,9 +106,11 @@ def upsampling(setup: Setup, config: Upsampling) -> Outcome:
         "hidden": f"{config.corruption}, {1 - known.mean():.0%} of the pixels",
         "seed": str(config.seed),
     }
-    for name in protocols_of(config):
+    for name in (names := protocols_of(config)):
         told = why_not(name, data.names, config.corruption)
-        about["published"] = told or f"in parentheses, {PUBLISHED[name].source}" if name in PUBLISHED else "none"
+        about["published" if len(names) == 1 else f"published, {name}"] = (
+            told or f"in parentheses, {PUBLISHED[name].source}" if name in PUBLISHED else "none"
+        )
     record = {"source": data.images.source, "names": list(data.names), "sensor": sensor.name, "scans": len(data),
               "sha256": sha256("".join(problem.stamps.values()).encode()).hexdigest()}  # fmt: skip
     return Outcome(found, about, record, *_filled_pictures(setup, problem, found))

@@ -17,6 +17,10 @@ RANK: dict[
 ] = {  # measure of a protocol's row -> the less the better; others are themselves
     "iou": lambda value: -value,
     "iou-weighted": lambda value: -value,
+    "voxel-iou": lambda value: -value,
+    "voxel-precision": lambda value: -value,
+    "voxel-recall": lambda value: -value,
+    "voxel-f1": lambda value: -value,
     "sets-coverage": lambda value: -value,
     "sets-1nna": lambda value: abs(value - 50),
 }
