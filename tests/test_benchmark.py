@@ -501,6 +501,8 @@ def test_samples_of_others_compete_and_other_sizes_are_told(generation: Path, da
     assert table_of["same"][head.index("JSD x1e2")].startswith("**")
     assert table_of["odd"][2:] == ["N/A"] * 6
     assert "expected a reference of the samples' 16 x 48 pixels or a multiple, found 16 x 64" in text
+    assert "\n- same: samples and reference are the same images" in text, "a note of one row says of which"
+    assert "\n- bev-1 v1 judges 10,000 samples, found 4\n" in text, "and one of all rows says nothing more"
 
 
 def test_scores_are_drawn_over_the_numbers_of_steps(generation: Path, tiny: Path, tmp_path: Path, figures: None):

@@ -131,7 +131,7 @@ def seconds_columns() -> list[Column]:
 
 
 def notes(rows: Sequence[Row], columns: Sequence[Column], protocol: str) -> list[str]:
-    """Why cells are N/A, what the protocol warns of, and whose the published values are."""
+    """Why cells are N/A, and what the protocol warns of, with the rows that it is said of where it is not all."""
     told: dict[str, list[str]] = {}
     for row in rows:
         for column in columns:
@@ -139,8 +139,11 @@ def notes(rows: Sequence[Row], columns: Sequence[Column], protocol: str) -> list
             if reason:
                 told.setdefault(reason, []).append(row.name if reason == row.reason else column.heading)
     lines = [f"- N/A, {', '.join(dict.fromkeys(names))}: {_escaped(reason)}" for reason, names in told.items()]
-    warnings = {warning: None for row in rows for warning in row.reports.get(protocol, {}).get("warnings", ())}
-    lines += [f"- {_escaped(warning)}" for warning in warnings]
+    judged = [row for row in rows if "values" in row.reports.get(protocol, {})]
+    for warning in dict.fromkeys(text for row in judged for text in row.reports[protocol].get("warnings", ())):
+        warned = [row.name for row in judged if warning in row.reports[protocol].get("warnings", ())]
+        whose = "" if len(warned) == len(judged) else f"{', '.join(warned)}: "
+        lines.append(f"- {_escaped(whose + warning)}")
     return lines
 
 
