@@ -612,6 +612,41 @@ def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, 
     assert told in ls.evaluate(STREETS[:2], REAL[:2], "r2dm-upsampling-2024", sensor="vlp-16").warnings
 
 
+def test_points_that_statistics_draw_say_so_where_another_sensor_was_named(tmp_path: Path, real: Path):
+    scans, kept = tmp_path / "scans", tmp_path / "real.safetensors"
+    scans.mkdir()
+    for i, image in enumerate(STREETS):
+        ls.write(scans / f"{i}.bin", image)
+    evaluation.gather_part(real, "1/1", kept, side="reference")
+    told = "the samples are drawn into the reference's images, of hdl-64e: vlp-16, named for points and tensors, is not"
+    named = ls.evaluate(scans, kept, sensor="vlp-16")
+    assert any(text.startswith(told) for text in named.warnings)
+    for plain in (ls.evaluate(scans, kept), ls.evaluate(scans, kept, sensor="hdl-64e")):
+        assert plain.values == named.values and not any("is not used" in text for text in plain.warnings)
+
+
+def test_a_sensor_of_ones_own_need_not_have_a_word(real: Path):
+    own = replace(STREETS[0].sensor, name="own")
+    images = [replace(image, sensor=own) for image in STREETS]
+    assert ls.evaluate(images, real, sensor=own).values == ls.evaluate(STREETS, real).values
+    other = replace(own, name="other", elevations=tuple(e + 1 for e in own.elevations))
+    told = "the samples know their own sensor, own: other, named for points and tensors, is not used"
+    assert told in ls.evaluate(images, real, sensor=other).warnings
+
+
+def test_more_machines_than_scans_merge(tmp_path: Path, real: Path):
+    parts = [tmp_path / f"{i}.safetensors" for i in range(1, 13)]
+    for i, part in enumerate(parts, 1):
+        evaluation.gather_part(
+            saved(tmp_path / "samples", STREETS) if i == 1 else tmp_path / "samples", f"{i}/12", part
+        )
+    report = ls.evaluate(parts, real)
+    assert report.counts["samples"] == len(STREETS) < len(parts)
+    assert report.values == pytest.approx(ls.evaluate(STREETS, real).values, rel=1e-6)
+    with pytest.raises(ValueError, match="expected a part of its own"):
+        ls.evaluate([parts[0], *parts], real)
+
+
 def test_a_zero_has_no_sign():
     assert [str(Result("FRD", value, "m")) for value in (-0.0004, 0.0004, -0.0006)] == [
         "0.000 m",

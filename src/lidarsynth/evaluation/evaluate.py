@@ -120,9 +120,8 @@ class _Run:
     def notes(self, judged: ImageSet | None, truth: ImageSet | None, drawn: Sensor) -> tuple[str, ...]:
         """What is unlike in the images that were read, or statistics stand for, and judged as those of `drawn`."""
         sides = {"samples": judged, "the reference": truth}
-        named = self.sensor.name if isinstance(self.sensor, Sensor) else self.sensor
-        told = unused_sensor(named, judged, drawn) + unlike_sensors(sides, drawn)
-        return told + tensors_taken(sides, drawn, named) + unlike_metres(sides)
+        told = unused_sensor(self.sensor, judged, drawn) + unlike_sensors(sides, drawn)
+        return told + tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides)
 
     def projection(self, sensor: Sensor) -> str:
         """Of points: the protocol's into images of its own sensor; by rings into those that published programs take."""
@@ -321,7 +320,8 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
     digests = [statistics.digest for statistics, _ in loaded]
     shared = [part for part in parts if part[1] > 1]
     for i, file in enumerate(files):
-        if digests[i] in digests[:i] or (parts[i] in shared and parts[i] in parts[:i]):
+        again = int(digests[i], 16) and digests[i] in digests[:i]  # parts without an image are alike
+        if again or (parts[i] in shared and parts[i] in parts[:i]):
             raise ValueError(f"{file}: expected a part of its own, found the images of another part")
     if len({n for _, n in parts}) > 1:  # a whole beside parts, too: the images of these may be in it
         raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in parts)}")

@@ -50,7 +50,7 @@ def _some(images: ImageSet) -> Iterator[Item]:
     return (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
 
 
-def tensors_taken(sides: Sides, rays: Sensor, named: str | None) -> tuple[str, ...]:
+def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tuple[str, ...]:
     """Notes where a side, by some from everywhere, has tensors whose rows are other beams than the sensor's they are
     taken for; or, unless a sensor was named for them, which rays those have that hold no points."""
     told = []
@@ -65,19 +65,22 @@ def tensors_taken(sides: Sides, rays: Sensor, named: str | None) -> tuple[str, .
     return tuple(told)
 
 
-def unused_sensor(named: str | None, images: ImageSet | None, own: Sensor) -> tuple[str, ...]:
-    """A note where a sensor was named, and the samples are images, or statistics, that know another of their own.
+def unused_sensor(named: str | Sensor | None, images: ImageSet | None, own: Sensor) -> tuple[str, ...]:
+    """A note where a sensor was named, and the samples are images, or statistics, that know another of their own; or
+    points and tensors that are drawn into the images of a reference that cannot be drawn again.
 
-    own  of the samples, where they are statistics
+    own  of the samples, where they are not images
     """
-    first = images.item(0) if images else None
-    if named is None or (images and not isinstance(first, RangeImage)):
+    if named is None:
         return ()
-    own, given = first.sensor if isinstance(first, RangeImage) else own, get_sensor(named)
-    fits = given.height % own.height == 0
-    if fits and given.resized(own.height, own.width).elevations == own.elevations:
+    first, given = images.item(0) if images else None, get_sensor(named)
+    own = first.sensor if isinstance(first, RangeImage) else own
+    if given.height % own.height == 0 and given.resized(own.height, own.width).elevations == own.elevations:
         return ()
-    return (f"the samples know their own sensor, {own.name}: {named}, named for points and tensors, is not used",)
+    drawn = images is not None and not isinstance(first, RangeImage)
+    why = f"are drawn into the reference's images, of {own.name}" if drawn else f"know their own sensor, {own.name}"
+    word = named.name if isinstance(named, Sensor) else named
+    return (f"the samples {why}: {word}, named for points and tensors, is not used",)
 
 
 def unlike_metres(sides: Sides) -> tuple[str, ...]:
