@@ -465,6 +465,25 @@ def test_a_cache_of_dusty_keeps_the_columns_of_its_program(scan64: bytes, tmp_pa
         thin(wide, width=512, resizing="bilinear")
 
 
+def test_images_of_published_systems_are_of_raw_drives(scan64: bytes, tmp_path: Path):
+    """Odometry's points are motion-compensated, and its test split is of other drives."""
+    folder = tmp_path / "odometry" / "sequences" / "00" / "velodyne"
+    folder.mkdir(parents=True)
+    (folder / "000000.bin").write_bytes(scan64)
+    for word in ("kitti-dusty", "kitti-r2dm"):
+        with pytest.raises(ValueError, match=r"expected raw drives, DATE/DATE_drive_NNNN_sync, .* found odometry's"):
+            list(cache_source(word, tmp_path / "odometry", tmp_path / word))
+    assert list(cache_source("kitti", tmp_path / "odometry", tmp_path / "kitti", sensor="hdl-64e-dusty"))
+
+
+def test_a_frame_that_has_no_number_is_named(scan64: bytes, tmp_path: Path):
+    root = kitti_of(scan64, tmp_path)
+    notes = root / "2011_10_03/2011_10_03_drive_0027_sync/velodyne_points/data/notes.bin"
+    notes.write_bytes(scan64)
+    with pytest.raises(ValueError, match=r"notes.bin: expected a file named by the number of its frame, found 'notes'"):
+        list(cache_source("kitti", root, tmp_path / "cache"))
+
+
 def test_a_cache_of_lidargen_is_of_its_drives_and_without_limits(scan64: bytes, tmp_path: Path):
     """Its program trains on all names without 0000_sync and 0001_sync, and drops no return for its range."""
     for drive in (0, 2, 3):

@@ -73,6 +73,15 @@ def kitti_raw(root: str | Path, split: str = "train") -> Frames:
     return gather("kitti", root, split, frames)
 
 
+def kitti_published(root: str | Path, split: str = "train") -> Frames:
+    """`kitti_raw`, on which published systems learned. Raises ValueError for odometry's layout, of other points."""
+    if _sequences(Path(root)).is_dir():
+        raise ValueError(f"{root}: expected raw drives, DATE/DATE_drive_NNNN_sync, on which published systems learned, "
+                         "found odometry's sequences, whose points are motion-compensated and whose splits are others: "
+                         "data kitti takes them, with --sensor")  # fmt: skip
+    return kitti_raw(root, split)
+
+
 def raw_test_drives() -> list[str]:
     """The 51 drives of R2DM's test split, city, road, then residential."""
     dates = [(date, drives) for dates in RAW_TEST.values() for date, drives in dates.items()]
@@ -81,6 +90,9 @@ def raw_test_drives() -> list[str]:
 
 def _drive(root: Path, drive: str, first: int, last: int | None) -> list[Frame]:
     frames = list_frames(root / drive[:10] / drive / "velodyne_points" / "data", drive)
+    for frame in frames if last is not None else ():
+        if not frame.frame.isdecimal():
+            raise ValueError(f"{frame.path}: expected a file named by the number of its frame, found {frame.frame!r}")
     return frames if last is None else [frame for frame in frames if first <= int(frame.frame) <= last]
 
 

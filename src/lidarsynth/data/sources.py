@@ -15,7 +15,7 @@ from lidarsynth.data.folder import folder as scan_folder
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import Frames, Reader, choose, stamped
 from lidarsynth.data.index import INDEX, REPORT, read_index, report
-from lidarsynth.data.kitti import kitti
+from lidarsynth.data.kitti import kitti, kitti_published
 from lidarsynth.data.kitti360 import kitti360, kitti360_lidargen
 from lidarsynth.data.nuscenes import NuScenes, nuscenes
 from lidarsynth.data.street_caches import begins_alike
@@ -50,8 +50,8 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "kitti360": Source(kitti360, "train", "hdl-64e", "spherical", 1024),
     "kitti": Source(kitti, "train", "hdl-64e-kitti", "unfolding", 512),
     # images on which the presets of published systems learned: r2dm-kitti-raw, DUSty's and the vanilla GAN's, lidargen
-    "kitti-r2dm": Source(kitti, "train", "hdl-64e-r2dm", "unfolding", 512),
-    "kitti-dusty": Source(kitti, "train", "hdl-64e-dusty", "unfolding", 512, "nearest"),
+    "kitti-r2dm": Source(kitti_published, "train", "hdl-64e-r2dm", "unfolding", 512),
+    "kitti-dusty": Source(kitti_published, "train", "hdl-64e-dusty", "unfolding", 512, "nearest"),
     "kitti360-lidargen": Source(kitti360_lidargen, "train", "hdl-64e-lidargen", "spherical", 1024),
     "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
     "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
