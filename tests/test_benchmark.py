@@ -606,6 +606,16 @@ def test_a_model_that_is_none_is_told_before_the_first_scan(data: Path, tmp_path
     assert not (tmp_path / "out").exists()
 
 
+def test_samples_that_are_nowhere_are_told_before_the_first_scan(generation: Path, tiny: Path, tmp_path: Path):
+    model = Counted(ls.load(tiny))
+    for words, message in (('held_out = "nowhere"', "nowhere: expected a cache, or samples"),
+                           ('samples = "synthetic:2"', "expected synthetic:COUNT:SEED")):  # fmt: skip
+        text = generation.read_text() + f'[[method]]\nname = "last"\n{words}\n'
+        with pytest.raises(ValueError, match=message):
+            benchmark("generation", written(tmp_path / "last.toml", text), tmp_path / "out", lambda word: model)
+    assert not model.calls
+
+
 def test_curves_need_matplotlib_and_say_so_first(generation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'lidarsynth\[viz\]'"):

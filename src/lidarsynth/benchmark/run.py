@@ -145,6 +145,9 @@ def _coloured(
 def generation(setup: Setup, config: Generation) -> Outcome:
     """Every method's scans meet the same reference. Raises ValueError for a reference that cannot be used."""
     reference = image_set(located(config.reference, setup.folder, config.sensor, setup.on_images))
+    for method in config.method:
+        if word := method.samples or method.held_out:  # its lack is told now, not after hours
+            image_set(located(word, setup.folder, config.sensor, setup.on_images))
     first = get_protocol(protocols_of(config)[0])
     sensor = sensor_of(reference.item(0), get_sensor(config.sensor or first.sensor))
     found = [generation_row(setup, config, group, method, reference, sensor) for group, method in rows(config.method)]
