@@ -1,5 +1,6 @@
 """What returns are of: surroundings, lessons, the network and its loss."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,13 @@ from lidarsynth.streets.varied import VariedStreets
 from lidarsynth.systems.cascade.examples import CascadeBatch
 from lidarsynth.systems.cascade.lessons import HEIGHT, WIDTH, Lessons, Pixels, _filled_in, lesson, lessons
 from lidarsynth.systems.cascade.naming import (
+    ALSO,
+    PEOPLE,
     THOUSAND,
     NamingObjective,
     _on_true_beams,
     named,
+    of_pieces,
     of_surfaces,
     weights,
 )
@@ -251,3 +255,25 @@ def test_pixels_of_a_surface_are_named_together_and_edges_stay():
     assert (mean[0, :, 14:16] > 0.9).all() and (mean[1, :, 16:18] == 1).all()
     assert mean[0, 0, 0] == 1 and mean[1, 0, 31] == 1  # around the turn, but no nearer to each other
     assert_close(mean[:, 4, 5], chances[:, 4, 5])
+
+
+def test_pieces_inside_are_wholly_people_or_furniture_and_all_else_stays():
+    person, wall = CLASS_NUMBER["person"], CLASS_NUMBER["building"]
+    metres = torch.full((4, 32), 9.0)
+    metres[:, 2:6], metres[:, 10:14], metres[0, 20] = 3.0, 4.0, 0.0
+    chances = torch.full((20, 4, 32), 1e-3)
+    chances[wall] = 0.9
+    chances[wall, :, 2:6], chances[wall, :, 10:14] = 0.1, 0.1
+    chances[0, :, 2:6], chances[person, :, 2:6] = 0.2, 0.6
+    chances[0, 1, 2:6], chances[person, 1, 2:6] = 0.6, 0.2  # a part of the first that looks like furniture
+    chances[0, :, 10:14], chances[person, :, 10:14] = 0.6, 0.2
+    alike = torch.full_like(chances, math.exp(-PEOPLE / ALSO))  # streets' network says nothing either way
+    whole = of_pieces(chances, alike, metres)
+    label = whole.argmax(0)
+    assert (label[:, 2:6] == person).all() and (label[:, 10:14] == 0).all()
+    assert (label[:, 14:] == wall).all() and (label[:, :2] == wall).all()
+    assert_close(whole.sum(0), chances.sum(0))
+    surely = alike.clone()
+    surely[person] = 1.0
+    assert (of_pieces(chances, surely, metres).argmax(0)[:, 10:14] == person).all()
+    assert_close(of_pieces(chances, alike, torch.zeros_like(metres)), chances)  # nothing returned

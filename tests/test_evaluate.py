@@ -219,6 +219,10 @@ def test_parts_of_a_reference_become_one_file_to_share(tmp_path: Path, real: Pat
     with pytest.raises(ValueError, match="found samples and samples; gather a reference as such"):
         ls.evaluate(STREETS, shared_file)
     evaluation.gather_part(real, "2/2", shared_file, "bev-1", side="reference")
+    evaluation.gather_part(real, "1/40", tmp_path / "one.safetensors", "bev-1", side="reference")
+    told = ls.evaluate(STREETS, tmp_path / "one.safetensors").warnings
+    lacking = "2/40, 3/40, 4/40, 5/40, 6/40, 7/40, 8/40, 9/40 and 31 more"
+    assert any(text.endswith(f"found none of {lacking}") for text in told)
     with pytest.raises(ValueError, match="expected parts of one division, found 1/3, 2/2"):
         ls.evaluate(STREETS, [parts[0], shared_file])
     with pytest.raises(ValueError, match="takes as many of the reference as there are samples"):

@@ -37,6 +37,7 @@ from lidarsynth.networks.device import check_device
 from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
+NAMED = 8  # parts that lack, of a note
 GATHERED = 2  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
@@ -329,8 +330,9 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
     for other, _ in loaded[1:]:
         total.merge(other)
     if shared and len(shared) < (n := shared[0][1]):
-        lacking = ", ".join(f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared)
-        return total, (f"expected all parts of the images, found none of {lacking}",)
+        lacking = [f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared]
+        more = f" and {len(lacking) - NAMED} more" if len(lacking) > NAMED else ""
+        return total, (f"expected all parts of the images, found none of {', '.join(lacking[:NAMED])}{more}",)
     return total, ()
 
 

@@ -41,7 +41,7 @@ OUTDOORS = ("road", "parking", "sidewalk", "fence", "vegetation", "trunk", "terr
 MOSTLY, SOME = 0.7, 0.02
 # Inside, people are told from furniture piece by piece: by the logarithm of their chance there, so much of what the
 # network of streets says, and as much more as brings their IoU to most in held-out insides.
-ALSO, PEOPLE = 0.5, 2.0
+ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no longer counts
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
 # is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": 0.45, "terrain": 0.6}
@@ -151,25 +151,7 @@ def _inside(network: ClassUNet, streets: ClassUNet, told: Tensor, image: RangeIm
     if telling <= SOME * count.sum() or within <= MOSTLY * telling:
         return None
     chances = of_surfaces(logits.softmax(0), _metres(image))
-    return _with_people(chances, _outside(streets, told, image, _fair(weights())), image)
-
-
-def _with_people(chances: Tensor, streets: Tensor, image: RangeImage) -> Tensor:
-    """Chances (20, H, W), in which whole pieces of furniture and of people are of the one or the other; those of the
-    network of streets (20, H, W)."""
-    person = CLASS_NUMBER["person"]
-    both, here = chances[0] + chances[person], (chances[person].log() + ALSO * streets[person].log() + PEOPLE).exp()
-    least = 1e-4  # of a chance that counts
-    odds = ((here + least) / (chances[0] + least)).log().numpy()
-    most = chances.index_fill(0, torch.tensor(person), 0).amax(0)
-    stands = image.mask & ((here >= most) | (chances[0] >= torch.maximum(most, here))).numpy()
-    of = pieces(image.range, stands)
-    size = np.bincount(of[stands], minlength=1)
-    share = torch.from_numpy(np.bincount(of[stands], odds[stands], len(size)) / np.maximum(size, 1)).sigmoid().float()
-    chances, whose, on = chances.clone(), share[torch.from_numpy(of)], torch.from_numpy(stands)
-    chances[person] = torch.where(on, both * whose, chances[person])
-    chances[0] = torch.where(on, both * (1 - whose), chances[0])
-    return chances
+    return of_pieces(chances, _outside(streets, told, image, _fair(weights())), _metres(image))
 
 
 def _metres(image: RangeImage) -> Tensor:
@@ -198,6 +180,25 @@ def of_surfaces(chances: Tensor, metres: Tensor) -> Tensor:
             total[:, here].addcmul_(chances[:, there].roll(right, 2), alike.float())
             count[here] += alike
     return total / count
+
+
+def of_pieces(chances: Tensor, streets: Tensor, metres: Tensor) -> Tensor:
+    """(C, H, W) chances inside buildings, in which pieces of furniture and people are wholly the one or the other, as
+    their pixels say on average; by chances (C, H, W) of the network of insides, and by those of streets, which has its
+    say on people; metres (H, W), 0 for no return."""
+    person = CLASS_NUMBER["person"]
+    here = (chances[person].log() + ALSO * streets[person].log() + PEOPLE).exp()
+    others = chances.index_fill(0, torch.tensor([0, person]), 0).amax(0)
+    stands = (metres > 0) & (torch.maximum(here, chances[0]) >= others)
+    of = pieces(metres.numpy(), stands.numpy())
+    odds = ((here + FAINT) / (chances[0] + FAINT)).log()[stands].numpy()
+    mean = np.bincount(of[of >= 0], odds) / np.maximum(np.bincount(of[of >= 0]), 1)
+    share = torch.zeros_like(metres)
+    share[stands] = torch.from_numpy(mean[of[of >= 0]]).float().sigmoid()
+    both, whole = chances[0] + chances[person], chances.clone()
+    whole[0] = torch.where(stands, both * (1 - share), chances[0])
+    whole[person] = torch.where(stands, both * share, chances[person])
+    return whole
 
 
 def _told(image: RangeImage, even: np.ndarray, rays: Rays, device: torch.device) -> Tensor:
