@@ -21,7 +21,7 @@ from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
-from lidarsynth.lidar.scan import RangeImage, Scan, with_points
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
@@ -254,8 +254,7 @@ def _made(
     path = work.item.path
     if job.verb == "project":
         image = project(scan, named_sensor(scan, path, "--sensor", job.sensor), job.projection, job.width)
-        if not image.mask.any():
-            raise ValueError(f"{path}: expected points within {image.sensor.name}'s view, found none of {len(scan)}")
+        image = check_seen(image, len(scan))
         return image, f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
     assert model is not None
     if job.verb == "complete":
