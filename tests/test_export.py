@@ -79,6 +79,18 @@ def test_the_fill_is_the_models_for_any_number_of_columns(exported: Exported, wi
     np.testing.assert_array_equal(found[0][0, 0][known & sparse.mask], sparse.range[known & sparse.mask])
 
 
+def test_what_stands_in_pixels_that_are_not_known_says_nothing():
+    blocked = replace(SENSOR, blocked=((2, 10, 40), (5, 0, 63)))
+    image = SyntheticStreets(3, 1, SENSOR).image(0)
+    known = torch.from_numpy(corrupt(image, "beams:4"))[None, None]
+    whole = [torch.from_numpy(part)[None, None] for part in (image.range, image.reflectance)]
+    told = [torch.where(known, part, 0.0) for part in whole]
+    graph = graph_of(cascade().into(blocked)).module
+    with torch.no_grad():
+        for found, expected in zip(graph(*whole, known.float()), graph(*told, known.float()), strict=True):
+            assert torch.equal(found, expected)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_file_says_what_it_is(exported: Exported):

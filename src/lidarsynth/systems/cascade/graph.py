@@ -47,8 +47,8 @@ class FillGraph(nn.Module):
 
     def forward(self, range: Tensor, reflectance: Tensor, known: Tensor) -> tuple[Tensor, ...]:
         sensor = self.model.sensor
+        returned = (known > 0.5) & (range > 0)  # and no other, though a range may stand where a blocked ray is
         told = (known > 0.5) | self._buffer("closed")
-        returned = told & (range > 0)
         metres = self._padded(torch.where(returned, range, 0.0), 0)
         light = self._padded(calmed(reflectance, range, returned), 0)
         answered = metres > 0
