@@ -588,6 +588,12 @@ def test_help_reads_on_any_terminal(monkeypatch: pytest.MonkeyPatch, verb: tuple
     assert "\\u" not in text, "boxes are drawn with what the terminal has"
 
 
+@pytest.mark.parametrize("verb", ["export", "generate", "label", "realise", "demo"])
+def test_help_offers_interpolations_and_recognition_where_they_are_taken(run: Run, verb: str):
+    assert "bilinear" not in run(verb, "--help").out and "bilinear" in run("complete", "--help").out
+    assert "recognised" not in run("export", "--help").out
+
+
 def test_any_file_name_can_be_said_on_any_terminal(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "straße.pcd"
     path.write_bytes(scan.read_bytes())

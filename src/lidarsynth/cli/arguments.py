@@ -14,7 +14,10 @@ Positional = tyro.conf.Positional
 Count = Annotated[int, arg(aliases=["-n"], help="how many scans.")]
 From = Annotated[str | None, arg(name="from")]
 Source = Annotated[
-    str, arg(metavar="MODEL", help="default, an official release, a model folder, an official .pth file, or bilinear.")
+    str, arg(metavar="MODEL", help="default, kitti, an official release, a model folder or an official .pth file.")
+]
+Filler = Annotated[
+    Source, arg(help="default, kitti, an official release, a model folder, an official .pth file, or bilinear.")
 ]
 Seed = Annotated[int, arg(help="of all randomness.")]
 NoSeed = Annotated[int, arg(help="not used; every verb takes it.")]
@@ -65,7 +68,9 @@ Intensity = Annotated[
 ]
 Picture = Annotated[bool, arg(help="write a .png beside each file.")]
 Labels = Annotated[bool, arg(help="SemanticKITTI's class of each point too: a field, and of .bin and .npy a .label.")]
-Output = Annotated[Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the range image.")]
+Output = Annotated[
+    Path, arg(help="file to write: .ply .pcd .bin .npy, or .npz for the image; a folder for several; or a bag.")
+]
 Recipe = Annotated[
     str | None,
     arg(metavar="RECIPE", help="hide first: beams:4, points:0.1, sector:90, region:5:20:-5:5, or several joined by +."),

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from lidarsynth.cli.arguments import (
     Device,
+    Filler,
     Intensity,
     Labels,
     Least,
@@ -18,7 +19,6 @@ from lidarsynth.cli.arguments import (
     Resamples,
     Seed,
     SensorWord,
-    Source,
     Steps,
     arg,
 )
@@ -30,7 +30,7 @@ def complete(
     scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
     out: Annotated[Path, arg(help="file to write, as in upsample; a folder where there are several scans; or a bag.")],
     corrupt: Recipe = None,
-    model: Source = "default",
+    model: Filler = "default",
     method: Method = "auto",
     steps: Steps = None,
     resamples: Resamples = None,

@@ -12,7 +12,7 @@ from lidarsynth.cli.terminal import load_with_bar, say
 def export(
     model: Positional[Source],
     out: Annotated[Positional[Path], arg(metavar="OUT.onnx", help="file to write.")],
-    sensor: SensorWord = None,
+    sensor: Annotated[SensorWord, arg(help="of the images, for a model of any sensor; default the model's.")] = None,
     any_columns: Annotated[bool, arg(help="leave the number of columns open, in multiples of 16; of default.")] = False,
     seed: NoSeed = 0,
 ) -> None:

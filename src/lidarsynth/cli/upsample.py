@@ -7,6 +7,7 @@ from typing import Annotated
 
 from lidarsynth.cli.arguments import (
     Device,
+    Filler,
     Intensity,
     Labels,
     Least,
@@ -19,7 +20,6 @@ from lidarsynth.cli.arguments import (
     Seed,
     SensorOut,
     SensorWord,
-    Source,
     Steps,
     arg,
 )
@@ -37,7 +37,7 @@ def upsample(
     times: Annotated[
         int | None, arg(metavar="INT", help="as many beams as the scan has, in its own view; default 4 without --to.")
     ] = None,
-    model: Source = "default",
+    model: Filler = "default",
     method: Method = "auto",
     steps: Steps = None,
     resamples: Resamples = None,
