@@ -121,6 +121,9 @@ def test_images_that_are_no_measurements_are_refused(model: ls.ScanModel, image:
             replace(image, range=wrong)
     with pytest.raises(ValueError, match="expected a reflectance of 0 to 1"):
         model.complete(replace(image, reflectance=light))
+    unknown = np.column_stack([np.ones((3, 3)), [0.5, np.nan, 1.0]])
+    with pytest.raises(ValueError, match="0 to 1 in the fourth column, found NaN; put 0"):
+        model.complete(unknown)
     with pytest.raises(ValueError, match="mask must be bool, got uint8"):
         replace(image, mask=image.mask.astype(np.uint8))
     with pytest.raises(ValueError, match="range must be an array, got a list"):

@@ -478,6 +478,9 @@ def test_errors_name_the_sample_and_say_both_sides(tmp_path: Path, real: Path):
     torch.save({"f": print}, tmp_path / "code/0.pth")
     with pytest.raises(ValueError, match="damaged or unsafe file"):
         ls.evaluate(tmp_path / "code", real)
+    with pytest.raises(ValueError, match=r"found 1 with array\(.*\]\]") as caught:
+        image_set([np.zeros((2, 3))])  # type: ignore[list-item]
+    assert "\n" not in str(caught.value)
 
 
 def recoded(form: str, images: list[RangeImage]) -> list[torch.Tensor]:

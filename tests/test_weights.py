@@ -250,6 +250,7 @@ def test_words_and_paths_that_are_nothing_get_one_line(tmp_path):
         "nonsense": "no file or folder of that name",
         "r2dm-h": "a preset, which has no trained weights",
         tmp_path / "gone": "no file or folder of that name",
+        Path("default"): "no file or folder of that name; words are given as str",
         tmp_path: "no experiment.json",
     }.items():
         with pytest.raises(ValueError, match=f"expected .*found {found}") as caught:

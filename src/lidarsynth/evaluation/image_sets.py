@@ -104,9 +104,8 @@ def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path], 
         if not images:
             raise ValueError("expected at least one range image, found an empty list")
         if other := [image for image in images if not isinstance(image, RangeImage)]:
-            raise ValueError(
-                f"expected one folder, or a list of range images, found {len(images)} with {other[0]!r:.80}"
-            )
+            found = " ".join(repr(other[0]).split())
+            raise ValueError(f"expected one folder, or a list of range images, found {len(images)} with {found:.80}")
         return ImageSet(tuple(f"image {i}" for i in range(len(images))), images.__getitem__, "a list of images", "")
     path = Path(source)
     if (path / INDEX).is_file():

@@ -173,6 +173,8 @@ def check_seen(image: RangeImage, count: int) -> RangeImage:
 def _check(xyz: np.ndarray, light: np.ndarray, where: str = "") -> None:
     if not np.isfinite(xyz).all():
         raise ValueError("expected finite points, found NaN or infinite ones; leave them out")
+    if np.isnan(light.max(initial=0)):
+        raise ValueError(f"expected a reflectance of 0 to 1{where}, found NaN; put 0 where nobody knows it")
     if not (light.min(initial=0) >= 0 and light.max(initial=0) <= 1):
         raise ValueError(f"expected a reflectance of 0 to 1{where}, found {light.min():g} to {light.max():g}; divide "
                          "it by its scale")  # fmt: skip

@@ -56,7 +56,7 @@ def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = 
         return read_official(path, ema)
     if isinstance(source, str) and is_repository(source):
         return load_folder(fetch(source))
-    raise ValueError(_unknown(str(source)))
+    raise ValueError(_unknown(source))
 
 
 def _load_release(word: str, ema: bool, on_bytes: OnBytes | None) -> tuple[Experiment, nn.Module]:
@@ -75,9 +75,10 @@ def shipped() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(SHIPPED.glob(f"*/{RECORD}"))}
 
 
-def _unknown(source: str) -> str:
+def _unknown(source: str | Path) -> str:
     expected = f"expected shipped weights ({', '.join(shipped()) or 'none here'}), a release ({', '.join(RELEASES)})"
     found = "a preset, which has no trained weights" if source in PRESETS else "no file or folder of that name"
+    found += "; words are given as str" if isinstance(source, Path) else ""
     expected += f", an interpolation ({', '.join(WITHOUT_WEIGHTS)})"
     return f"{source}: {expected}, a model folder, an official .pth file or owner/name of a hub, found {found}"
 
