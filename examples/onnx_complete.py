@@ -16,8 +16,11 @@ _, network, source, target = sys.argv
 for path in (network, source):
     if not os.path.isfile(path):
         sys.exit(f"{path}: expected a file, found none")
-session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
-sensor = json.loads(session.get_modelmeta().custom_metadata_map["sensor"])
+try:
+    session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
+    sensor = json.loads(session.get_modelmeta().custom_metadata_map["sensor"])
+except Exception:  # onnxruntime's own are all of one kind
+    sys.exit(f"{network}: expected a file of `lidarsynth export`, found another or a damaged one")
 elevations, width = np.array(sensor["elevations"]), sensor["width"]
 
 with open(source, "rb") as file:  # the points
@@ -30,6 +33,10 @@ with open(source, "rb") as file:  # the points
     kind = {"F4": "f4", "U1": "u1", "U2": "u2", "U4": "u4", "I4": "i4", "F8": "f8", "I1": "i1", "I2": "i2"}
     types = [kind[t + s] for t, s in zip(header["TYPE"], header["SIZE"], strict=True)]
     cloud = np.fromfile(file, np.dtype(list(zip(header["FIELDS"], types, strict=True))), int(header["POINTS"][0]))
+if lacking := [name for name in ("x", "y", "z", "intensity") if name not in (cloud.dtype.names or ())]:
+    sys.exit(f"{source}: expected the fields x y z intensity, found no {' '.join(lacking)}")
+if len(cloud) < int(header["POINTS"][0]):
+    sys.exit(f"{source}: expected {header['POINTS'][0]} points, found the file cut off after {len(cloud)}")
 xyz = np.stack([cloud[axis] for axis in "xyz"], 1).astype(np.float32)
 metres, light = np.linalg.norm(xyz, axis=1), cloud["intensity"].astype(np.float32)
 hit = np.isfinite(metres) & (metres > 0)  # others are rays without a return

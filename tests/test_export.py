@@ -177,6 +177,15 @@ def test_the_example_needs_no_torch(exported: Exported, tmp_path: Path):
     assert abs(len(dense) - len(filled.to_scan())) < 0.1 * len(filled.to_scan())
 
 
+def test_the_example_refuses_what_is_no_network_in_one_line(tmp_path: Path):
+    for name in ("x.onnx", "scan.pcd"):
+        (tmp_path / name).write_bytes(b"no network")
+    program = [sys.executable, str(ROOT / "examples" / "onnx_complete.py"), "x.onnx", "scan.pcd", "d.npy"]
+    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "x.onnx: expected a file of `lidarsynth export`, found another or a damaged one"
+
+
 def test_the_example_refuses_what_is_no_binary_cloud_in_one_line(tmp_path: Path):
     meta = {"sensor": json.dumps({"elevations": [1.0, 0.0], "width": 8})}
     (tmp_path / "onnxruntime.py").write_text(
@@ -187,13 +196,17 @@ def test_the_example_refuses_what_is_no_binary_cloud_in_one_line(tmp_path: Path)
         "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
     )
     (tmp_path / "x.onnx").touch()
-    for content, found in ((f"{head}DATA binary_compressed\n0000", "binary_compressed"),
-                           (f"{head}DATA ascii\n1 2 3 0\n", "ascii"), (head, "no DATA"), ("", "no DATA"),
-                           ("\x89PNG\x00\xff", "no DATA")):  # fmt: skip
+    kind, other = "a .pcd with DATA binary, found", head.replace("intensity", "i")
+    for content, told in ((f"{head}DATA binary_compressed\n0000", f"{kind} binary_compressed"),
+                          (f"{head}DATA ascii\n1 2 3 0\n", f"{kind} ascii"), (head, f"{kind} no DATA"),
+                          ("", f"{kind} no DATA"), ("\x89PNG\x00\xff", f"{kind} no DATA"),
+                          (f"{head}DATA binary\n0000", "1 points, found the file cut off after 0"),
+                          (f"{other}DATA binary\n{'0' * 16}", "the fields x y z intensity, found no intensity"),
+                          ):  # fmt: skip
         (tmp_path / "scan.pcd").write_text(content, "latin-1")
         program = [sys.executable, str(ROOT / "examples" / "onnx_complete.py"), "x.onnx", "scan.pcd", "d.npy"]
         done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, timeout=60,
                               env={**os.environ, "PYTHONPATH": str(tmp_path)})  # fmt: skip
         said = done.stderr.strip()
         assert done.returncode == 1 and "\n" not in said and not (tmp_path / "d.npy").exists()
-        assert said == f"scan.pcd: expected a .pcd with DATA binary, found {found}"
+        assert said == f"scan.pcd: expected {told}"
