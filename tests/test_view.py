@@ -1,5 +1,7 @@
 """The viewer without a browser: bytes, rows, what lies beside, scans by number, the server's doors, the file."""
 
+import base64
+import gzip
 import http.client
 import json
 import re
@@ -501,3 +503,19 @@ def test_a_range_image_is_shown_as_its_points(tmp_path: Path):
     image = project(turn(), SENSORS["vlp-16"], width=256)
     write(tmp_path / "a.npz", image)
     np.testing.assert_allclose(read_shown(tmp_path / "a.npz").scan.xyz, read(tmp_path / "a.npz").xyz)
+
+
+def test_of_a_file_of_several_sensors_the_rings_of_one_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scan, page = turn(), tmp_path / "page.html"
+    write(tmp_path / "two.pcd", scan)
+    for label, note in ((np.where(np.arange(len(scan)) % 2, 40, 50), None), (np.zeros(7), "labels left out")):
+        label.astype(np.uint32).tofile(tmp_path / "two.label")
+        for words, count in (([], 4096), (["--rings", "0-7"], 2048)):
+            main(["view", str(tmp_path / "two.pcd"), "--out", str(page), *words])
+            (found,) = re.findall(r'id="scan-0-0">([^<]*)<', page.read_text())
+            header, _ = unpacked(gzip.decompress(base64.b64decode(found)))
+            assert header["points"] == count
+            assert [text.split(":")[0] for text in header["notes"]] == ([] if note is None else [note])
+    assert "expected --rings FIRST-LAST" in refused(
+        capsys, str(tmp_path / "two.pcd"), "--out", str(page), "--rings", "7"
+    )

@@ -40,9 +40,10 @@ def view(
         str, arg(metavar="XYZ", help="where x, y, z of the files point: CARLA has fru, AirSim frd.")
     ] = "flu",
     mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0.")] = None,
+    rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
 ) -> None:
     """Scans in the browser, from a page on this machine alone; or, with --out, as one file to send."""
-    from lidarsynth.verbs.inputs import Reading, read_transform
+    from lidarsynth.verbs.inputs import Reading, parse_rings, read_transform
     from lidarsynth.viewer.page import write_page
     from lidarsynth.viewer.pairs import compared, entries
     from lidarsynth.viewer.server import Show
@@ -50,7 +51,8 @@ def view(
     at_least(0, {"port": port})
     if out is not None and out.suffix.lower() not in ENDINGS:
         raise ValueError(f"{out}: expected a name that ends in .html, found {out.name[-20:]!r}")
-    series = compared(scans, other, Reading(intensity, topic, metadata, read_transform(transform, mount, axes)))
+    how = Reading(intensity, topic, metadata, read_transform(transform, mount, axes), rings=parse_rings(rings))
+    series = compared(scans, other, how)
     title = next(iter(series))
     if out is None:
         return _serve(Show(title, series), port, browser)

@@ -17,21 +17,23 @@ from lidarsynth.viewer.packing import Shown
 THREE = ("centre", "size")  # fields of a box with three numbers
 
 
-def read_shown(path: Path, intensity: str = "auto") -> Shown:
+def read_shown(path: Path, intensity: str = "auto", rings: tuple[int, int] | None = None) -> Shown:
     """A scan file with the labels, boxes, `new` and `confidence` beside it; what cannot be used becomes a note.
 
     Labels: NAME.label beside it or in ../labels, as SemanticKITTI has them. Boxes: NAME.json beside it or in a folder
-    `boxes` up to three levels up, as `lidarsynth streets` writes them. Raises FileError for the scan itself.
+    `boxes` up to three levels up, as `lidarsynth streets` writes them. Of a file of several sensors `rings` are the
+    first and last to show. Raises FileError for the scan itself.
     """
     labels = next((p for p in _label_places(path) if p.is_file()), None)
     notes: list[str] = []
     try:
-        scan, dropped = read_with_report(path, intensity, labels)
+        scan, dropped = read_with_report(path, intensity, labels, rings=rings)
     except FileError:
         if labels is None:
             raise
         scan, dropped = read_with_report(path, intensity)  # a broken scan raises again
         notes.append(_why(labels, len(scan) + dropped))
+        scan, dropped = (scan, dropped) if rings is None else read_with_report(path, intensity, rings=rings)
     if dropped:
         notes.append(dropped_points(dropped))
     if (placed := viewpoint_note(path)) is not None:

@@ -44,7 +44,7 @@ class Files:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> Shown:
-        shown = read_shown(self.paths[index], self.reading.intensity)
+        shown = read_shown(self.paths[index], self.reading.intensity, self.reading.rings)
         if self.reading.transform is None:
             return shown
         notes = (*shown.notes, "boxes left out: they belong to the frame before --transform") if shown.boxes else ()
