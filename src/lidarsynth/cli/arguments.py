@@ -66,6 +66,9 @@ Intensity = Annotated[
     Literal["auto", "unit", "byte", "uint16", "none"],
     arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),
 ]
+Rings = Annotated[
+    str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63; all others are left out.")
+]
 Picture = Annotated[bool, arg(help="write a .png beside each file.")]
 Labels = Annotated[bool, arg(help="SemanticKITTI's class of each point too: a field, and of .bin and .npy a .label.")]
 Output = Annotated[

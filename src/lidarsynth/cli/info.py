@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from lidarsynth.cli.arguments import NoSeed, Positional, arg
+from lidarsynth.cli.arguments import NoSeed, Positional, Rings, arg
 from lidarsynth.cli.terminal import say
 
 
@@ -19,7 +19,7 @@ def info(
     ] = None,
     axes: Annotated[str, arg(metavar="XYZ", help="where x, y, z of a scan point: CARLA has fru, AirSim frd.")] = "flu",
     mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above a scan's z = 0.")] = None,
-    rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
+    rings: Rings = None,
     seed: NoSeed = 0,
 ) -> None:
     """What a model, a preset, a sensor, a file or a folder is."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-from lidarsynth.cli.arguments import arg
+from lidarsynth.cli.arguments import Rings, arg
 from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
 from lidarsynth.lidar.plural import plural, was
 
@@ -49,10 +49,7 @@ class Many:
     mount: Annotated[
         float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0, where that is the ground.")
     ] = None
-    rings: Annotated[
-        str | None,
-        arg(metavar="A-B", help="of a file of several sensors, such as 32-63; all others are left out."),
-    ] = None
+    rings: Rings = None
     strict: Annotated[bool, arg(help="refuse points that are not in the sensor's frame, instead of a warning.")] = False
     format: Annotated[
         str | None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, arg
+from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, Rings, arg
 from lidarsynth.cli.terminal import say, warn
 from lidarsynth.lidar.plural import plural, was
 
@@ -23,7 +23,7 @@ def sensor(
         str | None, arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture.")
     ] = None,
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture: it tells all beams.")] = None,
-    rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
+    rings: Rings = None,
     transform: Annotated[
         str | None, arg(metavar="T", help="brings points into the sensor's frame, as of complete; later verbs take it.")
     ] = None,

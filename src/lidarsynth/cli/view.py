@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from lidarsynth.cli.arguments import Intensity, NoSeed, Positional, arg
+from lidarsynth.cli.arguments import Intensity, NoSeed, Positional, Rings, arg
 from lidarsynth.cli.terminal import at_least, say, warn
 from lidarsynth.lidar.plural import was
 
@@ -40,7 +40,7 @@ def view(
         str, arg(metavar="XYZ", help="where x, y, z of the files point: CARLA has fru, AirSim frd.")
     ] = "flu",
     mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above the points' z = 0.")] = None,
-    rings: Annotated[str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63.")] = None,
+    rings: Rings = None,
 ) -> None:
     """Scans in the browser, from a page on this machine alone; or, with --out, as one file to send."""
     from lidarsynth.verbs.inputs import Reading, parse_rings, read_transform
