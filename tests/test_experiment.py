@@ -1,20 +1,23 @@
 """Experiments: presets, replaced fields, records and folders; what cannot be built says why."""
 
 import json
+import re
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
 import torch
 from networks import trained
+from safetensors.torch import load_file, save_file
 
-from lidarsynth.experiment.folder import read_experiment, save
+from lidarsynth.experiment.eight_bits import SCALE
+from lidarsynth.experiment.folder import WEIGHTS, read_experiment, save
 from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Data, Training, from_dict, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import SENSORS, get_sensor
 from lidarsynth.systems.diffusion.build import build_denoiser
-from lidarsynth.systems.table import build_network
+from lidarsynth.systems.table import SHIPPED, build_network
 from lidarsynth.systems.table import load_folder as load
 
 
@@ -60,7 +63,9 @@ def test_rows_of_table_ii_differ_in_what_the_table_says():
 def test_the_shipped_model_fits_its_60_mb():
     with torch.device("meta"):
         network = build_network(preset("default"))
-    assert sum(p.numel() for p in network.parameters()) * 2 < 60e6
+    in_bytes = sum(p.numel() for name, p in network.named_parameters() if name.startswith("coarse."))
+    assert sum(p.numel() for p in network.parameters()) * 2 - in_bytes < 60e6
+    assert (SHIPPED / "default" / WEIGHTS).stat().st_size < 60e6
 
 
 def test_experiments_are_frozen_and_fields_are_replaced_by_name():
@@ -155,6 +160,37 @@ def test_a_saved_model_loads_as_it_was(tmp_path, half):
     size = (folder / "model.safetensors").stat().st_size
     save(folder, experiment, network, not half)
     assert (folder / "model.safetensors").stat().st_size != size, "saving again replaces"
+
+
+def test_matrices_in_eight_bits_are_off_by_little_and_take_half_of_the_place(tmp_path):
+    experiment = with_fields(preset("tiny"), {"model.base_channels": 32})
+    network = trained(experiment)
+    sizes = []
+    for bytewise in ((), ("unet.",)):
+        folder = save(tmp_path / f"bits {len(bytewise)}", experiment, network, half=True, bytewise=bytewise)
+        sizes.append((folder / "model.safetensors").stat().st_size)
+    assert 0.5 < sizes[1] / sizes[0] < 0.75
+    loaded, stored = load(folder)[1].state_dict(), load_file(folder / "model.safetensors")
+    off = 0
+    for name, value in network.state_dict().items():
+        if stored[name].dtype != torch.int8:
+            torch.testing.assert_close(loaded[name], value, rtol=1e-3, atol=1e-5)
+            continue
+        assert stored[name + SCALE].dtype == torch.float32 and value.ndim > 1
+        largest = value.flatten(1).abs().amax(1).view(-1, *(1,) * (value.ndim - 1))
+        assert ((loaded[name] - value).abs() <= largest / 253).all()
+        off += int((loaded[name] != value).sum())
+    assert off > 1000
+
+
+def test_scales_that_do_not_fit_are_no_tensors_of_the_network(tmp_path):
+    experiment = with_fields(preset("tiny"), {"model.base_channels": 32})
+    folder = save(tmp_path, experiment, trained(experiment), half=True, bytewise=("unet.",))
+    stored = load_file(folder / "model.safetensors")
+    name = next(name for name in stored if name.endswith(SCALE))
+    save_file({**stored, name: stored[name][:-1].clone()}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=rf"expected {re.escape(name)} not to be there"):
+        load(folder)
 
 
 def test_the_ray_angles_of_the_sensor_are_in_the_network():

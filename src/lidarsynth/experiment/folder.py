@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save as serialized
 from torch import nn
 
+from lidarsynth.experiment.eight_bits import packed
 from lidarsynth.experiment.record import Experiment, from_dict
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import whole_file
@@ -17,13 +18,16 @@ from lidarsynth.lidar.whole_file import whole_file
 WEIGHTS, RECORD = "model.safetensors", "experiment.json"
 OWN = ("likeliest.", "observer.")  # how the weights begin that a model with a base does not share with it
 CLASSES = "classes."  # and those that it may have of its own
-OWN_PARTS = ("likeliest", "observer_channels", "own_classes")  # what a record says of them
+OWN_PARTS = ("likeliest", "likeliest_blocks", "observer_channels", "own_classes")  # what a record says of them
 
 
-def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False) -> Path:
+def save(
+    folder: str | Path, experiment: Experiment, network: nn.Module, half: bool = False, bytewise: tuple[str, ...] = ()
+) -> Path:
     """Write `model.safetensors` (float16 if `half`) and `experiment.json`; each is moved into place when complete.
 
     Of an experiment with a `base`, the weights that are not the base's.
+    bytewise  how the names begin of matrices that are stored in eight bits (`eight_bits.packed`)
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -32,6 +36,7 @@ def save(folder: str | Path, experiment: Experiment, network: nn.Module, half: b
     exact = {name for name, _ in network.named_buffers()}
     own = {k: v for k, v in network.state_dict().items() if not experiment.base or k.startswith(owned(experiment))}
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in own.items()}
+    weights |= packed({k: v.cpu() for k, v in own.items() if k not in exact}, bytewise) if bytewise else {}
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
         file.write_bytes(serialized(weights))  # save_file would hide it from other users

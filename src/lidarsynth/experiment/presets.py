@@ -200,6 +200,7 @@ def default() -> Experiment:
             beam_channels=56,
             inside_channels=12,
             likeliest=True,
+            likeliest_blocks=(1, 2, 6, 6),  # wide maps cost time, small ones little
             observer_channels=48,
         ),
         diffusion=Diffusion(schedule="flow", kind="velocity", clip=False, gamma=None, mean_weight=False),

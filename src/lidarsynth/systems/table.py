@@ -9,6 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from lidarsynth.experiment.eight_bits import unpacked
 from lidarsynth.experiment.folder import RECORD, WEIGHTS, on_base, owned, read_experiment
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.experiment.sensor import build_sensor
@@ -135,7 +136,7 @@ def load_folder(folder: str | Path) -> tuple[Experiment, nn.Module]:
         network = build_network(experiment)
     try:
         check_regular(path, LARGEST_WEIGHTS)
-        weights = load_file(path)
+        weights = unpacked(load_file(path))
     except FileNotFoundError:
         raise ValueError(f"{folder}: expected {WEIGHTS} beside {RECORD}, found none") from None
     except (SafetensorError, OSError) as error:
@@ -151,5 +152,5 @@ def _base(experiment: Experiment, folder: str) -> tuple[Experiment, dict[str, Te
     base = None if home is None else read_experiment(home)
     if home is None or base is None or base.base:
         raise ValueError(f"{folder}: expected a base of shipped weights that have none, found {experiment.base!r:.60}")
-    own = owned(experiment)
-    return base, {name: value for name, value in load_file(home / WEIGHTS).items() if not name.startswith(own)}
+    own, weights = owned(experiment), unpacked(load_file(home / WEIGHTS))
+    return base, {name: value for name, value in weights.items() if not name.startswith(own)}

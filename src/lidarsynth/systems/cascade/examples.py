@@ -22,6 +22,7 @@ from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
 from lidarsynth.systems.cascade.lessons import AS_FAR, FARTHEST, HEIGHT, WIDTH, Lessons, lessons, to_height
+from lidarsynth.systems.cascade.losing import losing
 from lidarsynth.systems.cascade.surfaces import evened
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
@@ -30,6 +31,7 @@ from lidarsynth.training.task import Images
 TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
+LOSING = 0.7  # of what learns the most likely image lack some of their returns
 JOINED = 0.25  # of sparse patterns have holes besides
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
@@ -83,7 +85,7 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     rngs = [np.random.default_rng(number) for number in seeds]
     crops = []
     for image, rng, position in zip(taken, rngs, positions, strict=True):
-        shown = image if position < samples else mixed(image, images, experiment.data.mix, rng)
+        shown = image if position < samples else _worse(mixed(image, images, experiment.data.mix, rng), rng)
         crops.append(crop(shown, rng, position < samples, experiment.training.upsampling_share))
     grids = [grid(image, rng) for image, rng in zip(taken, rngs, strict=True)]
     wide = 4 * COLUMNS if step % 2 and min(image.shape[1] for image in taken) >= 4 * COLUMNS else 2 * COLUMNS
@@ -102,6 +104,11 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
         lessons=lessons(_all_mixed(experiment, images, taken, seeds), seeds),
         seen=_all_seen(experiment, images, taken, seeds) if observed else None,
     )
+
+
+def _worse(image: RangeImage, rng: np.random.Generator) -> RangeImage:
+    """Most streets with fewer returns than they have; a recorded scan, which lacks its own, as it is."""
+    return image if image.surface is None or rng.random() >= LOSING else losing(image, rng)
 
 
 def _all_mixed(

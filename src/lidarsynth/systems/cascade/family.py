@@ -25,18 +25,25 @@ from lidarsynth.systems.system import System
 
 
 def build(experiment: Experiment, sensor: Sensor) -> Cascade:
-    """All networks; none knows a sensor. Raises ValueError for other numbers of blocks from level to level."""
+    """All networks; none knows a sensor.
+
+    Raises ValueError for other numbers of blocks from level to level of the coarse stage, and for other than four of
+    the likeliest fill.
+    """
     model, width = experiment.model, experiment.model.base_channels
     if len(set(model.num_residual_blocks)) > 1:
         raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
                          f"{model.num_residual_blocks}")  # fmt: skip
+    if len(model.likeliest_blocks) != 4:
+        raise ValueError(f"model.likeliest_blocks: expected four numbers, found {model.likeliest_blocks}")
     coarse, guide = (
         CoarseUNet(channels, model.channel_multipliers, model.num_residual_blocks[0]) if channels else None
         for channels in (width, model.guide_channels)
     )
     assert coarse is not None
     widths = _widths(width)
-    fill, likeliest = FillUNet(widths, classes=model.classes), FillUNet(widths) if model.likeliest else None
+    fill = FillUNet(widths, classes=model.classes)
+    likeliest = FillUNet(widths, model.likeliest_blocks) if model.likeliest else None
     observer = FillUNet(_sixteens(_widths(model.observer_channels))) if model.observer_channels else None
     columns = ColumnTransformer(model.column_channels) if model.column_channels else None
     between = BetweenColumns(model.between_channels) if model.between_channels else None
