@@ -31,7 +31,7 @@ SHARES = tuple(k / 10 for k in range(11))  # of the mean of what is known around
 PARTS, WIDTH, SEAM = 8, 64, 16  # parts of the turn in which they are tried, columns of each, and of its ends not judged
 # Where nothing can be tried, or beams are measured: less errs by 1 % less there, but classes are read worse
 # (docs/training-default.md).
-USUAL = 0.4
+USUAL = 0.5
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 
 
