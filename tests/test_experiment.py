@@ -183,6 +183,16 @@ def test_matrices_in_eight_bits_are_off_by_little_and_take_half_of_the_place(tmp
     assert off > 1000
 
 
+def test_a_tuned_model_has_a_fill_as_deep_as_it_was_saved_with():
+    blocks = {name: load(SHIPPED / name)[1].surest for name in ("default", "kitti")}
+    counts = {name: [len(stage) for stage in list(fill.down)[::2]] for name, fill in blocks.items()}
+    assert counts == {"default": [1, 2, 6, 6], "kitti": [1, 1, 2, 2]}
+    assert read_experiment(SHIPPED / "kitti").model.likeliest_blocks == (1, 1, 2, 2)
+    assert preset("tuned").model.likeliest_blocks == read_experiment(SHIPPED / "default").model.likeliest_blocks
+    with pytest.raises(ValueError, match=r"model.likeliest_blocks: expected four numbers, found \(1, 2, 3\)"):
+        build_network(with_fields(preset("default"), {"model.likeliest_blocks": (1, 2, 3)}))
+
+
 def test_scales_that_do_not_fit_are_no_tensors_of_the_network(tmp_path):
     experiment = with_fields(preset("tiny"), {"model.base_channels": 32})
     folder = save(tmp_path, experiment, trained(experiment), half=True, bytewise=("unet.",))

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.streets.virtual import VirtualStreets
@@ -64,3 +66,24 @@ def test_recorded_scans_are_shown_as_they_are(streets: list[RangeImage], monkeyp
     recorded = RangeImage(street.range, street.reflectance, street.mask, street.sensor)
     assert examples._worse(recorded, np.random.default_rng(1)) is recorded
     assert examples._worse(street, np.random.default_rng(1)).mask.sum() < street.mask.sum()
+
+
+def test_examples_lack_returns_where_the_most_likely_image_is_learned(monkeypatch: pytest.MonkeyPatch):
+    """`draw` takes returns away from crops, but not from those that are drawn, nor from grids and lessons."""
+    images, seen = VirtualStreets(32, 1000), []
+    monkeypatch.setattr(examples, "losing", lambda image, rng: (seen.append(image), losing(image, rng))[1])
+    experiment = with_fields(preset("default"), {"training.batch_size": 8, "model.observer_channels": 0})
+    taken = [images.image(16 * k) for k in range(8)]
+    drawn = examples.draw(experiment, Taken(taken), list(range(8)), 1, list(range(8)))
+    assert drawn.crops.samples == 4
+    assert 0 < len(seen) <= 4 and all(any(image is one for one in taken[4:]) for image in seen)
+
+
+class Taken:
+    """Images by their index."""
+
+    def __init__(self, images: list[RangeImage]):
+        self.images = images
+
+    def take(self, indices: list[int]) -> list[RangeImage]:
+        return [self.images[k] for k in indices]
