@@ -36,7 +36,7 @@ def save(
     exact = {name for name, _ in network.named_buffers()}
     own = {k: v for k, v in network.state_dict().items() if not experiment.base or k.startswith(owned(experiment))}
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in own.items()}
-    weights |= packed({k: v.cpu() for k, v in own.items() if k not in exact}, bytewise) if bytewise else {}
+    weights |= packed({k: v.cpu() for k, v in own.items() if k not in exact}, bytewise)
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
         file.write_bytes(serialized(weights))  # save_file would hide it from other users

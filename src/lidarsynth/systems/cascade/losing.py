@@ -19,7 +19,8 @@ TURN = 1024  # columns of the turn that lengths along a ring are said of
 
 
 def losing(image: RangeImage, rng: np.random.Generator) -> RangeImage:
-    """The image without some of its returns, lost in about two of eight ways at once; as it is where most would be."""
+    """The image (H, W) without some of its returns, lost in about two of eight ways at once; as it is where most would
+    be. Its surfaces and labels stay."""
     lost = np.zeros(image.shape, bool)
     for chance, way in WAYS:
         if rng.random() < chance:
@@ -92,7 +93,7 @@ def _far(image: RangeImage, rng: np.random.Generator) -> np.ndarray:
     return np.log(image.range + 1e-3) + soft * noise > np.log(edge)
 
 
-Way = Callable[[RangeImage, np.random.Generator], np.ndarray]
+Way = Callable[[RangeImage, np.random.Generator], np.ndarray]  # (H, W) bool: what is lost, of returns and all else
 WAYS: tuple[tuple[float, Way], ...] = (
     (0.35, _speckle), (0.4, _dashes), (0.25, _patches), (0.35, _weak), (0.2, _bands), (0.12, _columns), (0.2, _classes),
     (0.25, _far),
