@@ -266,6 +266,7 @@ def _vehicles() -> dict[str, list[Mesh]]:
     }
 
 
+SHAPES = 2024  # seed of those that are drawn at random
 # How many variants of these every street draws from; those behind them come where more of all shapes is asked for.
 USUAL = {"person": 8, "bicyclist": 3, "motorcyclist": 2, "bicycle": 1, "motorcycle": 1}
 
@@ -292,11 +293,20 @@ def _of_more_shapes(kinds: dict[str, list[Mesh]]) -> dict[str, list[Mesh]]:
     }
 
 
+@lru_cache(maxsize=1)
+def cars_and_people() -> dict[str, list[Mesh]]:
+    """Those of `library` that every street has, without building the others."""
+    return _first(np.random.default_rng(SHAPES))
+
+
+def _first(rng: np.random.Generator) -> dict[str, list[Mesh]]:
+    return _vehicles() | {"person": [person(rng) for _ in range(USUAL["person"])]}
+
+
 def _kinds() -> dict[str, list[Mesh]]:
-    rng = np.random.default_rng(2024)
+    rng = np.random.default_rng(SHAPES)
     two = {"bicycle": False, "motorcycle": True}
-    return _vehicles() | {
-        "person": [person(rng) for _ in range(8)],
+    return _first(rng) | {
         "bicyclist": [rider(rng, "bicyclist", False) for _ in range(3)],
         "motorcyclist": [rider(rng, "motorcyclist", True) for _ in range(2)],
         **{name: [two_wheeler(name, heavy)] for name, heavy in two.items()},

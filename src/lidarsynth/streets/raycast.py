@@ -1,4 +1,4 @@
-"""First hits of many rays on a triangle soup, by Embree (Wald et al., 2014)."""
+"""First hits of many rays on a triangle soup, by Embree (Wald et al., 2014), or of some without it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarsynth.streets.embree import PacketScene, library
 
+BLOCK = 256  # rays that are looked at together: what lies in the processor's cache
 Hits = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -53,6 +54,58 @@ class Caster:
         distance = gap / towards
         distance[missed] = np.inf
         return face, distance, np.abs(towards)
+
+
+class FewTriangles:
+    """As `Caster`, of some hundred triangles, corners (T, 3, 3) float32 metres, and without Embree."""
+
+    def __init__(self, corners: np.ndarray):
+        corners = np.ascontiguousarray(corners, np.float32)
+        self._axes, self.level = _planes(corners)
+        self._first = corners[:, 0]
+        self._sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        self._middle = corners.mean(1)
+        self._reach = np.square(corners - self._middle[:, None]).sum(2).max(1) + np.float32(0.01)
+
+    def cast(self, origins: np.ndarray, rays: np.ndarray, times: np.ndarray | None = None) -> Hits:
+        """As `Caster.cast`."""
+        ray, face = self._pairs(origins, rays)
+        towards = np.stack([axis[face] for axis in self._axes], 1)
+        way, start = rays[ray], origins[ray]
+        slope = np.einsum("ij,ij->i", towards, way)
+        with np.errstate(divide="ignore", invalid="ignore"):  # rays along a triangle's plane do not meet it
+            away = (self.level[face] - np.einsum("ij,ij->i", towards, start)) / slope
+            met = np.isfinite(away) & (away > 0)
+            met[met] = self._inside(face[met], start[met] + way[met] * away[met, None])
+        ray, face, away, slope = (part[met] for part in (ray, face, away, slope))
+        order = np.lexsort((away, ray))
+        at, first = np.unique(ray[order], return_index=True)
+        hits = np.full(len(rays), -1, np.int32), np.full(len(rays), np.inf, np.float32), np.ones(len(rays), np.float32)
+        for whole, values in zip(hits, (face, away, np.abs(slope)), strict=True):
+            whole[at] = values[order[first]]
+        return hits
+
+    def _pairs(self, origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (P,) of rays and of triangles that they come near."""
+        middle, size = self._middle.T, np.square(self._middle).sum(1) - self._reach
+        numbers, faces = [np.zeros(0, int)], [np.zeros(0, int)]
+        for first in range(0, len(rays), BLOCK):
+            start, way = origins[first : first + BLOCK], rays[first : first + BLOCK]
+            along = way @ middle - np.einsum("ij,ij->i", way, start)[:, None]
+            gap = size - 2 * (start @ middle) + np.square(start).sum(1)[:, None]
+            np.multiply(along, np.abs(along), out=along)  # those behind are near only where the ray starts
+            ray, face = np.nonzero(gap < along)
+            numbers.append(ray + first)
+            faces.append(face)
+        return np.concatenate(numbers), np.concatenate(faces)
+
+    def _inside(self, face: np.ndarray, spots: np.ndarray) -> np.ndarray:
+        """(P,) bool: whether spots (P, 3) of the triangles' planes are of the triangles (P,)."""
+        (a, b), c = (side[face] for side in self._sides), spots - self._first[face]
+        aa, ab, bb, ac, bc = (np.einsum("ij,ij->i", *two) for two in ((a, a), (a, b), (b, b), (a, c), (b, c)))
+        size = aa * bb - ab * ab
+        u, v = bb * ac - ab * bc, aa * bc - ab * ac
+        return (u >= 0) & (v >= 0) & (u + v <= size) & (size > 0)
 
 
 def _planes(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -58,12 +58,23 @@ def _without(taken: np.ndarray, metres: np.ndarray, shade: np.ndarray) -> tuple[
         gone, left = np.flatnonzero(taken[row]), np.flatnonzero(~taken[row])
         if not len(left):
             continue
-        after = np.searchsorted(left, gone)
-        a, b = left[after - 1], left[after % len(left)]
+        a, b, share = beside(gone, left, width)
         near, far = metres[row, a], metres[row, b]
-        share = ((gone - a) % width) / np.maximum((b - a) % width, 1)
-        both = (near > 0) & (far > 0) & (np.abs(np.log(np.maximum(far, 1e-3) / np.maximum(near, 1e-3))) < CLEAR)
-        plane = 1 / ((1 - share) / np.maximum(near, 0.1) + share / np.maximum(far, 0.1))
+        both, plane = one_surface(near, far, share)
         metres[row, gone] = np.where(both, plane, np.maximum(near, far))
         shade[row, gone] = np.where(near > far, shade[row, a], shade[row, b])
     return metres, shade
+
+
+def beside(gone: np.ndarray, left: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The next columns before and after those that are gone (N,) of all that are left, rising, around a turn of `width`
+    columns, and how far each one is from the first to the second, 0 to 1."""
+    after = np.searchsorted(left, gone)
+    a, b = left[after - 1], left[after % len(left)]
+    return a, b, ((gone - a) % width) / np.maximum((b - a) % width, 1)
+
+
+def one_surface(near: np.ndarray, far: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether ranges (N,) on either side, 0 for none, are of one surface, and its range at `share` of the way."""
+    both = (near > 0) & (far > 0) & (np.abs(np.log(np.maximum(far, 1e-3) / np.maximum(near, 1e-3))) < CLEAR)
+    return both, 1 / ((1 - share) / np.maximum(near, 0.1) + share / np.maximum(far, 0.1))

@@ -1,0 +1,137 @@
+"""Where a car or a person stands that a scan's returns only suggest: boxes tried in many places."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Shape(NamedTuple):
+    """What things of one kind are like: two boxes one upon the other, (2, 2, 3) least and greatest x, y, z in metres,
+    0 on the ground; `words` of `streets.objects`; tall: returns of a higher one reach so far up, else 0."""
+
+    words: str
+    boxes: np.ndarray
+    tall: float = 0.0
+
+    @property
+    def size(self) -> np.ndarray:
+        """(2,) length and width, metres."""
+        return self.boxes[0, 1, :2] - self.boxes[0, 0, :2]
+
+
+def two_boxes(
+    words: str, length: float, width: float, waist: float, height: float, upper: tuple[float, float, float], tall: float
+) -> Shape:
+    """upper: from where to where along the thing the upper box goes, and how much narrower it is on either side."""
+    half, foot = width / 2, min(0.2, waist / 4)
+    lower = [[-length / 2, -half, foot], [length / 2, half, waist]]
+    back, front, less = upper
+    return Shape(
+        words, np.array([lower, [[back, -half + less, waist], [front, half - less, height]]], np.float32), tall
+    )
+
+
+class View(NamedTuple):
+    """N rays, (N, 3), from the origin through some of what a thing may hide; metres (N,), inf for none; own (N,) bool:
+    they met what suggests the thing; ground (N,) bool; weight (N,): how many rays each one stands for."""
+
+    rays: np.ndarray
+    metres: np.ndarray
+    own: np.ndarray
+    ground: np.ndarray
+    weight: np.ndarray
+
+
+class Place(NamedTuple):
+    """A thing's middle and direction, metres and radians; what it costs, see `_costs`, and which share of its own rays
+    end about where it is."""
+
+    x: float
+    y: float
+    yaw: float
+    cost: float
+    share: float
+
+
+# Of each ray, in what a missed one of the thing's own costs: one that ends so many metres off; one that hides what is
+# farther; one that ends inside, or where something else is; then, how far off a return may be.
+OFF, HIDES, INSIDE, ANOTHER, ABOUT = 2.0, 0.35, 0.6, 0.5, 1.0
+GAP, BEHIND = 0.3, 0.15  # metres
+ENDS = (0.06, 0.94)  # quantiles of what is seen of a thing
+ASKEW = 0.15  # cost of standing at 45 degrees to everything around
+STEPS = ((0.25, 0.07), (0.1, 0.028))  # metres and radians, of the best place
+
+
+def best_place(shape: Shape, turns: int, points: np.ndarray, view: View, level: float, axis: float | None) -> Place:
+    """The place of least cost of a thing that is suggested by points (n, 3).
+
+    turns  directions that are tried in half a turn; level: height of the ground there, metres
+    axis   direction in which most things stand, or at a right angle to it; None = who knows
+    """
+    places = _corners(points[:, :2], shape.size, np.arange(turns, dtype=np.float32) * np.float32(np.pi / turns))
+    costs, share = _costs(places, shape, view, level, axis)
+    for metres, radians in STEPS:
+        around = np.array([metres, metres, radians if turns > 1 else 0], np.float32)
+        places = places[costs.argmin()] + NEIGHBOURS * around
+        costs, share = _costs(places, shape, view, level, axis)
+    best = int(costs.argmin())
+    return Place(*(float(value) for value in (*places[best], costs[best], share[best])))
+
+
+NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3).astype(np.float32)
+
+
+def _corners(seen: np.ndarray, size: np.ndarray, yaws: np.ndarray) -> np.ndarray:
+    """(9 T, 3) places of a box of length and width `size` (2,) in T directions: along each side, what is seen (n, 2) is
+    its near end, its far end or its middle."""
+    c, s = np.cos(yaws), np.sin(yaws)
+    places = []
+    for across, half in enumerate(size / 2):
+        ends = seen @ (np.stack([-s, c]) if across else np.stack([c, s]))
+        low, high = np.quantile(ends, ENDS, axis=0)
+        near = np.where(np.median(ends, 0) > 0, 1, -1) * half
+        places.append(
+            np.stack([np.where(near > 0, low, high) + near, np.where(near > 0, high, low) - near, (low + high) / 2])
+        )
+    along, side = places[0][:, None], places[1][None]
+    grid = np.stack(np.broadcast_arrays(c * along - s * side, s * along + c * side, yaws), -1)
+    return grid.reshape(-1, 3).astype(np.float32)
+
+
+def _costs(
+    places: np.ndarray, shape: Shape, view: View, level: float, axis: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Costs (P,) of things at places (P, 3), and shares (P,) of the thing's own rays that end within a metre of it."""
+    met, left = _through(places, shape.boxes, view.rays, level)
+    hit, off = np.isfinite(met), np.abs(np.minimum(met, 1e4) - np.minimum(view.metres, 2e4))
+    cost = np.where(hit, np.minimum(off / OFF, 1), 1) * view.own
+    hides = hit & ~view.own & (view.metres > met + GAP)
+    inside = hides & (view.metres < left - BEHIND) & ~view.ground
+    another = hit & ~view.own & ~view.ground & (off <= GAP)
+    cost += HIDES * hides + INSIDE * inside + ANOTHER * another
+    own = view.weight * view.own
+    costs, share = cost @ view.weight / own.sum(), (hit & (off < ABOUT)) @ own / own.sum()
+    if axis is not None:
+        costs += ASKEW * np.abs((places[:, 2] - axis + np.pi / 4) % (np.pi / 2) - np.pi / 4) / (np.pi / 4)
+    return costs, share
+
+
+def _through(places: np.ndarray, boxes: np.ndarray, rays: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays (N, 3) meet things at places (P, 3), inf for none, and where they leave that box: (P, N) metres."""
+    c, s = np.cos(places[:, 2:]), np.sin(places[:, 2:])
+    x, y = places[:, :1], places[:, 1:2]
+    starts = -(c * x + s * y), s * x - c * y, np.full_like(x, -level)
+    with np.errstate(divide="ignore"):  # along a side: never through it
+        slopes = [
+            1 / way for way in (c * rays[:, 0] + s * rays[:, 1], c * rays[:, 1] - s * rays[:, 0], rays[None, :, 2])
+        ]
+    met, left = [], []
+    for low, high in boxes:
+        sides = [((a - o) * w, (b - o) * w) for a, b, o, w in zip(low, high, starts, slopes, strict=True)]
+        first = np.maximum.reduce([np.minimum(*pair) for pair in sides])
+        last = np.minimum.reduce([np.maximum(*pair) for pair in sides])
+        met.append(np.where((first < last) & (last > 0), first, np.float32(np.inf)))
+        left.append(last)
+    return np.minimum(*met), np.where(met[0] <= met[1], *left)

@@ -1,0 +1,319 @@
+"""Cars and people of generated scans, cast as streets have them where the networks have drawn something like one.
+
+What is drawn of a car is about as large, as near and as bright as one, but hardly ever has its outline: the columns of
+a layout are 2.8 degrees apart. So where the classes say car or person, one of the streets' own shapes is put where it
+explains most (`placing.py`), its rays are cast and read as streets' are, and what else was drawn of it becomes what is
+beside it. What suggests no place stays as it was drawn. Measured in docs/training-default.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from lidarsynth.lidar.pieces import connected
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.ground import Ground
+from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
+from lidarsynth.streets.materials import MATERIALS
+from lidarsynth.streets.objects import cars_and_people
+from lidarsynth.streets.raycast import FewTriangles
+from lidarsynth.streets.sensor_model import RESPONSE, Returns, range_noise, sense
+from lidarsynth.streets.shapes import Mesh, moved
+from lidarsynth.streets.turn import sensor_pose
+from lidarsynth.streets.world import THING, THINGS, World
+from lidarsynth.systems.cascade.hanging import beside, one_surface
+from lidarsynth.systems.cascade.placing import Place, Shape, View, best_place, two_boxes
+
+
+class Kind(NamedTuple):
+    """Things of a class that are cast anew: what they are like; their material; the directions tried in half a turn;
+    where returns of at least `area` square metres within `reach` metres suggest one; the `most` that its place may
+    cost, and the `least` share of its own rays that must end about there; what else of it within `margin` metres is
+    taken away."""
+
+    name: str
+    shapes: tuple[Shape, ...]
+    material: str
+    turns: int
+    area: float
+    reach: float
+    most: float
+    least: float
+    margin: float
+
+
+# Chosen on 96 generated scans (docs/training-default.md).
+KINDS = (
+    Kind("car", (two_boxes("car", 4.3, 1.74, 0.9, 1.46, (-1.93, 0.95, 0.15), 0.0),
+                 two_boxes("van", 4.9, 1.94, 0.95, 2.0, (-2.45, 1.76, 0.05), 1.6)),
+         "paint", 24, 0.3, 40.0, 0.9, 0.4, 1.6),
+    Kind("person", (two_boxes("person", 0.5, 0.55, 0.8, 1.75, (-0.2, 0.2, 0.12), 0.0),),
+         "cloth", 1, 0.12, 25.0, 1.3, 0.3, 0.5),
+)  # fmt: skip
+GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
+STANDING = np.array([CLASS_NUMBER[w] for w in ("building", "fence", "car")])
+ROAD = CLASS_NUMBER["road"]
+CELL, FEW = 0.4, 20  # metres, in which returns of one thing are within two cells of others; returns
+AROUND, LOW = 6.0, 0.2  # metres around a thing where the ground is looked for, and above it that are ground
+WIDER, TALLER = 2.5, 2.2  # metres beside and above a thing that are looked at
+OWN, OTHERS = 220, 340  # rays that are looked at, of a thing's and of the others
+SIZE = (0.97, 1.03)  # things are so much smaller or larger
+TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
+OCCLUDED = 0.3  # metres nearer than a thing that hide it
+ALONG, APART = (
+    3,
+    (0.05, 1.5),
+)  # columns, and metres between their returns, that tell in which direction something stands
+
+
+@dataclass
+class _Canvas:
+    """A scan in the making: metres (H, W), 0 for no return, reflectance, label; points (H, W, 3), rays (H, W, 3) and
+    where these start, (H, 3), of a frame that stands upright; their azimuth and elevation, (H, W) radians."""
+
+    sensor: Sensor
+    metres: np.ndarray
+    reflectance: np.ndarray
+    label: np.ndarray
+    points: np.ndarray
+    rays: np.ndarray
+    starts: np.ndarray
+    azimuth: np.ndarray
+    elevation: np.ndarray
+
+
+def all_recast(images: list[RangeImage], rng: list[torch.Generator]) -> list[RangeImage]:
+    """`recast` of images, each by a generator of its own."""
+    seeds = [int(torch.randint(1 << 62, (), generator=one)) for one in rng]
+    return [recast(image, np.random.default_rng(seed)) for image, seed in zip(images, seeds, strict=True)]
+
+
+def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
+    """The image (H, W) with labels, whose cars and people have the shapes of streets'."""
+    canvas = _canvas(image)
+    axis = _axis(canvas)
+    for kind in KINDS:
+        todo = _suggestions(canvas, kind)
+        while todo:
+            rest = _thing(canvas, kind, todo.pop(0), axis, rng)
+            todo += [rest] if rest is not None else []
+    mask = canvas.metres > 0
+    return replace(image, range=canvas.metres, reflectance=canvas.reflectance, mask=mask, label=canvas.label)
+
+
+def _canvas(image: RangeImage) -> _Canvas:
+    assert image.label is not None
+    sensor, label = image.sensor, np.where(image.mask, image.label, 0)
+    rays, starts = sensor.directions(), np.zeros((sensor.height, 3), np.float32)
+    starts[:, 2] = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
+    rays, starts = (_upright(sensor, part) for part in (rays, starts))
+    metres, reflectance = image.range * image.mask, image.reflectance * image.mask
+    points = _upright(sensor, sensor.points(metres))
+    angles = np.arctan2(rays[..., 1], rays[..., 0]), np.arcsin(rays[..., 2].clip(-1, 1))
+    return _Canvas(sensor, metres, reflectance, label, points, rays, starts, *angles)
+
+
+def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of the sensor's frame, of one that is not tilted."""
+    return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3].T.astype(np.float32) if any(sensor.tilt) else vectors
+
+
+def _suggestions(canvas: _Canvas, kind: Kind) -> list[np.ndarray]:
+    """Places in the flattened image of the returns of each thing of a kind, the nearest first."""
+    at = np.flatnonzero(canvas.label == CLASS_NUMBER[kind.name])
+    if not len(at):
+        return []
+    cells = np.floor(canvas.points.reshape(-1, 3)[at, :2] / CELL).astype(np.int64)
+    key, cell = np.unique(cells @ [1 << 20, 1], return_inverse=True)
+    one, other = [], []
+    for step in (x * (1 << 20) + y for x in range(4) for y in range(-3, 4)):
+        there = np.searchsorted(key, key + step).clip(max=len(key) - 1)
+        beside = np.flatnonzero(key[there] == key + step)
+        one.append(beside)
+        other.append(there[beside])
+    thing = connected(np.concatenate(one), np.concatenate(other), len(key))[cell.ravel()]
+    things = [at[thing == number] for number in np.unique(thing)]
+    return sorted(things, key=lambda each: float(np.median(canvas.metres.flat[each])))
+
+
+def _thing(
+    canvas: _Canvas, kind: Kind, at: np.ndarray, axis: float | None, rng: np.random.Generator
+) -> np.ndarray | None:
+    """Casts what the pixels `at` (n,) suggest; which of them may be of another one, None for none or too few."""
+    points = canvas.points.reshape(-1, 3)[at]
+    metres, sensor = canvas.metres.flat[at], canvas.sensor
+    step = np.abs(np.gradient(np.radians(sensor.elevations)))[at // sensor.width] * (2 * np.pi / sensor.width)
+    middle = np.median(points, 0)
+    if len(at) < FEW or (step * metres**2).sum() < kind.area or np.hypot(*middle[:2]) > kind.reach:
+        return None
+    level = _level(canvas, middle)
+    view, top = _view(canvas, at, middle, level), np.quantile(points[:, 2], 0.97) - level
+    shapes = [shape for shape in kind.shapes if top >= shape.tall]
+    places = [best_place(shape, kind.turns, points, view, level, axis if kind.turns > 1 else None) for shape in shapes]
+    place, shape = min(zip(places, shapes, strict=True), key=lambda both: both[0].cost)
+    if place.cost > kind.most or place.share < kind.least:
+        return None
+    shade = float(np.median(canvas.reflectance.flat[at]))
+    found, rays = _cast(canvas, _mesh(kind, shape, place, level, rng), _tint(kind, shade, rng), rng)
+    mine = at[_near(canvas.points.reshape(-1, 3)[at], place, shape, kind.margin)]
+    _put(canvas, found, rays, mine, level, rng)
+    rest = at[~np.isin(at, mine)]
+    return rest if len(rest) >= FEW and len(mine) else None
+
+
+def _level(canvas: _Canvas, middle: np.ndarray) -> float:
+    """Height of the ground around a thing, metres above the sensor's origin."""
+    near = np.square(canvas.points[..., :2] - middle[:2]).sum(-1) < AROUND**2
+    ground = canvas.points[..., 2][near & GROUND[canvas.label] & (canvas.metres > 0)]
+    return float(np.median(ground)) if len(ground) >= FEW else -canvas.sensor.mount
+
+
+def _axis(canvas: _Canvas) -> float | None:
+    """Direction in which most of what stands does, radians, or at a right angle to it; None where too little does."""
+    stands = np.isin(canvas.label, STANDING)
+    along = np.roll(canvas.points[..., :2], -ALONG, 1) - canvas.points[..., :2]
+    length = np.hypot(along[..., 0], along[..., 1])
+    along, length = (
+        part[stands & np.roll(stands, -ALONG, 1) & (length > APART[0]) & (length < APART[1])]
+        for part in (along, length)
+    )
+    if len(length) < 10 * FEW:
+        return None
+    return float(np.angle((length * np.exp(4j * np.arctan2(along[:, 1], along[:, 0]))).sum())) / 4
+
+
+def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> View:
+    """Some of the rays around what the pixels `at` suggest."""
+    points, away = canvas.points.reshape(-1, 3)[at], float(np.hypot(*middle[:2]))
+    ahead = np.arctan2(middle[1], middle[0])
+    low, high = _span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
+    wider, seen = np.arctan2(WIDER, max(away, WIDER)), canvas.elevation.flat[at]
+    top = max(np.arctan2(level + TALLER, max(away - 2, 1)), seen.max())
+    bottom = min(np.arctan2(level, max(away - 3, 1)), seen.min())
+    window = _window(canvas, ahead, (low - wider, high + wider), (bottom, top))
+    own = np.isin(window, at)
+    groups = [(window[which], most) for which, most in ((own, OWN), (~own, OTHERS))]
+    chosen = [group[np.linspace(0, len(group) - 1, min(len(group), most)).astype(int)] for group, most in groups]
+    weight = np.concatenate([
+        np.full(len(some), len(group) / max(len(some), 1), np.float32)
+        for some, (group, _) in zip(chosen, groups, strict=True)
+    ])  # fmt: skip
+    of = np.concatenate(chosen)
+    metres = canvas.metres.flat[of]
+    ground = GROUND[canvas.label.flat[of]] | (canvas.points.reshape(-1, 3)[of, 2] < level + LOW)
+    metres = np.where(metres > 0, metres, np.float32(np.inf)).astype(np.float32)
+    return View(canvas.rays.reshape(-1, 3)[of], metres, np.arange(len(of)) < len(chosen[0]), ground, weight)
+
+
+def _span(angles: np.ndarray) -> tuple[float, float]:
+    """Least and greatest of angles around the one ahead, radians."""
+    around = (angles + np.pi) % (2 * np.pi) - np.pi
+    return float(around.min()), float(around.max())
+
+
+def _window(
+    canvas: _Canvas, ahead: float, azimuths: tuple[float, float], elevations: tuple[float, float]
+) -> np.ndarray:
+    """Places in the flattened image of the rays that go between two azimuths, radians to the left of `ahead`, and two
+    elevations, and that nothing blocks."""
+    around = (canvas.azimuth - ahead + np.pi) % (2 * np.pi) - np.pi
+    between = (around >= azimuths[0]) & (around <= azimuths[1])
+    between &= (canvas.elevation >= elevations[0]) & (canvas.elevation <= elevations[1])
+    return np.flatnonzero(between & ~hidden(canvas.sensor))
+
+
+def _mesh(kind: Kind, shape: Shape, place: Place, level: float, rng: np.random.Generator) -> Mesh:
+    """One of the streets' own, there, its front ahead or behind."""
+    words = cars_and_people()[shape.words]
+    mesh = words[int(rng.integers(len(words)))]
+    yaw = place.yaw + np.pi * rng.integers(2) if kind.turns > 1 else rng.uniform(0, 2 * np.pi)
+    larger = np.float32(rng.uniform(*SIZE))
+    return moved(replace(mesh, corners=mesh.corners * larger), place.x, place.y, level, yaw=yaw)
+
+
+def _tint(kind: Kind, shade: float, rng: np.random.Generator) -> float:
+    """How much brighter than its material usually is one is that reads `shade` on average."""
+    of = MATERIALS[kind.material]
+    signal = float(np.interp(shade, RESPONSE[1], RESPONSE[0])) + of.gloss / 2
+    return float(np.clip((signal - of.signal) / of.spread + rng.normal(0, 0.5), *TINT))
+
+
+def _cast(canvas: _Canvas, mesh: Mesh, tint: float, rng: np.random.Generator) -> tuple[Returns, np.ndarray]:
+    """What the rays around a thing bring back of it, and their places (N,) in the flattened image."""
+    sensor, corners = canvas.sensor, mesh.corners.reshape(-1, 3)
+    ahead = np.arctan2(*corners.mean(0)[[1, 0]])
+    low, high = _span(np.arctan2(corners[:, 1], corners[:, 0]) - ahead)
+    heights = np.arctan2(corners[:, 2], np.hypot(corners[:, 0], corners[:, 1]))
+    at = _window(canvas, ahead, (low - 0.01, high + 0.01), (heights.min() - 0.02, heights.max() + 0.02))
+    number = np.cumsum(~hidden(sensor)) - 1
+    each = Lasers(*(part[number[at]] for part in lasers(sensor)))
+    starts, rays = canvas.starts[at // sensor.width], canvas.rays.reshape(-1, 3)[at]
+    return sense(_world(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
+
+
+def _world(mesh: Mesh, tint: float) -> World:
+    """A world of one thing."""
+    count = len(mesh)
+    kinds, tints = np.full(count, THING, np.uint8), np.full(count, tint, np.float32)
+    none, thing = np.full(count, -1, np.int16), np.zeros(count, np.int32)
+    nowhere, alone = np.zeros((0, 12), np.float32), np.zeros(1, THINGS)
+    told = mesh.corners, kinds, mesh.material, mesh.label, tints, none, nowhere
+    return World(*told, ground=Ground(()), poses=np.zeros((1, 6)), thing=thing, things=alone)
+
+
+def _near(points: np.ndarray, place: Place, shape: Shape, margin: float) -> np.ndarray:
+    """(n,) bool: which points (n, 3) are of a thing, or beside it."""
+    x, y = (points[:, :2] - (place.x, place.y)).T
+    c, s = np.cos(place.yaw), np.sin(place.yaw)
+    length, width = shape.size / 2 + margin
+    return (np.abs(c * x + s * y) < length) & (np.abs(c * y - s * x) < width)
+
+
+def _put(
+    canvas: _Canvas, found: Returns, at: np.ndarray, mine: np.ndarray, level: float, rng: np.random.Generator
+) -> None:
+    """The thing in the scan, where nothing nearer hides it and rays do not go through it; what else was drawn of it,
+    pixels `mine`, is as it is beside it."""
+    own = np.isin(at, mine)
+    there = canvas.metres.flat[at]
+    there = np.where(there > 0, there, np.inf)
+    ground = GROUND[canvas.label.flat[at]]
+    hidden_there = ~own & ~ground & (there < found.surface - OCCLUDED)
+    through = ~own & (found.face < 0) & (there > found.surface + OCCLUDED)
+    put = np.isfinite(found.surface) & ~hidden_there & ~through
+    returned = put & (found.distance >= canvas.sensor.min_range)
+    left = mine[~np.isin(mine, at[put])]
+    _fill(canvas, left, np.concatenate([at[put], mine]), level, rng)
+    for whole, values in ((canvas.metres, found.distance), (canvas.reflectance, found.reflectance),
+                          (canvas.label, found.label)):  # fmt: skip
+        whole.flat[at[put]] = np.where(returned, values, 0)[put]
+    changed = np.concatenate([left, at[put]])
+    canvas.points.reshape(-1, 3)[changed] = _upright(canvas.sensor, canvas.sensor.points(canvas.metres, changed))
+
+
+def _fill(canvas: _Canvas, left: np.ndarray, taken: np.ndarray, level: float, rng: np.random.Generator) -> None:
+    """Pixels `left` (n,) as the next ones of their row are that are not `taken`, or the ground before these."""
+    width, free = canvas.sensor.width, ~hidden(canvas.sensor)
+    free.flat[taken] = False
+    for row in np.unique(left // width):
+        gone, others = left[left // width == row] % width, np.flatnonzero(free[row])
+        if not len(others):
+            continue
+        before, after, share = beside(gone, others, width)
+        nearer, down = np.where(share <= 0.5, before, after), canvas.rays[row, gone, 2]
+        both, plane = one_surface(canvas.metres[row, before], canvas.metres[row, after], share)
+        behind = np.where(both, plane, canvas.metres[row, nearer])
+        behind = np.where(behind > 0, behind, np.inf)
+        ground = np.where(down < -0.01, level / np.minimum(down, -0.01), np.inf)
+        metres = np.minimum(behind, ground)
+        there = metres <= canvas.sensor.max_range
+        noise = range_noise(np.where(there, metres, 0)) * rng.standard_normal(len(gone))
+        canvas.metres[row, gone] = np.where(there, metres + noise, 0)
+        canvas.reflectance[row, gone] = np.where(there, canvas.reflectance[row, nearer], 0)
+        canvas.label[row, gone] = np.where(there, np.where(ground < behind, ROAD, canvas.label[row, nearer]), 0)

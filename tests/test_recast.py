@@ -1,0 +1,178 @@
+"""Cars and people of generated scans: found, placed, cast, and what else was drawn of them taken away."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lidarsynth as ls
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.hdl64e import hidden
+from lidarsynth.streets.objects import cars_and_people, library
+from lidarsynth.streets.raycast import Caster, FewTriangles
+from lidarsynth.streets.shapes import Mesh, moved
+from lidarsynth.streets.turn import sensor_pose
+from lidarsynth.systems.cascade import recast as module
+from lidarsynth.systems.cascade.placing import best_place
+from lidarsynth.systems.cascade.recast import recast
+
+CAR, PERSON, ROAD = (CLASS_NUMBER[name] for name in ("car", "person", "road"))
+SENSOR = replace(ls.get_sensor("os1-64"), mount=1.8)
+
+
+def turn(sensor: Sensor) -> np.ndarray:
+    return sensor_pose(sensor, np.zeros(6))[:3, :3].astype(np.float32)
+
+
+def scene(sensor: Sensor, *things: Mesh) -> RangeImage:
+    """A flat road and things on it, as exact first hits with their classes."""
+    rays = (sensor.directions() @ turn(sensor).T).reshape(-1, 3)
+    down = rays[:, 2]
+    metres = np.where(down < -0.01, -sensor.mount / np.minimum(down, -0.01), np.inf)
+    label = np.where(metres < np.inf, ROAD, 0)
+    for thing in things:
+        face, away, _ = FewTriangles(thing.corners).cast(np.zeros_like(rays), rays)
+        nearer = (face >= 0) & (away < metres)
+        metres, label = np.where(nearer, away, metres), np.where(nearer, thing.label[face], label)
+    metres[metres > 60] = np.inf
+    metres[hidden(sensor).ravel()] = np.inf
+    there = np.isfinite(metres)
+    shape = (sensor.height, sensor.width)
+    parts = np.where(there, metres, 0).astype(np.float32), 0.2 * there.astype(np.float32), there
+    return RangeImage(*(part.reshape(shape) for part in parts), sensor, (label * there).reshape(shape))
+
+
+def standing(words: str, number: int, x: float, y: float, yaw: float, mount: float = SENSOR.mount) -> Mesh:
+    return moved(cars_and_people()[words][number], x, y, -mount, yaw=yaw)
+
+
+def blob(image: RangeImage, of: int) -> RangeImage:
+    """What is of a class as a blob: all of it as far as its middle, give or take half a metre."""
+    there = image.label == of
+    rough = np.random.default_rng(0).uniform(-0.5, 0.5, there.sum())
+    metres = image.range.copy()
+    metres[there] = np.median(image.range[there]) + rough
+    return replace(image, range=metres)
+
+
+def points(image: RangeImage, of: int) -> np.ndarray:
+    return (image.sensor.points(image.range) @ turn(image.sensor).T)[(image.label == of) & image.mask]
+
+
+def test_cars_and_people_are_the_streets_own() -> None:
+    first, all_of_them = cars_and_people(), library()
+    assert set(first) == {"car", "van", "truck", "bus", "person"}
+    for words, shapes in first.items():
+        for one, other in zip(shapes, all_of_them[words], strict=False):
+            np.testing.assert_array_equal(one.corners, other.corners)
+
+
+@pytest.mark.parametrize("scattered", [False, True])
+def test_a_few_triangles_are_met_where_embree_says(scattered: bool) -> None:
+    pytest.importorskip("embreex")
+    rng, shape = np.random.default_rng(1), standing("car", 2, 8, 2, 0.5)
+    azimuth, elevation = rng.uniform(-0.2, 0.7, 3000), rng.uniform(-0.3, 0.05, 3000)
+    level = np.cos(elevation)
+    rays = np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)], 1).astype(np.float32)
+    starts = rays * rng.uniform(5, 9, (3000, 1)).astype(np.float32) if scattered else np.zeros_like(rays)
+    theirs, ours = Caster(shape.corners).cast(starts, rays), FewTriangles(shape.corners).cast(starts, rays)
+    assert (theirs[0] >= 0).mean() > 0.1
+    assert (theirs[0] == ours[0]).mean() > 0.99
+    same = (theirs[0] == ours[0]) & (ours[0] >= 0)
+    for a, b in zip(theirs[1:], ours[1:], strict=True):
+        np.testing.assert_allclose(a[same], b[same], rtol=1e-4)
+    assert np.isinf(ours[1][ours[0] < 0]).all()
+
+
+def test_no_ray_meets_nothing() -> None:
+    face, away, cosine = FewTriangles(standing("car", 0, 8, 0, 0).corners).cast(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert len(face) == len(away) == len(cosine) == 0
+
+
+@pytest.mark.parametrize(("x", "y", "yaw"), [(9.0, 3.0, 0.4), (-7.0, -6.0, 1.3), (4.0, 14.0, 2.6)])
+def test_a_car_is_found_where_it_stands(x: float, y: float, yaw: float) -> None:
+    image = scene(SENSOR, standing("car", 1, x, y, yaw))
+    canvas = module._canvas(image)
+    (at,) = module._suggestions(canvas, module.KINDS[0])
+    seen = canvas.points.reshape(-1, 3)[at]
+    view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount)
+    place = best_place(module.KINDS[0].shapes[0], 24, seen, view, -SENSOR.mount, None)
+    assert np.hypot(place.x - x, place.y - y) < 0.35
+    assert abs((place.yaw - yaw + np.pi / 2) % np.pi - np.pi / 2) < 0.12
+    assert place.share > 0.9
+    assert place.cost < 0.3
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (12.0, -6.0)])
+def test_a_blob_becomes_a_car_that_stands_on_the_road(tilt: tuple[float, float]) -> None:
+    sensor = replace(SENSOR, tilt=tilt)
+    truth = scene(sensor, standing("car", 1, 9.0, 3.0, 0.4))
+    drawn = blob(truth, CAR)
+    found = recast(drawn, np.random.default_rng(3))
+    both = (truth.label == CAR) & (found.label == CAR) & found.mask
+    assert both.sum() > 0.4 * (truth.label == CAR).sum()  # panes hardly return
+
+    def off(image: RangeImage) -> float:
+        return float(np.median(np.abs(image.range - truth.range)[both]))
+
+    assert off(drawn) > 0.2
+    assert off(found) < 0.15
+    z = points(found, CAR)[:, 2] + sensor.mount
+    assert -0.1 < z.min() < 0.4
+    assert 1.2 < z.max() < 2.1
+    rays = sensor.directions() @ turn(sensor).T
+    far = np.abs(np.arctan2(rays[..., 1], rays[..., 0]) - np.arctan2(3.0, 9.0)) > 0.5
+    assert (far & truth.mask).sum() > 5000
+    np.testing.assert_array_equal(found.range[far], truth.range[far])
+
+
+def test_a_column_becomes_a_person() -> None:
+    truth = scene(SENSOR, standing("person", 0, 7.0, -2.0, 0.3))
+    drawn = blob(truth, PERSON)
+    found = recast(drawn, np.random.default_rng(0))
+    assert not np.array_equal(found.range, drawn.range)
+    seen = points(found, PERSON)
+    assert len(seen) > 60
+    assert np.ptp(seen[:, 2]) < 2.1
+    assert np.hypot(seen[:, 0] - 7.0, seen[:, 1] + 2.0).max() < 1.2
+
+
+def test_what_is_no_car_stays_as_it_was_drawn() -> None:
+    """A long wall that was taken for a car: no place explains it."""
+    image = scene(SENSOR)
+    points_of = SENSOR.points(np.full(image.shape, 12.0, np.float32))
+    wall = (np.abs(points_of[..., 1]) < 9) & (points_of[..., 0] > 0) & (points_of[..., 2] > -1.7)
+    rng = np.random.default_rng(5)
+    metres = np.where(wall, rng.uniform(5, 30, image.shape), image.range).astype(np.float32)
+    drawn = replace(image, range=metres, mask=metres > 0, label=np.where(wall, CAR, image.label))
+    found = recast(drawn, np.random.default_rng(0))
+    np.testing.assert_array_equal(found.range, drawn.range)
+    np.testing.assert_array_equal(found.label, drawn.label)
+
+
+def test_a_scan_without_any_stays_bit_by_bit() -> None:
+    image = scene(ls.get_sensor("hdl-64e-kitti"))
+    found = recast(image, np.random.default_rng(0))
+    for name in ("range", "reflectance", "mask", "label"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(image, name))
+
+
+def test_the_same_seed_gives_the_same_scan() -> None:
+    drawn = blob(scene(SENSOR, standing("car", 4, 8.0, -3.0, 0.1)), CAR)
+    first, again, other = (recast(drawn, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.range, again.range)
+    assert not np.array_equal(first.range, other.range)
+
+
+def test_blocked_rays_and_limits_are_kept() -> None:
+    sensor = ls.get_sensor("hdl-64e-kitti")
+    drawn = blob(scene(sensor, standing("car", 3, 5.0, 2.5, 0.0, sensor.mount)), CAR)
+    found = recast(drawn, np.random.default_rng(4))
+    assert not np.array_equal(found.range, drawn.range)
+    assert not found.mask[hidden(sensor)].any()
+    np.testing.assert_array_equal(found.mask, found.range > 0)
+    assert (found.reflectance[~found.mask] == 0).all()
+    assert found.range[found.mask].min() >= sensor.min_range
+    assert found.range.max() <= sensor.max_range
