@@ -16,7 +16,7 @@ from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.systems.cascade import recast as module
 from lidarsynth.systems.cascade.placing import best_place
-from lidarsynth.systems.cascade.recast import recast
+from lidarsynth.systems.cascade.recast import as_cast, recast
 
 CAR, PERSON, ROAD = (CLASS_NUMBER[name] for name in ("car", "person", "road"))
 SENSOR = replace(ls.get_sensor("os1-64"), mount=1.8)
@@ -176,3 +176,15 @@ def test_blocked_rays_and_limits_are_kept() -> None:
     assert (found.reflectance[~found.mask] == 0).all()
     assert found.range[found.mask].min() >= sensor.min_range
     assert found.range.max() <= sensor.max_range
+
+
+def test_what_is_cast_has_its_class_and_the_rest_what_is_seen() -> None:
+    image = scene(SENSOR, standing("car", 1, 9.0, 3.0, 0.4))
+    seen = replace(image, label=np.where(image.mask, CLASS_NUMBER["terrain"], 0))
+    (named,) = as_cast([seen], [image])
+    car = image.label == CAR
+    assert named.label is not None
+    assert (named.label[car] == CAR).all()
+    np.testing.assert_array_equal(named.label[~car], seen.label[~car])
+    (bare,) = as_cast([replace(seen, label=None)], [image])
+    assert bare.label is None

@@ -49,7 +49,7 @@ from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_t
 from lidarsynth.systems.cascade.layout import CHOICE, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
-from lidarsynth.systems.cascade.recast import all_recast
+from lidarsynth.systems.cascade.recast import all_recast, as_cast
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
@@ -292,7 +292,8 @@ class CascadeModel(AnySensorModel):
         told = self.network.classes, recorded, self.response, self.sensor, self.precision
         seen = named(*told, more=GROWING if len(rows) > ROWS else None, alone=True)  # without speckle between its beams
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
-        return self._named(all_recast(recorded, rng))
+        recorded = all_recast(recorded, rng)
+        return as_cast(self._named(recorded), recorded)
 
     def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for; of

@@ -94,6 +94,15 @@ def all_recast(images: list[RangeImage], rng: list[torch.Generator]) -> list[Ran
     return [recast(image, np.random.default_rng(seed)) for image, seed in zip(images, seeds, strict=True)]
 
 
+def as_cast(named: list[RangeImage], cast: list[RangeImage]) -> list[RangeImage]:
+    """The images with the classes of those that were cast anew, where these have one; without classes as they are."""
+    things = [CLASS_NUMBER[kind.name] for kind in KINDS]
+    return [
+        a if a.label is None else replace(a, label=np.where(np.isin(b.label, things), b.label, a.label))
+        for a, b in zip(named, cast, strict=True)
+    ]
+
+
 def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
     """The image (H, W) with labels, whose cars and people have the shapes of streets'."""
     canvas = _canvas(image)
