@@ -98,7 +98,9 @@ def as_cast(named: list[RangeImage], cast: list[RangeImage]) -> list[RangeImage]
     """The images with the classes of those that were cast anew, where these have one; without classes as they are."""
     things = [CLASS_NUMBER[kind.name] for kind in KINDS]
     return [
-        a if a.label is None else replace(a, label=np.where(np.isin(b.label, things), b.label, a.label))
+        a
+        if a.label is None or b.label is None
+        else replace(a, label=np.where(np.isin(b.label, things), b.label, a.label))
         for a, b in zip(named, cast, strict=True)
     ]
 
