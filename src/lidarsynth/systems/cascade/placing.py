@@ -24,7 +24,10 @@ class Shape(NamedTuple):
 def two_boxes(
     words: str, length: float, width: float, waist: float, height: float, upper: tuple[float, float, float], tall: float
 ) -> Shape:
-    """upper: from where to where along the thing the upper box goes, and how much narrower it is on either side."""
+    """A thing of so many metres; waist: height at which the upper box stands on the lower one.
+
+    upper: from where to where along the thing the upper box goes, and how much narrower it is on either side, metres
+    """
     half, foot = width / 2, min(0.2, waist / 4)
     lower = [[-length / 2, -half, foot], [length / 2, half, waist]]
     back, front, less = upper
@@ -62,6 +65,7 @@ GAP, BEHIND = 0.3, 0.15  # metres
 ENDS = (0.06, 0.94)  # quantiles of what is seen of a thing
 ASKEW = 0.15  # cost of standing at 45 degrees to everything around
 STEPS = ((0.25, 0.07), (0.1, 0.028))  # metres and radians, of the best place
+NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3).astype(np.float32)
 
 
 def best_place(shape: Shape, turns: int, points: np.ndarray, view: View, level: float, axis: float | None) -> Place:
@@ -78,9 +82,6 @@ def best_place(shape: Shape, turns: int, points: np.ndarray, view: View, level: 
         costs, share = _costs(places, shape, view, level, axis)
     best = int(costs.argmin())
     return Place(*(float(value) for value in (*places[best], costs[best], share[best])))
-
-
-NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3).astype(np.float32)
 
 
 def _corners(seen: np.ndarray, size: np.ndarray, yaws: np.ndarray) -> np.ndarray:

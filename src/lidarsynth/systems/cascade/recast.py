@@ -1,6 +1,6 @@
 """Cars and people of generated scans, cast as streets have them where the networks have drawn something like one.
 
-What is drawn of a car is about as large, as near and as bright as one, but hardly ever has its outline: the columns of
+What is drawn of a car is often a heap and hardly ever has the outline of one: the columns of
 a layout are 2.8 degrees apart. So where the classes say car or person, one of the streets' own shapes is put where it
 explains most (`placing.py`), its rays are cast and read as streets' are, and what else was drawn of it becomes what is
 beside it. What suggests no place stays as it was drawn. Measured in docs/training-default.md.
@@ -106,7 +106,8 @@ def as_cast(named: list[RangeImage], cast: list[RangeImage]) -> list[RangeImage]
 
 
 def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
-    """The image (H, W) with labels, whose cars and people have the shapes of streets'."""
+    """The image (H, W), metres and reflectance in [0, 1], with labels (H, W), whose cars and people have the shapes of
+    streets'; as it is, where nothing suggests any."""
     canvas = _canvas(image)
     axis = _axis(canvas)
     for kind in KINDS:
@@ -172,7 +173,7 @@ def _thing(
         return None
     shade = float(np.median(canvas.reflectance.flat[at]))
     found, rays = _cast(canvas, _mesh(kind, shape, place, level, rng), _tint(kind, shade, rng), rng)
-    mine = at[_near(canvas.points.reshape(-1, 3)[at], place, shape, kind.margin)]
+    mine = at[_near(points, place, shape, kind.margin)]
     _put(canvas, found, rays, mine, level, rng)
     rest = at[~np.isin(at, mine)]
     return rest if len(rest) >= FEW and len(mine) else None
@@ -269,7 +270,7 @@ def _cast(canvas: _Canvas, mesh: Mesh, tint: float, rng: np.random.Generator) ->
 
 
 def _world(mesh: Mesh, tint: float) -> World:
-    """A world of one thing."""
+    """A world of one thing, `tint` in spreads of its materials."""
     count = len(mesh)
     kinds, tints = np.full(count, THING, np.uint8), np.full(count, tint, np.float32)
     none, thing = np.full(count, -1, np.int16), np.zeros(count, np.int32)
