@@ -13,6 +13,7 @@ from lidarsynth.diffusion.schedule import flow
 from lidarsynth.experiment.record import Data, Experiment, Model
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks import fill_unet
 from lidarsynth.networks.candidates import BEND, candidates
@@ -30,6 +31,7 @@ from lidarsynth.systems.cascade.images import noisy
 from lidarsynth.systems.cascade.known import spread
 from lidarsynth.systems.cascade.layout import DRAFT, draft, one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.naming import FAIR, weights
 from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.weights.load import load_parts
 
@@ -484,6 +486,21 @@ def test_classes_come_with_generated_and_completed_scans(learned: CascadeModel):
     assert filled.label is not None and filled.label.min() >= 1
     own = learned.into(SMALL).with_labels().complete(perfect(SMALL)[::3]).to_scan()
     assert own.label is not None and np.all(own.label[own.extra["new"] == 0] == 9)
+
+
+def test_what_is_rarer_in_layouts_is_named_less_often_in_generated_scans_alone(learned: CascadeModel):
+    classes = ClassUNet(8).eval()
+    torch.nn.init.zeros_(classes.classes.weight)
+    truck, building = (CLASS_NUMBER[word] for word in ("truck", "building"))
+    bias = torch.zeros(20)
+    bias[truck], bias[building] = 21.0, 20.0  # before what learning gave rare ones is taken off
+    classes.classes.bias.data = bias + torch.from_numpy(FAIR * np.log(weights())).float()
+    network = Cascade(learned.network.coarse, learned.network.fill, classes=classes)
+    model = replace(learned, network=network).with_labels()
+    (drawn,) = model.generate(1, steps=2)
+    assert drawn.label is not None and (drawn.label[drawn.mask] == building).all()
+    filled = model.into(SMALL).complete(replace(perfect(SMALL)[::3], label=None)).to_scan()
+    assert filled.label is not None and (filled.label == truck).all()
 
 
 def test_bf16_errs_little_and_auto_asks_the_processor(model: CascadeModel, monkeypatch: pytest.MonkeyPatch):

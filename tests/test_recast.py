@@ -139,15 +139,34 @@ def test_a_column_becomes_a_person() -> None:
     assert np.hypot(seen[:, 0] - 7.0, seen[:, 1] + 2.0).max() < 1.2
 
 
-def test_what_is_no_car_stays_as_it_was_drawn() -> None:
-    """A long wall that was taken for a car: no place explains it."""
+def called_a_car(metres: np.ndarray, there: np.ndarray) -> RangeImage:
+    """A road, and pixels (H, W) called a car that end `metres` away."""
     image = scene(SENSOR)
-    points_of = SENSOR.points(np.full(image.shape, 12.0, np.float32))
-    wall = (np.abs(points_of[..., 1]) < 9) & (points_of[..., 0] > 0) & (points_of[..., 2] > -1.7)
-    rng = np.random.default_rng(5)
-    metres = np.where(wall, rng.uniform(5, 30, image.shape), image.range).astype(np.float32)
-    drawn = replace(image, range=metres, mask=metres > 0, label=np.where(wall, CAR, image.label))
+    metres = np.where(there, metres, image.range).astype(np.float32)
+    return replace(image, range=metres, mask=metres > 0, label=np.where(there, CAR, image.label))
+
+
+def test_a_heap_that_is_no_car_becomes_what_is_beside_it() -> None:
+    """Nine metres to either side, anywhere from 5 to 30 m: no place explains it."""
+    points_of, rng = SENSOR.points(np.full((SENSOR.height, SENSOR.width), 12.0, np.float32)), np.random.default_rng(5)
+    heap = (np.abs(points_of[..., 1]) < 9) & (points_of[..., 0] > 0) & (points_of[..., 2] > -1.7)
+    drawn, bare = called_a_car(rng.uniform(5, 30, heap.shape), heap), scene(SENSOR)
+    found = recast(drawn, rng)
+    assert heap.sum() > 5000
+    assert (found.label != CAR).all()
+    near = heap & bare.mask & (bare.range < 20)
+    assert near.sum() > 500
+    np.testing.assert_allclose(found.range[near], bare.range[near], atol=0.15)
+    np.testing.assert_array_equal(found.range[~heap], drawn.range[~heap])
+
+
+def test_a_wall_that_is_called_a_car_stays_as_it_was_drawn() -> None:
+    rays = SENSOR.directions()
+    metres = 9 / np.maximum(rays[..., 0], 0.1)
+    wall = (np.abs(metres * rays[..., 1]) < 9) & (rays[..., 0] > 0.3) & (metres * rays[..., 2] > -1.6)
+    drawn = called_a_car(metres, wall)
     found = recast(drawn, np.random.default_rng(0))
+    assert wall.sum() > 5000
     np.testing.assert_array_equal(found.range, drawn.range)
     np.testing.assert_array_equal(found.label, drawn.label)
 

@@ -47,7 +47,7 @@ from lidarsynth.systems.cascade.images import (
 )
 from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, grids, sampling, times
-from lidarsynth.systems.cascade.naming import GROWING, class_of_points, named
+from lidarsynth.systems.cascade.naming import GROWING, RARER, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast
 from lidarsynth.systems.cascade.request import calls, resolved
@@ -290,10 +290,10 @@ class CascadeModel(AnySensorModel):
         if self.network.classes is None:
             return self._named(recorded)
         told = self.network.classes, recorded, self.response, self.sensor, self.precision
-        seen = named(*told, more=GROWING if len(rows) > ROWS else None, alone=True)  # without speckle between its beams
+        seen = named(*told, more=RARER | (GROWING if len(rows) > ROWS else {}), alone=True)  # calm between its beams
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
-        recorded = all_recast(recorded, rng)
-        return as_cast(self._named(recorded), recorded)
+        cast = all_recast(recorded, rng)
+        return as_cast(self._named(cast), cast)
 
     def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for; of
@@ -303,7 +303,7 @@ class CascadeModel(AnySensorModel):
         assert self.network.classes is not None
         inside = self.network.inside if recorded and not self.experiment.model.own_classes else None
         told = self.network.classes, images, self.response, self.sensor, self.precision, least
-        return named(*told, inside=inside)
+        return named(*told, more=None if recorded else RARER, inside=inside)
 
     def _between(
         self,
