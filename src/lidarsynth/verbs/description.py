@@ -17,7 +17,7 @@ from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.systems.description import training_line
 from lidarsynth.systems.table import build_network, system_of
-from lidarsynth.verbs.file_kinds import file_lines, moves
+from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading
 from lidarsynth.weights.load import load_parts, shipped
 
@@ -30,7 +30,7 @@ def describe(what: str, reading: Reading | None = None) -> str:
     path, reading = Path(what), reading or Reading()
     if lines := file_lines(path, reading):
         return _table(str(path), lines)
-    if moves(reading):
+    if reading.moves:
         raise ValueError(f"{what}: expected a scan to move or take rings of, found a word, a sensor or a model")
     if what in WORDS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
