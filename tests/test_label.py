@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_cascade import SMALL, perfect
 from test_realise import save_model_and_sensor, write_bag_of
+from test_upsampling_model import model_of
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, read_image, write
@@ -203,6 +204,13 @@ def test_a_range_image_is_of_the_sensor_that_its_file_holds(verb: str, place: Pa
     assert made.name == ("ownx4" if verb == "upsample" else "own") and len(beams) == SMALL.height
     main([verb, "image.npz", *asked, "--from" if verb == "upsample" else "--sensor", "vlp-16", "--out", "o.npz"])
     assert read_image("o.npz").sensor.name.startswith("vlp-16")  # unless another is named
+
+
+def test_a_model_of_one_sensor_completes_a_range_image_in_its_own(place: Path):
+    model_of("lidar-sr").save("sr")
+    main(["project", "scan.ply", "--sensor", "own.toml", "--out", "image.npz", "--no-picture"])
+    main(["complete", "image.npz", "--model", "sr", "--steps", "2", "--corrupt", "beams:4", "--out", "o.npz"])
+    assert read_image("o.npz").sensor == model_of("lidar-sr").sensor
 
 
 def test_info_tells_the_sensor_that_a_range_image_holds_until_its_points_are_moved(place: Path):

@@ -28,7 +28,7 @@ from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
-from lidarsynth.systems.any_sensor import IN_PYTHON
+from lidarsynth.systems.any_sensor import IN_PYTHON, AnySensorModel
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL, check_companions
@@ -173,8 +173,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     begun, warning = time.perf_counter(), None
     try:
         loaded = work.item.read()
-        if job.sensor is None and (job.verb != "complete" or (model is not None and model.any_sensor)):
-            job = replace(job, sensor=loaded.sensor)  # models of one sensor complete others' scans in their own images
+        if job.sensor is None and (job.verb != "complete" or isinstance(model, AnySensorModel)):
+            job = replace(job, sensor=loaded.sensor)  # other models complete any sensor's scans in their own images
         with_points(loaded.scan, str(work.item.path))
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         warning = warning or _viewpoint_warning(job, work)
