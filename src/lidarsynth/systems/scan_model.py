@@ -194,9 +194,9 @@ class ScanModel(ABC):
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
         """
-        scan, seed = noted(self, scan, sensor), checked_seed(seed)
+        made, seed = made_by(noted(self, scan, sensor), sensor), checked_seed(seed)
         with usual_torch():
-            return self.realised(*made_by(scan, sensor), seed).to_scan()
+            return self.realised(*made, seed).to_scan()
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`."""
@@ -221,9 +221,9 @@ class ScanModel(ABC):
         """
         if not 0 <= least <= 1:
             raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
-        scan = noted(self, scan, sensor)
+        made = made_by(noted(self, scan, sensor), sensor)
         with usual_torch():
-            return self.named(*made_by(scan, sensor), least).to_scan()
+            return self.named(*made, least).to_scan()
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`."""
