@@ -1,5 +1,6 @@
 """Files as users have them: other axes with rings, bags of one name, fields named like ours, times in odd units."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,10 +154,63 @@ def test_names_of_columns_may_have_units(header: str, tmp_path: Path):
     assert name.lower() == "range" and found.extra[name][0] == 8 and (found.reflectance == 0.25).all()
 
 
-def test_two_columns_of_one_name_are_refused(tmp_path: Path):
-    (tmp_path / "a.csv").write_text("x,y,z,intensity,range,range\n1,2,3,0.5,6,7\n")
-    with pytest.raises(ValueError, match=r"a.csv: expected columns of different names, found 2 named range"):
-        read(tmp_path / "a.csv")
+def npz_with_x_twice(path: Path, columns: list[np.ndarray]) -> None:
+    np.savez(path, **dict(zip("xyzi_", columns, strict=True)))
+    path.write_bytes(path.read_bytes().replace(b"_.npy", b"x.npy"))
+
+
+def feather_with_x_twice(path: Path, columns: list[np.ndarray]) -> None:
+    pyarrow = pytest.importorskip("pyarrow", reason="needs lidarsynth[data]")
+    with pyarrow.OSFile(str(path), "wb") as file:
+        table = pyarrow.table(columns, names=list("xyzix"))
+        with pyarrow.ipc.new_file(file, table.schema) as writer:
+            writer.write_table(table)
+
+
+def bag_with_x_twice(path: Path, columns: list[np.ndarray]) -> None:
+    with write_bag(path) as writer:
+        fields = dict(zip(("x", "y", "z", "i", "_"), columns, strict=True))
+        writer.write_cloud("/points", Cloud(1, "lidar", 1, fields))
+    path.write_bytes(path.read_bytes().replace(b"\x01\x00\x00\x00_", b"\x01\x00\x00\x00x"))
+
+
+def text_with_x_twice(head: str) -> Callable[[Path, list[np.ndarray]], None]:
+    def put(path: Path, columns: list[np.ndarray]) -> None:
+        rows = [" ".join(map(str, row)) for row in zip(*columns, strict=True)]
+        path.write_text("\n".join([head, *rows]) + "\n")
+
+    return put
+
+
+PLY = "\n".join(
+    ["ply", "format ascii 1.0", "element vertex 100", *(f"property float {n}" for n in "xyzix"), "end_header"]
+)
+PCD = "FIELDS x y z i x\nSIZE 4 4 4 4 4\nTYPE F F F F F\nPOINTS 100\nDATA ascii"
+TWICE = {
+    "a.csv": text_with_x_twice("x y z i x"),
+    "a.ply": text_with_x_twice(PLY),
+    "a.pcd": text_with_x_twice(PCD),
+    "a.npz": npz_with_x_twice,
+    "a.feather": feather_with_x_twice,
+    "a.bag": bag_with_x_twice,
+}
+
+
+@pytest.mark.parametrize("name", TWICE)
+def test_two_fields_of_one_name_are_refused(name: str, tmp_path: Path, capsys: Capture):
+    columns = [np.full(100, value) for value in (1.0, 2.0, 3.0, 0.5, 7.0)]
+    TWICE[name](tmp_path / name, columns)
+    with pytest.raises(SystemExit, match="2"):
+        main(["info", str(tmp_path / name)])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{name}: " in line and "expected fields of different names, found 2 named x" in line
+
+
+def test_padding_of_a_pcd_may_come_twice(tmp_path: Path):
+    rows = ["1 2 3 9 0.5 9"] * 100
+    head = "FIELDS x y z _ i _\nSIZE 4 4 4 4 4 4\nTYPE F F F F F F\nPOINTS 100\nDATA ascii"
+    (tmp_path / "a.pcd").write_text("\n".join([head, *rows]) + "\n")
+    assert len(read(tmp_path / "a.pcd")) == 100 and not read(tmp_path / "a.pcd").extra
 
 
 def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):

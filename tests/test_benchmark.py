@@ -119,13 +119,13 @@ class Counted:
             raise KeyboardInterrupt
         self.calls.append(seed)
 
-    def generate(self, n=1, steps=None, seed=0, sampler=None, batch_size=4):
+    def generate(self, n=1, steps=None, seed=0, sampler=None, batch_size=4, on_step=None):
         self._count(seed)
-        return self.model.generate(n, steps, seed, sampler, batch_size)
+        return self.model.generate(n, steps, seed, sampler, batch_size, on_step)
 
-    def complete(self, scan, known, method="auto", steps=None, resamples=None, sampler=None, seed=0):
+    def complete(self, scan, known, method="auto", steps=None, resamples=None, sampler=None, seed=0, on_step=None):
         self._count(seed)
-        return self.model.complete(scan, known, method, steps, resamples, sampler, seed)
+        return self.model.complete(scan, known, method, steps, resamples, sampler, seed, on_step)
 
     def evaluations(self, method="auto", steps=None, resamples=None, sampler=None):
         return self.model.evaluations(method, steps, resamples, sampler)

@@ -130,7 +130,7 @@ def test_a_log_file_gets_few_pieces_of_progress(bar: str, monkeypatch):
             for _ in range(300):
                 on_step()
     elif bar == "scan":
-        with terminal.scan_bar("complete", 300) as on_scan:
+        with terminal.scan_bar("complete", 300) as (on_scan, _):
             for _ in range(300):
                 on_scan()
     elif bar == "image":

@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 from test_cascade import SMALL, perfect
 from test_realise import save_model_and_sensor, write_bag_of
+from test_upsampling_model import model_of
 
 from lidarsynth.cli.main import main
-from lidarsynth.files.formats import read, write
+from lidarsynth.files.formats import read, read_image, write
 from lidarsynth.files.labels import read_words
+from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.naming import class_of_points
+from lidarsynth.verbs.description import describe
+from lidarsynth.verbs.inputs import Reading
 from lidarsynth.weights.load import load
 
 WORDS = ("--model", "model", "--sensor", "own.toml", "--no-picture")
@@ -185,3 +189,39 @@ def test_a_seed_is_taken_and_nothing_sure_enough_is_told(tmp_path: Path, capsys:
     words = ["label", str(tmp_path / "a.pcd"), "--out", str(tmp_path / "b.pcd"), "--no-picture", "--seed", "3"]
     main([*words, "--min-confidence", "1"])
     assert " points of vlp-16: " in (out := capsys.readouterr().out) and ": ," not in out
+
+
+@pytest.mark.parametrize("verb", ["label", "complete", "upsample", "realise", "project"])
+def test_a_range_image_is_of_the_sensor_that_its_file_holds(verb: str, place: Path, capsys: pytest.CaptureFixture[str]):
+    main(["project", "scan.ply", "--sensor", "own.toml", "--out", "image.npz", "--no-picture"])
+    asked = [] if verb == "project" else ["--model", "default"]
+    with pytest.raises(SystemExit):  # of its points alone nobody can tell
+        main([verb, "scan.ply", *asked, "--out", "o.ply", "--no-picture"])
+    assert "name" in capsys.readouterr().err
+    main([verb, "image.npz", *asked, "--out", "o.npz", "--no-picture"])
+    made = read_image("o.npz").sensor
+    beams = [e for e in made.elevations if any(abs(e - own) < 1e-9 for own in SMALL.elevations)]
+    assert made.name == ("ownx4" if verb == "upsample" else "own") and len(beams) == SMALL.height
+    main([verb, "image.npz", *asked, "--from" if verb == "upsample" else "--sensor", "vlp-16", "--out", "o.npz"])
+    assert read_image("o.npz").sensor.name.startswith("vlp-16")  # unless another is named
+
+
+def test_a_model_of_one_sensor_completes_a_range_image_in_its_own(place: Path):
+    model_of("lidar-sr").save("sr")
+    main(["project", "scan.ply", "--sensor", "own.toml", "--out", "image.npz", "--no-picture"])
+    main(["complete", "image.npz", "--model", "sr", "--steps", "2", "--corrupt", "beams:4", "--out", "o.npz"])
+    assert read_image("o.npz").sensor == model_of("lidar-sr").sensor
+
+
+def test_info_tells_the_sensor_that_a_range_image_holds_until_its_points_are_moved(place: Path):
+    main(["project", "scan.ply", "--sensor", "own.toml", "--out", "image.npz", "--no-picture"])
+    assert "own (the file holds it)" in describe("image.npz")
+    assert "name the sensor" in describe("image.npz", Reading(transform=np.eye(4)))
+
+
+def test_a_range_image_is_of_its_own_sensor_in_python_too(place: Path):
+    image = project(read("scan.ply"), "own.toml")
+    with pytest.raises(ValueError, match="name the sensor"):
+        load("default").label(image.to_scan())
+    whole = load("default").label(image)
+    np.testing.assert_array_equal(whole.label, load("default").label(image.to_scan(), "own.toml").label)

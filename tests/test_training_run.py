@@ -1,6 +1,7 @@
 """Runs in a folder: exact continuation after kill -9 and SIGTERM, several processes, checkpoints, fine-tuning."""
 
 import csv
+import json
 import random
 import shutil
 import signal
@@ -31,7 +32,9 @@ from lidarsynth.training import monitor
 from lidarsynth.training.checkpoint import checkpoints
 from lidarsynth.training.options import Options
 from lidarsynth.verbs import training as training_verb
+from lidarsynth.verbs.description import describe
 from lidarsynth.verbs.training import resolve, run
+from lidarsynth.verbs.training_start import Start, check_start
 from lidarsynth.weights.load import load_parts
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
@@ -146,7 +149,7 @@ def test_a_run_goes_on_with_its_own_images(cache: Path, tmp_path: Path):
     ):
         with pytest.raises(ValueError, match=rf"{own}.*, found {found}.*; another folder begins a new run"):
             list(run(tiny(4), data, out, options=QUIET))
-    with pytest.raises(ValueError, match="48 images of several caches"):
+    with pytest.raises(ValueError, match="36 images of several caches"):
         list(run(tiny(4), f"{cache},{few}", out, options=QUIET))
     (out / "start.json").unlink()  # as of a run from before there was one
     with pytest.raises(ValueError, match=rf"{own}, found 12 images of few; another folder"):
@@ -182,10 +185,46 @@ def test_a_run_on_several_caches_says_so(cache: Path, tmp_path: Path):
             options=QUIET,
         )
     )
-    assert load(tmp_path / "run")[0].card.data == "48 images of several caches (24 of noise and 3 of few)"
+    assert load(tmp_path / "run")[0].card.data == "27 images of several caches (24 of noise and 3 of few)"
     assert load(tmp_path / "run")[0].card.sensor == SENSOR.name and not load(tmp_path / "run")[0].card.synthetic
     with pytest.raises(ValueError, match="nowhere"):
         list(run(tiny(2), f"{cache},nowhere", tmp_path / "other", options=QUIET))
+
+
+def test_a_run_that_counted_scans_as_often_as_they_are_shown_goes_on(cache: Path, tmp_path: Path):
+    """A cache that is named twice counts once too; runs from before that go on with the same images."""
+    few, out, start = tmp_path / "few", tmp_path / "run", tmp_path / "run" / "start.json"
+    list(write_cache(few, lambda i: noise_image(100 + i), 3, SENSOR, {"name": "few"}))
+    data = f"{few},{cache},{few}"
+    list(run(tiny(1), data, out, options=QUIET))
+    told = "27 images of several caches (3 of few (2 x) and 24 of noise)"
+    assert told in start.read_text() and load(out)[0].card.data == told
+    start.write_text(
+        start.read_text().replace(told, "72 images of several caches (3 of few and 24 of noise and 3 of few)")
+    )
+    assert [progress.step for progress in run(tiny(2), data, out, options=QUIET)] == [1, 2]
+    with pytest.raises(ValueError, match="its own run, which learns from 72 images of several"):
+        list(run(tiny(3), f"{few},{cache}", out, options=QUIET))
+    assert check_start(tmp_path, Start("27 images of several caches (24 of a and 3 of b)"),
+                       Card(data="48 images of several caches (24 of a and 3 of b)")) == ""  # fmt: skip
+    with pytest.raises(ValueError, match="its own run"):
+        check_start(tmp_path, Start("27 images of a"), Card(data="48 images of a"))
+
+
+def test_info_tells_how_far_a_stopped_run_came(cache: Path, tmp_path: Path):
+    steps = run(tiny(5), cache, tmp_path, options=Options(save_every=2, sample_every=0, workers=0))
+    for progress in steps:
+        if progress.step == 3:
+            break
+    steps.close()  # killed: the checkpoint of step 2 is the newest
+    assert "stopped at 2 of 5 steps of 4" in describe(str(tmp_path))
+    assert "stopped at 2 of 5 steps of 4" in card_text(load(tmp_path)[0], ls.load(tmp_path).description)
+    list(run(tiny(5), cache, tmp_path, options=QUIET))
+    assert "stopped" not in describe(str(tmp_path)) and " 5 steps of 4" in describe(str(tmp_path))
+    record = json.loads((tmp_path / "experiment.json").read_text())
+    del record["card"]["steps"]  # as of a run from before it was told
+    (tmp_path / "experiment.json").write_text(json.dumps(record))
+    assert "stopped" not in describe(str(tmp_path)) and " 5 steps of 4" in describe(str(tmp_path))
 
 
 def test_a_run_s_folder_loads_and_keeps_the_last_checkpoints(cache: Path, tmp_path: Path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lidarsynth.benchmark.config import Generation, GenerationMethod, protocols_
 from lidarsynth.benchmark.evaluation_counts import generation_evaluations
 from lidarsynth.benchmark.published import published
 from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
-from lidarsynth.benchmark.setup import Setup
+from lidarsynth.benchmark.setup import OnDone, Setup
 from lidarsynth.benchmark.sources import located
 from lidarsynth.benchmark.store import Seconds, Store
 from lidarsynth.evaluation.evaluate import evaluate
@@ -30,14 +31,20 @@ Draw = Callable[[int, int], list[RangeImage]]  # seed of the first scan, how man
 DECIDING = ("noise", "steps", "sampler")  # keys of a method that decide its scans
 
 
-def drawer(method: GenerationMethod, model: ScanModel | None, sensor: Sensor) -> Draw:
-    """What makes new scans: a model with the method's settings, or noise as `sensor` would see it."""
+def drawer(
+    method: GenerationMethod, model: ScanModel | None, sensor: Sensor, on_step: Callable[..., None] | None = None
+) -> Draw:
+    """What makes new scans: a model with the method's settings, or noise as `sensor` would see it.
+
+    on_step  called after every network step with how many scans it was for
+    """
     if model is None:
         return lambda seed, count: [noise(sensor, seed + i) for i in range(count)]
     given: dict[str, Any] = {key: vars(method)[key] for key in ("steps", "sampler") if vars(method)[key] is not None}
 
     def draw(seed: int, count: int) -> list[RangeImage]:
-        images = model.generate(count, seed=seed, batch_size=count, **given)
+        tell = None if on_step is None else partial(on_step, model.at_once(count))
+        images = model.generate(count, seed=seed, batch_size=count, on_step=tell, **given)
         if model.experiment.data.reflectance:
             return images
         return [replace(image, reflectance=np.zeros_like(image.reflectance)) for image in images]
@@ -76,7 +83,9 @@ def generation_row(
         try:
             evaluations, _ = timed(lambda: generation_evaluations(model, method) if model else None)
             batch = setup.batch_size if setup.device != "cpu" else model.together if model else 1
-            _make(setup, method, drawer(method, model, sensor), store, count, config.seed, batch)
+            calls = model.generation_steps(method.steps_asked, method.sampler) if model else 1
+            on_done, on_step = setup.stepwise(method.name, count, calls)
+            _make(drawer(method, model, sensor, on_step), store, count, config.seed, batch, on_done)
         except Declined as reason:
             return replace(row, reason=str(reason))
         samples = store.folder
@@ -92,13 +101,13 @@ def generation_row(
     )
 
 
-def _make(setup: Setup, method: GenerationMethod, draw: Draw, store: Store, count: int, seed: int, batch: int) -> None:
+def _make(draw: Draw, store: Store, count: int, seed: int, batch: int, on_done: OnDone) -> None:
     """Scans of any number depend on seed + number only, so that more of them go on where fewer ended."""
 
     def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
         return timed(lambda: draw(seed + numbers.start, len(numbers)))
 
-    fill_store(store, dict.fromkeys(range(count), ""), make, batch, setup.progress(method.name, count))
+    fill_store(store, dict.fromkeys(range(count), ""), make, batch, on_done)
 
 
 def _judged(

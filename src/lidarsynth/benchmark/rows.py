@@ -101,10 +101,13 @@ def fill_store(
     """Make the scans that the store lacks, `batch` at a time, and keep each with its share of the seconds.
 
     stamps   number of a scan -> what it is made of
-    on_done  called with how many are there. Raises Declined as `make` does, and where its scans are no numbers.
+    on_done  called with how many are there, at first too. Raises Declined as `make` does, and where its scans are no
+             numbers.
     """
     todo = store.lacks(stamps)
     there = len(stamps) - len(todo)
+    if on_done:
+        on_done(there)
     for numbers in _runs(todo, batch):
         images, seconds = make(numbers)
         for i, image in zip(numbers, images, strict=True):

@@ -21,6 +21,7 @@ from lidarsynth.systems.fingerprint import fingerprint
 from lidarsynth.systems.scan_model import ScanModel
 
 Load = Callable[[str], ScanModel]
+OnDone = Callable[[int], object] | None  # called with the number of scans that are there
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,29 @@ class Setup:
         """Where the scans of these settings are kept."""
         return open_store(self.folder / "scans", word, dict(settings))
 
-    def progress(self, name: str, total: int) -> Callable[[int], object] | None:
+    def progress(self, name: str, total: int) -> OnDone:
         """What to call with the number of scans that are there."""
         on_images = self.on_images
         return None if on_images is None else lambda done: on_images(name, done, total)
+
+    def stepwise(self, name: str, total: int, calls: int) -> tuple[OnDone, Callable[..., None] | None]:
+        """`progress` of a method of so many network steps a scan, and what to call after each, with the number of scans
+        that it was for (1): where they are several, they are what is counted."""
+        told, at = self.on_images, 0
+        if told is None or calls < 2:
+            return self.progress(name, total), None
+
+        def on_done(done: int) -> None:
+            nonlocal at
+            at = done * calls
+            told(f"{name}, steps", at, total * calls)
+
+        def on_step(scans: int = 1) -> None:
+            nonlocal at
+            at = min(at + scans, total * calls)
+            told(f"{name}, steps", at, total * calls)
+
+        return on_done, on_step
 
     def judges(self, protocol: str, width: int) -> Loaded:
         """The networks of a protocol of pairs: the user's own RangeNet, or the official one where it is here."""

@@ -22,18 +22,19 @@ from lidarsynth.evaluation.statistics import definition
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.systems.interpolation.model import interpolated
-from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 Fill = Callable[[RangeImage, np.ndarray, int], RangeImage]  # image without the hidden pixels, known (H, W), seed
 ERRORS = ("range MAE", "reflectance MAE", "hidden range MAE", "hidden reflectance MAE")  # of each scan
 DECIDING = ("interpolation", "method", "steps", "resamples", "sampler")  # keys of a method that decide its scans
 
 
-def filler(method: UpsamplingMethod, model: ScanModel | None) -> Fill:
+def filler(method: UpsamplingMethod, model: ScanModel | None, on_step: OnStep = None) -> Fill:
     """What fills a scan: an interpolation, or a model with the method's settings."""
     if model is None:
         return lambda before, known, seed: interpolated(before, known, method.interpolation or "")
     given: dict[str, Any] = {key: vars(method)[key] for key in DECIDING if vars(method)[key] is not None}
+    given["on_step"] = on_step
 
     def fill(before: RangeImage, known: np.ndarray, seed: int) -> RangeImage:
         filled = replace(model.complete(before, known, seed=seed, **given), sensor=before.sensor)
@@ -67,7 +68,6 @@ def upsampling_row(setup: Setup, problem: Problem, group: str, method: Upsamplin
     deciding = setup.settings(method, DECIDING) | {"corruption": config.corruption, "seed": config.seed}
     row = Row(method.name, group, deciding)
     store = setup.store(method.model or method.interpolation or "", deciding)
-    fill = filler(method, model)
 
     def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
         truth, known = data[numbers.start]
@@ -78,7 +78,9 @@ def upsampling_row(setup: Setup, problem: Problem, group: str, method: Upsamplin
     try:
         evaluations, _ = timed(lambda: completion_evaluations(model, method) if model else 0)
         needed = {i: stamp for i, stamp in stamps.items() if i < count or i == problem.shown}
-        fill_store(store, needed, make, on_done=setup.progress(method.name, len(needed)))
+        on_done, on_step = setup.stepwise(method.name, len(needed), evaluations)
+        fill = filler(method, model, on_step)
+        fill_store(store, needed, make, on_done=on_done)
     except Declined as reason:
         return replace(row, reason=str(reason))
     word = method.published or method.interpolation

@@ -82,7 +82,11 @@ SensorOut = Annotated[
     str | None, arg(name="to", metavar="SENSOR", help="of the result; for models of any sensor, such as iln, bilinear.")
 ]
 SensorWord = Annotated[
-    str | None, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file; recognised if not given.")
+    str | None,
+    arg(
+        metavar="SENSOR",
+        help="a word such as vlp-16, or a .toml/.json file; if not given, a range image's own, or recognised.",
+    ),
 ]
 
 

@@ -56,6 +56,6 @@ def generate(
             with step_bar("generate", sum(-(-len(run) // size) for run in runs) * calls) as on_step:
                 new = sum(1 for _ in make(on_step))
         else:
-            with scan_bar("generate", sum(map(len, runs))) as on_scan:
+            with scan_bar("generate", sum(map(len, runs))) as (on_scan, _):
                 new = sum(1 for _ in make(on_step=on_scan, workers=workers, source=source))
     say(f"{out}/ has {plural(count, 'scan')}, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")

@@ -115,14 +115,20 @@ def _model(job: Job) -> ScanModel | None:
     return model.with_labels() if job.labels else model
 
 
+def _calls(job: Job, model: ScanModel | None, workers: int = 1) -> int:
+    """How many network steps a scan takes, after each of which this process is told."""
+    if model is None or workers > 1 or job.verb in ("realise", "label"):
+        return 1
+    return model.calls(model.resolved(job.how))
+
+
 def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
     from lidarsynth.verbs.batch import run
     from lidarsynth.verbs.output_files import works
 
     work = list(works(inputs, out, "ply", beside=job.beside))
     model = _model(job)
-    calls = 1 if model is None or job.verb in ("realise", "label") else model.calls(model.resolved(job.how))
-    with step_bar(work[0].item.path.name, calls) as on_step:
+    with step_bar(work[0].item.path.name, _calls(job, model)) as on_step:
         (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:
         raise ValueError(_named(result))
@@ -193,8 +199,8 @@ def _done(
     from lidarsynth.verbs.batch import run
 
     results = []
-    with scan_bar(job.verb, count) as on_scan:
-        for result in run(job, works, many.workers, model):
+    with scan_bar(job.verb, count, _calls(job, model, many.workers)) as (on_scan, on_step):
+        for result in run(job, works, many.workers, model, on_step):
             if result.error is None and all(earlier.error is not None for earlier in results):
                 _begin(report, settings, many.skip_existing)
             results.append(result)
@@ -284,10 +290,11 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
     model, begun, results = _model(job), time.perf_counter(), []
     out.parent.mkdir(parents=True, exist_ok=True)
-    with write_bag(out) as writer, scan_bar(job.verb, inputs.count) as on_scan:
+    calls = _calls(job, model, many.workers)
+    with write_bag(out) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
         topic = _copied(paths[0], writer, many)
         stream = (Work(item, None, looked_at(number), number) for number, item in enumerate(inputs.stream()))
-        for result in run(replace(job, picture=False), stream, many.workers, model):
+        for result in run(replace(job, picture=False), stream, many.workers, model, on_step):
             if result.cloud is not None:
                 writer.write_cloud(topic, result.cloud)
             results.append(replace(result, cloud=None))

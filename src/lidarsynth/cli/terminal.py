@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, NoReturn
 
 from lidarsynth.cli.parsing import parsed
+from lidarsynth.lidar.plural import plural
 
 if TYPE_CHECKING:
     from lidarsynth.systems.scan_model import ScanModel
@@ -56,12 +57,25 @@ def _seconds() -> float:
 
 
 @contextmanager
-def scan_bar(title: str, count: int | None) -> Iterator[Callable[[], object]]:
-    """A progress bar with total and time left for work over two seconds; gives what to call after every scan."""
+def scan_bar(
+    title: str, count: int | None, calls: int = 1
+) -> Iterator[tuple[Callable[[], object], Callable[[], object] | None]]:
+    """A progress bar with total and time left for work over two seconds; gives what to call after every scan, and after
+    every network step where a scan takes several (`calls`): the bar counts these then."""
     from tqdm import tqdm
 
-    with tqdm(total=count, unit="scan", delay=2, desc=title, leave=False, mininterval=_seconds()) as bar:
-        yield bar.update
+    total, unit, done = None if count is None else count * calls, "scan" if calls == 1 else "step", 0
+    with tqdm(total=total, unit=unit, delay=2, desc=title, leave=False, mininterval=_seconds()) as bar:
+
+        def on_scan() -> None:
+            nonlocal done
+            done += 1
+            if calls > 1:
+                of = "" if count is None else f" of {count}"
+                bar.set_description(f"{title}, {plural(done, 'scan')}{of} done", refresh=False)
+            bar.update(done * calls - bar.n)  # one that failed has taken fewer steps
+
+        yield on_scan, None if calls == 1 else bar.update
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -113,7 +114,7 @@ class CachedImages:
 class SeveralCaches:
     """The images of several caches of one sensor as one, of each equally many: those of a small cache come again.
 
-    Used like `CachedImages`. Raises ValueError when the caches' sensors or projections
+    Used like `CachedImages`; `scans` counts each once. Raises ValueError when the caches' sensors or projections
     differ; streets, which are cast into the sensor's rays, have none and suit any.
     """
 
@@ -129,7 +130,11 @@ class SeveralCaches:
                     f"{part.sensor.height} x {part.sensor.width} and {part.source.get('projection')}"
                 )
         self.sensor = first.sensor
-        named = " and ".join(f"{len(part):,} of {part.source['name']}" for part in self._parts)
+        places = [Path(folder).resolve() for folder in folders]
+        own, often = dict(zip(places, self._parts, strict=True)), Counter(places)
+        self.scans = sum(map(len, own.values()))
+        named = " and ".join(f"{len(part):,} of {part.source['name']}{f' ({n} x)' if (n := often[place]) > 1 else ''}"
+                             for place, part in own.items())  # fmt: skip
         self.source = {"name": f"several caches ({named})"} | ({"projection": projection} if projection else {})
 
     def __len__(self) -> int:

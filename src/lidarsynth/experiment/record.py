@@ -209,6 +209,10 @@ class Card:
     results: tuple[str, ...] = ()  # measured numbers with their command
     sensor: str = ""  # whose scans alone were seen last
     synthetic: bool = False  # whether these were streets, or insides of buildings, that nobody recorded
+    steps: int = within(0, 0)  # of `training.steps`, that the last run has done; 0: not told
+
+    def __post_init__(self):
+        check_ranges(self)
 
 
 @dataclass(frozen=True)

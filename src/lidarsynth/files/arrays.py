@@ -13,7 +13,16 @@ from typing import IO
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, SCALED, Fields, FileError, rings_of_grid, written_names
+from lidarsynth.files.fields import (
+    MAX_BYTES,
+    MAX_METRES,
+    SCALED,
+    Fields,
+    FileError,
+    check_names,
+    rings_of_grid,
+    written_names,
+)
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import from_dict
 
@@ -183,6 +192,7 @@ def unzip(data: bytes) -> dict[str, np.ndarray]:
             if not 1 <= len(members) <= 64 or sum(m.file_size for m in members) > MAX_BYTES:
                 raise FileError(f"expected 1 to 64 arrays of at most {MAX_BYTES} bytes in all, found {len(members)} "
                                 f"of {sum(m.file_size for m in members)}")  # fmt: skip
+            check_names([m.filename[:-4] for m in members])
             return {m.filename[:-4]: _member(archive, m) for m in members}
     except FileError:
         raise

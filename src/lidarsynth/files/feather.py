@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 
-from lidarsynth.files.fields import MAX_POINTS, Fields, FileError
+from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, check_names
 
 
 def read_feather(data: bytes) -> Fields:
@@ -22,6 +22,7 @@ def read_feather(data: bytes) -> Fields:
         table.validate()
         if table.num_rows > MAX_POINTS:
             raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {table.num_rows}")
+        check_names(table.column_names)
         numeric = [name for name in table.column_names if table[name].null_count == 0]
         arrays = {name: table[name].to_numpy() for name in numeric}
     except (pyarrow.ArrowException, ValueError, OSError, MemoryError) as error:

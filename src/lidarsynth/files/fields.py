@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -58,6 +58,12 @@ def find(fields: Fields, name: str) -> str | None:
     """The file's own name of our field `name` (a key of NAMES), or None."""
     lower = {key.lower(): key for key in reversed(list(fields))}
     return next((lower[usual] for usual in NAMES[name] if usual in lower), None)
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raises FileError where two fields of a file have one name: nobody knows which of them is meant."""
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise FileError(f"expected fields of different names, found {names.count(twice[0])} named {twice[0][:40]}")
 
 
 def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, int] | None = None) -> tuple[Scan, int]:

@@ -26,6 +26,7 @@ from lidarsynth.files.fields import (
 from lidarsynth.files.labels import label_path, read_labels, read_words, words_of
 from lidarsynth.files.whole_numbers import stray
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import whole_file
 
 READERS: dict[str, Callable[[bytes], Fields]] = {
@@ -136,6 +137,12 @@ def read_image(path: str | Path) -> RangeImage:
     data = _bytes(path)
     with naming(path):
         return arrays.image_of(arrays.unzip(data))
+
+
+def sensor_in(path: str | Path) -> Sensor | None:
+    """The sensor of an `.npz` that holds a range image, None of other files. Raises FileError as `read`."""
+    image = Path(path).suffix.lower() == ".npz" and holds_image(path)
+    return read_image(path).sensor if image else None
 
 
 def write(path: str | Path, scan: Scan | RangeImage) -> None:

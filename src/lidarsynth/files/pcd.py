@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_BYTES, MAX_POINTS, Fields, FileError, rings_of_grid, scan_table
+from lidarsynth.files.fields import MAX_BYTES, MAX_POINTS, Fields, FileError, check_names, rings_of_grid, scan_table
 from lidarsynth.files.lzf import decompress
 from lidarsynth.files.whole_numbers import typed
 from lidarsynth.lidar.scan import Scan
@@ -49,10 +49,9 @@ def read_pcd(data: bytes) -> Fields:
     header = read_header(data)
     columns = DECODERS[header.encoding](data[header.start :], header)
     named = zip(header.names, header.counts, columns, strict=True)
-    fields: Fields = {}
-    for name, count, column in named:
-        if count == 1 and name != "_":
-            fields.setdefault(name, column)
+    scalars = [(name, column) for name, count, column in named if count == 1 and name != "_"]  # _ is padding
+    check_names([name for name, _ in scalars])
+    fields: Fields = dict(scalars)
     if header.rows > 1 and (ring := rings_of_grid(fields, header.shape)) is not None:
         fields["ring"] = ring
     return fields

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, scan_table
+from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, check_names, scan_table
 from lidarsynth.files.whole_numbers import typed
 from lidarsynth.lidar.scan import Scan
 
@@ -50,8 +50,9 @@ def read_ply(data: bytes) -> Fields:
     vertex, before = elements[place], elements[:place]
     if vertex.has_list:
         raise FileError("expected one number per vertex property, found a list property in the element vertex")
-    if len(set(vertex.names)) < len(vertex.names) or not vertex.names:
-        raise FileError(f"expected distinct vertex properties, found {vertex.names[:8]}")
+    if not vertex.names:
+        raise FileError("expected properties of the element vertex, found none")
+    check_names(vertex.names)
     if encoding == "ascii":
         return _ascii(data[start:], vertex, sum(element.count for element in before))
     dtypes = {types: tuple(FORMATS[encoding] + TYPES[t] for t in types) for e in elements for types in e.order}

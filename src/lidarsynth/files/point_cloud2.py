@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, rings_of_grid
+from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, check_names, rings_of_grid
 
 # PointField.datatype -> numpy (ros2/common_interfaces, sensor_msgs/msg/PointField.msg)
 TYPES: dict[int, str] = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -90,10 +90,11 @@ def _dtype(fields: Sequence[PointField], step: int, order: str) -> np.dtype:
         if field.offset + kind.itemsize * max(int(field.count), 1) > step:
             raise FileError(f"expected the field {field.name} within the {step} bytes of a point, "
                             f"found it at {field.offset}")  # fmt: skip
-        if field.count <= 1 and field.name not in names:  # a count of 0 is taken for 1, as drivers do
+        if field.count <= 1:  # a count of 0 is taken for 1, as drivers do
             names.append(field.name)
             formats.append(kind)
             offsets.append(int(field.offset))
+    check_names(names)
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
 
 

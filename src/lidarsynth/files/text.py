@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from lidarsynth.files.fields import MAX_POINTS, NAMES, SCALED, Fields, FileError
+from lidarsynth.files.fields import MAX_POINTS, NAMES, SCALED, Fields, FileError, check_names
 from lidarsynth.files.whole_numbers import exact
 from lidarsynth.lidar.plural import plural
 
@@ -42,10 +42,9 @@ def read_text(data: bytes) -> Fields:
     table, words = _table(lines[start:], separator)
     if names is not None and len(names) != table.shape[1]:
         raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")
-    if names is not None and (twice := [name for name in names if names.count(name) > 1]):
-        raise FileError(f"expected columns of different names, found {names.count(twice[0])} named {twice[0]}")
     if names is None:
         return guessed(table)
+    check_names(names)
     return {name: exact(table[:, i], [row[i] for row in words]) for i, name in enumerate(names)}
 
 

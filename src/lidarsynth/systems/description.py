@@ -34,3 +34,10 @@ class Description:
     network: Callable[[Experiment], str]
     details: Callable[[Experiment], dict[str, str]]
     about: Callable[[Experiment], About]
+
+
+def training_line(experiment: Experiment) -> str:
+    """How long it was trained, or until where, and how."""
+    training, done = experiment.training, experiment.card.steps
+    stopped = f"stopped at {done:,} of " if 0 < done < training.steps else ""
+    return f"{stopped}{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}"

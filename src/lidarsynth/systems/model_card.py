@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lidarsynth.experiment.record import Card, Data, Experiment
 from lidarsynth.experiment.sensor import build_sensor
-from lidarsynth.systems.description import Description
+from lidarsynth.systems.description import Description, training_line
 
 LICENCES = {  # how a card's licence begins -> the hub's word for it
     "MIT": "mit",
@@ -48,15 +48,14 @@ def _metadata(licence: str, tags: Sequence[str]) -> str:
 
 def _table(experiment: Experiment, own: Mapping[str, str]) -> str:
     """Sensor, images, training, and between them the rows of the system's `own`."""
-    data, training, sensor = experiment.data, experiment.training, build_sensor(experiment)
+    data, sensor = experiment.data, build_sensor(experiment)
     reflectance = ", reflectance 0 to 1" if data.reflectance else ", no reflectance"
     rows = {
         "sensor": f"{sensor.name}, {sensor.height} beams from {sensor.elevations[0]:+.2f} to "
         f"{sensor.elevations[-1]:+.2f} degrees, {sensor.min_range:g} to {sensor.max_range:g} m",
         "images": f"{data.height} x {data.width}, {data.projection} projection, {data.codec} range{reflectance}",
         **own,
-        "training": f"{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}, "
-        f"seed {training.seed}",
+        "training": f"{training_line(experiment)}, seed {experiment.training.seed}",
         "augmentation": _augmentation(data),
     }
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows.items())])

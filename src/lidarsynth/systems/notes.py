@@ -37,6 +37,14 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
     return scan
 
 
+def made_by(scan: Scan | RangeImage, sensor: Sensor | str | None) -> tuple[Scan, Sensor | str | None]:
+    """The points of a scan or image, and the sensor that made them: of an image its own, unless one is named; None = to
+    be recognised."""
+    if isinstance(scan, Scan):
+        return scan, sensor
+    return scan.to_scan(), scan.sensor if sensor is None else sensor
+
+
 def stranger(model: Knows, scan: Scan, sensor: Sensor | str | None = None) -> str | None:
     """What a model that knows one sensor alone, or was tuned to one, has to say of another's scan, or None."""
     own = model.experiment.card.sensor if model.any_sensor else model.sensor.name

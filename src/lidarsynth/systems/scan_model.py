@@ -25,7 +25,7 @@ from lidarsynth.systems.filling import Filling, check_counts, whole
 from lidarsynth.systems.hub import push
 from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
-from lidarsynth.systems.notes import noted, stranger
+from lidarsynth.systems.notes import made_by, noted, stranger
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -190,13 +190,13 @@ class ScanModel(ABC):
         sensor's view or limits, are gone. Which ones is drawn from the seed.
 
         scan    points, as a scan or an array (N, 3) x y z; their reflectance does not matter
-        sensor  that the simulator plays; None = recognised from the points, or that of `into`
+        sensor  that the simulator plays; None = an image's own, else recognised from the points, or that of `into`
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
         """
-        scan, seed = noted(self, scan, sensor), checked_seed(seed)
+        made, seed = made_by(noted(self, scan, sensor), sensor), checked_seed(seed)
         with usual_torch():
-            return self.realised(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, seed).to_scan()
+            return self.realised(*made, seed).to_scan()
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`."""
@@ -213,7 +213,7 @@ class ScanModel(ABC):
         limits.
 
         scan    points, as a scan or an array (N, 3) x y z
-        sensor  that made the scan; None = recognised from the points, or that of `into`
+        sensor  that made the scan; None = an image's own, else recognised from the points, or that of `into`
         least   points of whose class the network is less sure get 0 too; 0 to 1
 
         Labels that it had are replaced. Raises ValueError for a model that has learned no classes, where no point is in
@@ -221,9 +221,9 @@ class ScanModel(ABC):
         """
         if not 0 <= least <= 1:
             raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
-        scan = noted(self, scan, sensor)
+        made = made_by(noted(self, scan, sensor), sensor)
         with usual_torch():
-            return self.named(scan.to_scan() if isinstance(scan, RangeImage) else scan, sensor, least).to_scan()
+            return self.named(*made, least).to_scan()
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`."""

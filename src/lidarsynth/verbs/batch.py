@@ -6,7 +6,7 @@ import errno
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
@@ -22,13 +22,13 @@ from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
-from lidarsynth.lidar.sensor import get_sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
 from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
-from lidarsynth.systems.any_sensor import IN_PYTHON
+from lidarsynth.systems.any_sensor import IN_PYTHON, AnySensorModel
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL, check_companions
@@ -52,7 +52,7 @@ class Job:
     model      as `load` takes it; not of project
     how        of complete and upsample; of realise its seed, scan i being drawn from seed + i
     corrupt    recipe to hide a part first, of complete
-    sensor     that made the scans, None = recognised
+    sensor     that made the scans, None = that of a range image, or recognised
     into       sensor of the result, of upsample
     least      confidence of new points of complete and upsample, of classes of label, None = all
     times      as many beams as the scan's own, of upsample; None = the model's own number
@@ -68,7 +68,7 @@ class Job:
     device: str = "cpu"
     how: Filling = field(default_factory=Filling)
     corrupt: str | None = None
-    sensor: str | None = None
+    sensor: str | Sensor | None = None
     into: str | None = None
     least: float | None = None
     times: int | None = None
@@ -173,6 +173,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     begun, warning = time.perf_counter(), None
     try:
         loaded = work.item.read()
+        if job.sensor is None and (job.verb != "complete" or isinstance(model, AnySensorModel)):
+            job = replace(job, sensor=loaded.sensor)  # other models complete any sensor's scans in their own images
         with_points(loaded.scan, str(work.item.path))
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         warning = warning or _viewpoint_warning(job, work)

@@ -172,7 +172,7 @@ def upsample_scan(
     return Filled(filled, drawn, {}, scan)
 
 
-def named_sensor(scan: Scan, path: Path, flag: str, given: str | None, own: Sensor | None = None) -> Sensor:
+def named_sensor(scan: Scan, path: Path, flag: str, given: Sensor | str | None, own: Sensor | None = None) -> Sensor:
     """The sensor of a scan file: the given one, else as recognised, else a model's `own` where the points lie on its
     beams. Raises ValueError that asks for the flag."""
     if given is None:

@@ -15,8 +15,9 @@ from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
+from lidarsynth.systems.description import training_line
 from lidarsynth.systems.table import build_network, system_of
-from lidarsynth.verbs.file_kinds import file_lines, moves
+from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading
 from lidarsynth.weights.load import load_parts, shipped
 
@@ -29,7 +30,7 @@ def describe(what: str, reading: Reading | None = None) -> str:
     path, reading = Path(what), reading or Reading()
     if lines := file_lines(path, reading):
         return _table(str(path), lines)
-    if moves(reading):
+    if reading.moves:
         raise ValueError(f"{what}: expected a scan to move or take rings of, found a word, a sensor or a model")
     if what in WORDS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
@@ -59,7 +60,7 @@ def describe_sensor(sensor: Sensor) -> str:
 
 def describe_model(experiment: Experiment, network, source: str) -> str:
     """Network, sensor, diffusion, training, licence, history and results of a model."""
-    data, training, system = experiment.data, experiment.training, system_of(experiment)
+    data, system = experiment.data, system_of(experiment)
     if experiment.model.network in WITHOUT_WEIGHTS:
         return _table(experiment.name, system.description.details(experiment))
     sensor = data.sensor if isinstance(data.sensor, str) else data.sensor.get("name", "own")
@@ -70,7 +71,7 @@ def describe_model(experiment: Experiment, network, source: str) -> str:
         "network": system.description.network(experiment),
         "images": f"{data.height} x {data.width}, {sensor}, {data.projection} projection, {data.codec} range",
         **system.description.details(experiment),
-        "training": f"{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}",
+        "training": training_line(experiment),
     }
     card = experiment.card
     lines |= {k: v for k, v in {"learned from": card.data, "licence": card.licence}.items() if v}

@@ -16,7 +16,7 @@ from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
-from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report
+from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report, sensor_in
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.ground import LEANING, stance
 from lidarsynth.lidar.plural import plural
@@ -30,11 +30,6 @@ from lidarsynth.verbs.viewpoint import viewpoint_note
 
 Lines = dict[str, str]
 LOOKED_AT = 400  # packets of a capture that are counted
-
-
-def moves(reading: Reading) -> bool:
-    """Whether points are to be moved, or some rings of them taken."""
-    return reading.transform is not None or reading.rings is not None
 
 
 def file_lines(path: Path, reading: Reading) -> Lines | None:
@@ -58,13 +53,13 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
         if not (path / INDEX).exists():
             return _folder(path, reading)
     if path.name.lower().endswith(tuple(READERS)):
-        placed = {} if moves(reading) or (note := viewpoint_note(path)) is None else {"viewpoint": note}
+        placed = {} if reading.moves or (note := viewpoint_note(path)) is None else {"viewpoint": note}
         return _image(path) | _scan_file(path, reading) | placed
     if is_bag(path):
         return _bag(path, reading)
     if is_capture(path):
         return _capture(path, reading)
-    if moves(reading):
+    if reading.moves:
         raise FileError(f"{path}: expected a scan to move or take rings of, found another kind of file or folder")
     if path.is_dir():
         return _cache(path)
@@ -91,8 +86,10 @@ def _image(path: Path) -> Lines:
 
 def _scan_file(path: Path, reading: Reading) -> Lines:
     """Of a scan; also of one without intensities, for which other verbs want to be told that."""
+    own = None if reading.moves else sensor_in(path)
+    told = {} if own is None else {"sensor": f"{own.name} (the file holds it)"}
     try:
-        return scan_lines(*read_with_report(path, rings=reading.rings), reading)
+        return scan_lines(*read_with_report(path, rings=reading.rings), reading) | told
     except FileError as error:
         if "--intensity none" not in str(error):
             raise
@@ -191,7 +188,7 @@ def _folder(path: Path, reading: Reading) -> Lines:
     streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
     if not files and not streams:
         raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
-    if not files and moves(reading):
+    if not files and reading.moves:
         raise FileError(f"{path}: expected a scan to move or take rings of, found bags and captures: name one of them")
     if not files:
         listed = ", ".join(p.name for p in streams[:6]) + (", ..." if len(streams) > 6 else "")

@@ -16,10 +16,11 @@ from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
-from lidarsynth.files.formats import READERS, read_with_report
+from lidarsynth.files.formats import READERS, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST, check_regular
 
 FARTHEST = 1e9  # metres; no two frames on Earth are as far apart, and points there still have squares in float32
@@ -44,6 +45,11 @@ class Reading:
     labels: bool = False
     rings: tuple[int, int] | None = None
 
+    @property
+    def moves(self) -> bool:
+        """Whether points are to be moved, or some rings of them taken."""
+        return self.transform is not None or self.rings is not None
+
 
 @dataclass(frozen=True)
 class Loaded:
@@ -55,6 +61,7 @@ class Loaded:
     dropped  points without a return, or not finite
     scale    what a reflectance of 1 is in the intensities of a message
     stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
+    sensor   of a range image, whose points were not moved and are on all of its beams; else None
     """
 
     scan: Scan
@@ -64,6 +71,7 @@ class Loaded:
     stamp: int = 0
     frame_id: str = ""
     time: int = 0
+    sensor: Sensor | None = None
 
 
 class Input(Protocol):
@@ -88,9 +96,8 @@ class FileInput:
         """The scan. Raises FileError."""
         words = label_path(self.path) if self.reading.labels else None
         words = words if words is not None and words.is_file() else None
-        return _loaded(
-            *read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings), self.reading
-        )
+        read = read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings)
+        return replace(_loaded(*read, self.reading), sensor=None if self.reading.moves else sensor_in(self.path))
 
 
 @dataclass(frozen=True)

@@ -258,7 +258,7 @@ def _flat(record: dict) -> dict:
 def _with_history(experiment: Experiment, step: int, accelerator: Accelerator) -> Experiment:
     device = torch.cuda.get_device_name() if accelerator.device.type == "cuda" else accelerator.device.type
     line = f"{step:,} steps of {experiment.training.batch_size} on {accelerator.num_processes} x {device}"
-    return replace(experiment, card=replace(experiment.card, history=(*experiment.card.history, line)))
+    return replace(experiment, card=replace(experiment.card, history=(*experiment.card.history, line), steps=step))
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 
+from lidarsynth.data.dataset import SeveralCaches
 from lidarsynth.data.index import PLACE, read_index
 from lidarsynth.experiment.record import Card
 from lidarsynth.lidar.small_file import read_json
@@ -32,7 +33,10 @@ class Start:
 
 def start_of(images: TrainingImages, data: str | Path, weights: str | None) -> Start:
     """Of open images, and the words of them and of the weights. Raises ValueError where `data` is no cache."""
-    count = "endless" if isinstance(images, Streets) else f"{len(images):,}"
+    if isinstance(images, Streets):
+        count = "endless"
+    else:
+        count = f"{images.scans if isinstance(images, SeveralCaches) else len(images):,}"
     details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
     words = ", ".join([f"{count} images of {images.source['name']}", *details])
     return Start(words, "" if isinstance(images, Streets) else _fingerprint(data), weights)
@@ -61,7 +65,8 @@ def check_start(out: Path, start: Start, card: Card) -> str:
         found = Start(**read_json(out / START))
     except TypeError:  # made by other hands
         raise ValueError(f"{out / START}: expected what a run began with, found another table") from None
-    if (found.images, found.fingerprint) != (start.images, start.fingerprint):
+    same = found.fingerprint == start.fingerprint and (start.fingerprint or found.images == start.images)
+    if not same:  # words have not always counted the scans of several caches once
         was, given = ((f"{s.images} ({s.fingerprint})" if s.fingerprint else s.images) for s in (found, start))
         raise ValueError(_other(out, was, given))
     if start.weights not in (None, found.weights):
@@ -72,10 +77,16 @@ def check_start(out: Path, start: Start, card: Card) -> str:
 
 def _check_card(out: Path, start: Start, card: Card) -> str:
     was, given = (words.partition(", ")[0] for words in (card.data.rpartition("; ")[2], start.images))
-    if was and was != given:
+    if was and _counted_by_cache(was) != _counted_by_cache(given):
         raise ValueError(_other(out, was, given))
     return f"--from {start.weights} is not used: the run in {out} goes on" if start.weights else ""
 
 
 def _other(out: Path, was: str, given: str) -> str:
     return f"{out}: expected its own run, which learns from {was}, found {given}; another folder begins a new run"
+
+
+def _counted_by_cache(words: str) -> str:
+    """What tells images apart by their words: of several caches not their sum, which once counted scans as shown."""
+    _, several, named = words.partition(" images of several caches ")
+    return several + named or words
