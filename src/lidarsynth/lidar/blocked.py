@@ -54,9 +54,9 @@ def _empty_runs(empty: np.ndarray) -> list[tuple[int, int]]:
 
 
 def places(seen: np.ndarray) -> float:
-    """Of how many places scans tell, `seen` as in `blocked_runs`: 1 of a sensor that stands, nearly as many as there are
-    of one that was elsewhere each time. Each counts by what its lost rays do not share with those of the scan before,
-    by their correlation within rows."""
+    """Of how many places scans tell, `seen` as in `blocked_runs`: about 1 of a sensor that stands, nearly as many as
+    there are of one that was elsewhere each time. Each counts by what its lost rays do not share with those of the scan
+    before, by their correlation within rows."""
     total, before = 1.0, None
     for mask in seen:
         now = mask - mask.mean(axis=1, keepdims=True, dtype=np.float32)

@@ -22,7 +22,8 @@ SOME = 30_000  # of a scan tell what its rings are
 # For scans without rings, the least `share_on_beams`. Of train scans and streets of seven sensors it is 0.98 and more,
 # with a carrier's 10 m/s taken out mostly above 0.22; for 400 random sensors of nobody at most 0.17.
 POINTWISE = 0.25
-LAYERED = 0.02  # of the variance of directions, that rings explain; of a Livox it is 0.001, of known sensors 0.5 and more
+LAYERED = 0.02  # of the variance of directions, what rings explain: of a Livox 0.001, of spinning sensors 0.8 and more
+LEARN = "lidarsynth sensor SCANS --out my.toml"
 EVERYWHERE = "rings that each look everywhere, as of a sensor that does not spin (Livox), which no model here knows"
 
 
@@ -51,11 +52,10 @@ def recognise(
         name, other = _by_rings(scan.xyz, ring, INVERTED, whole=True)  # type: ignore[arg-type]
         reason = reason if name is None else other
     if name is None:
-        beams = scan.ring if scan.ring is not None else ring if told else rings_by_elevation(scan.xyz)
-        if scan.ring is not None and not layers(scan.xyz, scan.ring):
-            reason, beams = EVERYWHERE, None
-        way = "" if beams is None else ", or learn it: lidarsynth sensor SCANS --out my.toml"
-        reason = f"expected the beams of {', '.join(known)}, found {reason}: name the sensor with --sensor{way}"
+        spins = scan.ring is None or layers(scan.xyz, scan.ring)
+        beams = ring is not None or rings_by_elevation(scan.xyz) is not None
+        way = ": name the sensor with --sensor" + (f", or learn it: {LEARN}" if beams else "")
+        reason = f"expected the beams of {', '.join(known)}, found {reason + way if spins else EVERYWHERE}"
     return name, where + reason
 
 

@@ -26,8 +26,8 @@ MARGIN = 1.0  # degrees
 OUTSIDE, BELOW = 0.04, 0.25
 LOWEST = 0.002  # of the points are left out to find the lowest
 FEW = 5  # points: a ring that has fewer is a wrong number
-# Least `share_on_beams` of points that no rings tell of: of maps at most 0.05, of train scans 0.98, and with a carrier's
-# 25 m/s taken out 0.08.
+# Least `share_on_beams` of points that no rings tell of: of maps at most 0.05, of train scans 0.98 and more, with a
+# carrier's 25 m/s taken out 0.08.
 BETWEEN = 0.06
 BESIDE = "them between its beams as often as on them, as of a map, or of a sensor that does not spin"
 MISCOUNTED = 1.25  # as many rings may be counted by the points' order alone
