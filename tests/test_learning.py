@@ -17,6 +17,7 @@ from lidarsynth.lidar.learning import learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, read_sensor
+from lidarsynth.lidar.unseen import caution
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.verbs.description import describe_sensor
 from lidarsynth.verbs.inputs import Inputs, Loaded
@@ -155,6 +156,19 @@ def test_sky_at_the_end_of_a_street_is_no_carrier():
     below = blocked_runs(seen, np.array([-8.0, -9.0, -10.0, -11.0]))
     assert below == ((1, 10, 29), (2, 990, 3), (3, 500, 519)), "rays at the ground return"
     assert (3, 500, 519) not in blocked_runs(seen, np.array([-8.0, -9.0, -10.0, -11.0]), (8.0, 0.0)), "not if tilted"
+
+
+def test_a_sensor_that_looks_ahead_is_learned_so():
+    sensor = Sensor("ahead", tuple(np.linspace(8.0, -16.0, 16).tolist()), 600, 0.3, 100.0)
+    streets = SyntheticStreets(seed=3, length=200, sensor=sensor)
+    scans = [streets[16 * i] for i in range(7)]
+    ahead = [scan[np.abs(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0])) < np.pi / 3] for scan in scans]
+    found = learn_sensor(ahead, "ahead").sensor
+    aside = np.abs(found.ray_angles()[1])
+    assert found.blocked_rays()[aside > np.pi / 3 + 0.01].mean() > 0.8
+    assert not found.blocked_rays()[aside < np.pi / 3 - 0.01].any()
+    assert "hardly any in 2" in str(caution(ahead[0], replace(found, blocked=()))) and caution(ahead[0], found) is None
+    assert found.min_range <= 1, "what stands nearer than anything in these scans is seen, too"
 
 
 def test_a_street_hides_no_ray():

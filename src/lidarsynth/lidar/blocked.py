@@ -1,4 +1,4 @@
-"""Which rays of a sensor end on its carrier: those that never return, wherever it goes."""
+"""Which rays of a sensor end on its carrier, or are none of its own: those that never return, wherever it goes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 SCANS = 5  # what never returned in fewer scans may have looked at the sky
 RUN = 0.008  # of a turn: shorter runs are chance
-ROW = 0.5  # of a row must have returned
+ROW = 0.5  # of a row must have returned, within the view of the sensor around
 CHANCE = 1e-3  # that what is not blocked never returned in so many places
 # Degrees: rays that look higher may meet nothing wherever a street leads; of these only runs whose edges stand still
 # are believed, where in this share of a turn beside them returns are at least half of what is usual for the row.
@@ -28,9 +28,11 @@ def blocked_runs(
     if len(seen) < SCANS:
         return ()
     returned, width = seen.mean(axis=0), seen.shape[2]
-    many, raised, near = places(seen), float(np.hypot(*tilt)), np.arange(1, max(round(BESIDE * width), 3) + 1)
+    view = seen.any(axis=(0, 1))  # of a sensor that looks ahead only, columns behind it never return
+    many, raised = places(seen[:, :, view]), float(np.hypot(*tilt))
+    near = np.arange(1, max(round(BESIDE * width), 3) + 1)
     runs = []
-    for row in np.flatnonzero((returned > 0).mean(axis=1) > ROW):
+    for row in np.flatnonzero((returned[:, view] > 0).mean(axis=1) > ROW):
         share = returned[row]
         usual = float(share[share > 0].mean())
         high = elevations[row] > LEVEL - raised

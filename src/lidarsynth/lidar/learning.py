@@ -95,7 +95,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         name=name,
         elevations=elevations,
         width=width,
-        min_range=round(max(float(np.floor(min(d[0] for d in depths) * 10) / 10), 0.0), 1),
+        min_range=min(round(max(float(np.floor(min(d[0] for d in depths) * 10) / 10), 0.0), 1), Sensor.min_range),
         max_range=float(np.ceil(max(d[1] for d in depths) / 5) * 5),
         offsets=heights if any(abs(height) > 0.005 for height in heights) else (),
         mount=mount,

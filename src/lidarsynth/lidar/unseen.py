@@ -28,7 +28,7 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
     if 0 < len(scan) < SPARSE:
         said.append(f"expected a turn of a sensor, found {plural(len(scan), 'point')}: most of what is put between is "
                     "a guess; of default's a least confidence of 0.5 leaves most out")  # fmt: skip
-    elif len(scan) and (wide := widest_gap(scan.xyz)) > WIDE:
+    elif len(scan) and (wide := widest_gap(scan.xyz)) > WIDE + _never_seen(sensor):
         said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there is "
                     "a guess; of default's a least confidence of 0.5 leaves most out, repaint draws one")  # fmt: skip
     if (turns := several_turns(scan)) is not None:
@@ -36,6 +36,12 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
     if sensor is not None and (strays := stray_rings(scan, sensor)) is not None:
         said.append(strays)
     return "; ".join(said) or None
+
+
+def _never_seen(sensor: Sensor | None) -> float:
+    """Degrees of the turn in which half of a sensor's rays or more are said to be blocked, so that hardly anything is put
+    there, as of one that looks ahead only."""
+    return 0.0 if sensor is None else 360 * float((sensor.blocked_rays().mean(axis=0) >= 0.5).mean())
 
 
 def widest_gap(xyz: np.ndarray) -> int:

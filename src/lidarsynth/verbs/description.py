@@ -56,7 +56,7 @@ def describe_sensor(sensor: Sensor) -> str:
     if any(sensor.tilt):
         lines["tilt"] = f"nose {sensor.tilt[0]:+g} and left side {sensor.tilt[1]:+g} degrees up"
     if sensor.blocked:
-        lines["blocked"] = f"{sensor.blocked_rays().mean():.1%} of the rays, by its carrier"
+        lines["blocked"] = f"{sensor.blocked_rays().mean():.1%} of the rays, by its carrier or out of its view"
     return _table(sensor.name, lines)
 
 
