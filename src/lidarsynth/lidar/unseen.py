@@ -39,8 +39,8 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
 
 
 def _never_seen(sensor: Sensor | None) -> float:
-    """Degrees of the turn in which half of a sensor's rays or more are said to be blocked, so that hardly anything is put
-    there, as of one that looks ahead only."""
+    """Degrees of the turn in which half of a sensor's rays or more are said to be blocked, as behind one that looks
+    ahead: hardly anything is put there."""
     return 0.0 if sensor is None else 360 * float((sensor.blocked_rays().mean(axis=0) >= 0.5).mean())
 
 
