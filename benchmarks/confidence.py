@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.folder import scan_files
-from lidarsynth.experiment.folder import RECORD
+from lidarsynth.experiment.record import RECORD
 from lidarsynth.files.formats import read
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.systems.cascade.calibration import calibrated, held_out, judged, with_confidence

@@ -224,6 +224,14 @@ def test_errors_are_over_hidden_pixels_with_empty_ones_as_zero():
     assert errors["left empty"].reflectance_mae == pytest.approx(0.25)
 
 
+def test_a_scan_without_reflectance_is_judged_by_range_alone(model: LidarModel):
+    scan = room(SENSORS["hdl-64e-kitti"].resized(width=256))
+    errors = complete_scan(model, replace(scan, reflectance=np.zeros(len(scan), np.float32)), "beams:2").errors
+    assert all(math.isnan(e.reflectance_mae) and math.isnan(e.reflectance_rmse) for e in errors.values())
+    assert all(e.range_mae > 0 for e in errors.values())
+    assert not math.isnan(complete_scan(model, scan, "beams:2").errors["nearest"].reflectance_mae)
+
+
 def test_interpolation_works_in_metres_and_cuts_overshoots():
     truth = image(np.array([[10.0] * 8, [0.0] * 8, [0.0] * 8, [40.0] * 8]))
     known = np.zeros((4, 8), bool)

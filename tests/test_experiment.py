@@ -11,9 +11,9 @@ from networks import trained
 from safetensors.torch import load_file, save_file
 
 from lidarsynth.experiment.eight_bits import SCALE
-from lidarsynth.experiment.folder import WEIGHTS, read_experiment, save
+from lidarsynth.experiment.folder import read_experiment, save
 from lidarsynth.experiment.presets import PRESETS, preset
-from lidarsynth.experiment.record import Data, Training, from_dict, with_fields
+from lidarsynth.experiment.record import WEIGHTS, Data, Training, from_dict, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import SENSORS, get_sensor
 from lidarsynth.systems.diffusion.build import build_denoiser

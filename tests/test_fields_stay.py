@@ -147,7 +147,15 @@ def test_the_widest_gap_of_a_turn(turn: np.ndarray, wide: int):
     angle = np.radians(turn + 0.5)
     xyz = np.stack([9 * np.cos(angle), 9 * np.sin(angle), 0 * angle], 1).astype(np.float32)
     assert widest_gap(xyz) == wide
-    assert (caution(Scan(xyz)) is None) == (wide < 45)
+    many = np.concatenate([xyz * np.float32(scale) for scale in np.arange(1, 11)])
+    assert (caution(Scan(many)) is None) == (wide < 45)
+
+
+def test_hardly_any_points_are_told_to_be_a_guess():
+    rng = np.random.default_rng(0)
+    xyz = rng.normal(0, 10, (600, 3)).astype(np.float32)
+    assert caution(Scan(xyz)) is None
+    assert "found 40 points: most of what is put between is a guess" in str(caution(Scan(xyz[:40])))
 
 
 def test_stray_points_do_not_fill_a_gap_and_old_ones_do_not_hide_it():

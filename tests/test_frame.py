@@ -13,7 +13,7 @@ from lidarsynth.lidar.crowding import stand_of_beams
 from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed, turns_left
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
-from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.recognition import elevations_of, recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import INVERTED, SENSORS, get_sensor
 from lidarsynth.lidar.view import misfit
@@ -122,12 +122,34 @@ def test_points_that_a_named_sensor_could_not_see():
     assert "outside its view of -30.7 to +10.7" in str(misfit(raised, SENSORS["hdl-32e"]))
     level = scan.xyz[np.abs(scan.xyz[:, 2]) < 0.1 * np.hypot(scan.xyz[:, 0], scan.xyz[:, 1])]
     assert "lowest beams of 32" in str(misfit(level, SENSORS["hdl-32e"]))
-    ring = np.arange(len(scan)) % 32
+    ring = np.argsort(np.argsort(-elevations_of(scan.xyz))) * 32 // len(scan)
     assert misfit(scan.xyz, SENSORS["hdl-32e"], ring) is None
     ring[:4] = 40  # a few wrong numbers are no other sensor
     assert misfit(scan.xyz, SENSORS["hdl-32e"], ring) is None
     two = np.concatenate([scan.xyz, scan.xyz]), np.concatenate([ring, ring + 64])
     assert "on 64 rings, more than its 32 beams" in str(misfit(two[0], SENSORS["hdl-32e"], two[1]))
+
+
+def test_points_on_no_beams_are_no_named_sensors():
+    """Of a map, and of a sensor that does not spin, in whose view they may lie."""
+    scan = street("hdl-32e", rings=False)
+    rng = np.random.default_rng(0)
+    away = rng.uniform(-0.5, 0.5, len(scan)) * 4 / 3  # degrees, the beams' spacing
+    rho = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1])
+    between = scan.xyz.copy()
+    between[:, 2] = rho * np.tan(np.radians(elevations_of(scan.xyz) + away))
+    between = between[rng.permutation(len(between))]
+    assert "between its beams as often as on them" in str(misfit(between, SENSORS["hdl-32e"]))
+    line = np.arange(len(between)) % 6
+    assert "look everywhere" in str(misfit(between, SENSORS["hdl-32e"], line))
+    shuffled = scan.xyz[rng.permutation(len(scan))]
+    assert misfit(shuffled, SENSORS["hdl-32e"]) is None
+
+
+def test_the_transform_that_is_offered_has_no_digits_of_noise():
+    frame = check_frame(moved(street("hdl-32e"), parse_transform("1.2:0.1:1.9:0:3:0")))
+    way = str(frame.warning()).partition("--transform ")[2]
+    assert "e" not in way and len(way) <= len("-1.200:-0.100:-1.900:0:-3.000:0") and "-3" in way
     turn = street("hdl-64e-kitti", rings=False).xyz  # one ring after the other, which nobody has numbered
     assert "rings, more than its 32 beams" in str(misfit(turn, SENSORS["hdl-32e"]))
     some = [beam for beam in range(64) if beam % 16 != 8]

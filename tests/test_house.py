@@ -268,6 +268,14 @@ def test_help_does_not_import_torch():
     assert not read & {"torch", "numpy", "PIL", "tqdm.auto", "safetensors", "einops", "typeguard"}
 
 
+def test_what_a_file_is_is_said_without_torch(tmp_path: Path):
+    """Which takes seconds to import, and no scan, sensor or bag needs it."""
+    (tmp_path / "own.toml").write_text("beams = 4\ntop = 3.0\nbottom = -3.0\n")
+    done = run_python("-X", "importtime", "-m", "lidarsynth", "info", str(tmp_path / "own.toml"))
+    assert done.returncode == 0 and "4 from +3.00 to -3.00 degrees" in done.stdout
+    assert "| torch" not in done.stderr
+
+
 def cpu_seconds(*arguments: str) -> float:
     """Processor time of one Python process: what a clock shows on an idle machine, whoever else works on this one."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -11,11 +11,13 @@ from test_recognise import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write
+from lidarsynth.lidar.blocked import blocked_runs
 from lidarsynth.lidar.frame import check_frame
-from lidarsynth.lidar.learning import blocked_runs, learn_sensor
+from lidarsynth.lidar.learning import learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, read_sensor
+from lidarsynth.lidar.unseen import caution
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.verbs.description import describe_sensor
 from lidarsynth.verbs.inputs import Inputs, Loaded
@@ -127,13 +129,52 @@ def test_beams_are_found_without_rings():
         learn_sensor([Scan(cloud)], "own")
 
 
+def looks(scans: int, moves: bool = True) -> np.ndarray:
+    """(scans, 4, 1000) of scattered returns: row 0 sees only sky, rows 1 and 2 have a carrier; one that does not move
+    loses nearly the same rays each time."""
+    rng = np.random.default_rng(0)
+    seen = rng.random((scans, 4, 1000)) < 0.8
+    seen = seen if moves else seen[:1] ^ (rng.random((scans, 4, 1000)) < 0.01)
+    seen[:, 1, 10:30] = seen[:, 2, 990:] = seen[:, 2, :4] = seen[:, 0] = seen[:, 3, 50] = False
+    seen[-1, 2, 989] = seen[-1, 2, 4] = True
+    return seen
+
+
 def test_blocked_rays_are_runs_that_may_wrap():
-    returned = np.full((4, 1000), 0.8)
-    returned[1, 10:30] = returned[2, 990:] = returned[2, :4] = 0
-    returned[0] = 0  # only sky
-    returned[3, 50] = 0  # chance
-    assert blocked_runs(returned, 9) == ((1, 10, 29), (2, 990, 3))
-    assert blocked_runs(returned, 2) == (), "too few scans to tell"
+    down = np.array([-8.0, -9.0, -10.0, -11.0])
+    assert blocked_runs(looks(9), down) == ((1, 10, 29), (2, 990, 3))
+    assert blocked_runs(looks(9), down + 8) == ((1, 10, 29), (2, 990, 3)), "its edges stand still"
+    assert blocked_runs(looks(4), down) == (), "too few scans to tell"
+    assert blocked_runs(looks(9, moves=False), down) == (), "all of one place"
+
+
+def test_sky_at_the_end_of_a_street_is_no_carrier():
+    seen = looks(9)
+    for number, one in enumerate(seen):  # an opening that is never narrower than 20 columns, and mostly wider
+        one[3, 500 - 7 * number : 520 + 7 * ((number * 5) % 9)] = False
+    assert blocked_runs(seen, np.array([3.0, 2.0, 1.0, 0.0])) == ((1, 10, 29), (2, 990, 3))
+    below = blocked_runs(seen, np.array([-8.0, -9.0, -10.0, -11.0]))
+    assert below == ((1, 10, 29), (2, 990, 3), (3, 500, 519)), "rays at the ground return"
+    assert (3, 500, 519) not in blocked_runs(seen, np.array([-8.0, -9.0, -10.0, -11.0]), (8.0, 0.0)), "not if tilted"
+
+
+def test_a_sensor_that_looks_ahead_is_learned_so():
+    sensor = Sensor("ahead", tuple(np.linspace(8.0, -16.0, 16).tolist()), 600, 0.3, 100.0)
+    streets = SyntheticStreets(seed=3, length=200, sensor=sensor)
+    scans = [streets[16 * i] for i in range(7)]
+    ahead = [scan[np.abs(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0])) < np.pi / 3] for scan in scans]
+    found = learn_sensor(ahead, "ahead").sensor
+    aside = np.abs(found.ray_angles()[1])
+    assert found.blocked_rays()[aside > np.pi / 3 + 0.01].mean() > 0.8
+    assert not found.blocked_rays()[aside < np.pi / 3 - 0.01].any()
+    assert "hardly any in 2" in str(caution(ahead[0], replace(found, blocked=()))) and caution(ahead[0], found) is None
+    assert found.min_range <= 1, "what stands nearer than anything in these scans is seen, too"
+
+
+def test_a_street_hides_no_ray():
+    sensor = Sensor("own", tuple(np.linspace(40.0, -16.0, 29).tolist()), 600, 0.3, 60.0)
+    streets = SyntheticStreets(seed=3, length=100, sensor=sensor)
+    assert learn_sensor([streets[16 * i] for i in range(6)], "own").sensor.blocked == ()
 
 
 def test_what_is_blocked_is_described():

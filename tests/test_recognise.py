@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from lidarsynth.files.formats import read
+from lidarsynth.lidar.learning import learn_sensor
 from lidarsynth.lidar.own_beams import own_beams, stray_rings
-from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order, same_kind
+from lidarsynth.lidar.recognition import elevations_of, layers, recognise, rings_in_order, same_kind
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import GRIDS, INVERTED, SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
@@ -92,6 +93,23 @@ def test_an_unknown_sensor_is_asked_for_in_one_line():
         assert name is None
         assert reason.startswith("scan.pcd: expected the beams of hdl-64e") and "--sensor" in reason
         assert "\n" not in reason and "+40.0 to -30.0" in reason
+        assert reason.endswith("or learn it: lidarsynth sensor SCANS --out my.toml")
+
+
+def test_the_lines_of_a_sensor_that_does_not_spin_are_no_rings():
+    """As a Livox numbers its lasers, each of which looks everywhere."""
+    scan = turn(SENSORS["os1-64"], rings=False)
+    rng = np.random.default_rng(0)
+    petals = scan[rng.permutation(len(scan))]
+    for lines in (4, 6):
+        line = Scan(petals.xyz, petals.reflectance, ring=np.arange(len(petals)) % lines)
+        name, reason = recognise(line)
+        assert name is None and "look everywhere, as of a sensor that does not spin (Livox)" in reason
+        assert "learn it" not in reason
+        with pytest.raises(ValueError, match="rings that are beams, found rings that each look everywhere"):
+            learn_sensor([line], "own")
+    assert all(layers(turn(sensor).xyz[:, axes], turn(sensor).ring)
+               for sensor in SENSORS.values() for axes in ([0, 1, 2], [2, 0, 1], [1, 2, 0]))  # fmt: skip
 
 
 def test_points_of_no_spinning_sensor_are_asked_for():

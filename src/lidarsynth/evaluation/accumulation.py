@@ -18,7 +18,7 @@ from lidarsynth.data.kitti360 import SPLITS
 from lidarsynth.evaluation.image_sets import ImageSet
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Network
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
-from lidarsynth.experiment.folder import WEIGHTS
+from lidarsynth.experiment.record import WEIGHTS
 from lidarsynth.metrics.point_sets import spread
 from lidarsynth.networks.pointnet import read_pointnet
 from lidarsynth.networks.rangenet import RangeNet

@@ -11,11 +11,10 @@ from safetensors.torch import save as serialized
 from torch import nn
 
 from lidarsynth.experiment.eight_bits import packed
-from lidarsynth.experiment.record import Experiment, from_dict
+from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment, from_dict
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import whole_file
 
-WEIGHTS, RECORD = "model.safetensors", "experiment.json"
 OWN = ("likeliest.", "observer.")  # how the weights begin that a model with a base does not share with it
 CLASSES = "classes."  # and those that it may have of its own
 OWN_PARTS = ("likeliest", "likeliest_blocks", "observer_channels", "own_classes")  # what a record says of them

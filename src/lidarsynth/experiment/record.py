@@ -9,6 +9,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from lidarsynth.experiment.ranges import check_ranges, within
 
+WEIGHTS, RECORD = "model.safetensors", "experiment.json"  # the files of a model's folder
+
 
 @dataclass(frozen=True)
 class Data:

@@ -141,7 +141,7 @@ def check_metres(far: np.ndarray) -> None:
     returns = far[far > 0]
     if returns.size and (half := float(np.median(returns))) > MEDIAN:
         raise FileError(f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "
-                        "centimetres, or coordinates of a map?")  # fmt: skip
+                        "centimetres, millimetres or coordinates of a map?")  # fmt: skip
 
 
 def on_rings(fields: Fields, first: int, last: int) -> Fields:

@@ -61,7 +61,7 @@ class Frame:
         found = [*self.faults, *self.hints]
         if not found:
             return None
-        way = ":".join(f"{v:.4g}" for v in pose_of(self.transform))
+        way = ":".join(f"{round(v, 3) + 0.0:.4g}" for v in pose_of(self.transform))
         return f"expected points in the sensor's frame (x forward, z up), found them {', '.join(found)}: " \
                f"try --transform {way}"  # fmt: skip
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarsynth.lidar.blocked import blocked_runs
 from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
 from lidarsynth.lidar.ground import is_above, lowest_plane
 from lidarsynth.lidar.motion import straighten
-from lidarsynth.lidar.recognition import recognise, rings_in_order
+from lidarsynth.lidar.recognition import EVERYWHERE, layers, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
@@ -28,9 +29,6 @@ HALVED = 0.5  # of the residual: heights that explain less are bent rings of a m
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
 SPLIT = 0.2  # of the scans: so many that have other rings than the others are no chance
 ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
-BLOCKED_SCANS = 5  # what never returned in fewer scans may have looked at the sky
-BLOCKED_RUN = 0.008  # of a turn: shorter runs are chance
-BLOCKED_ROW = 0.5  # a row must return at least this often elsewhere
 
 
 @dataclass(frozen=True)
@@ -68,8 +66,8 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     Beams are fitted over all scans, z = tan(e) rho + h, with h = 0 unless heights halve the residual; a row's height is
     the neighbours' where its own points cannot tell it. Rings of one beam are one row. Columns come from the azimuths'
     steps, mount and tilt from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what
-    never returned in five scans or more. Raises ValueError without rings, with too few points, or where most beams are
-    wider than SMEARED.
+    never returned in five scans or more, of several places. Raises ValueError without rings, with too few points, or
+    where most beams are wider than SMEARED.
     """
     kept, left, split = _alike(scans)
     points = _pooled(kept)
@@ -87,25 +85,26 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     _check_sharp(rings, merged, kept[0][0], guessed)
     kept = [(scan, row_of[ring]) for scan, ring in kept]
     width = max(round(2 * np.pi / float(np.median(steps))), 4)
-    returned = _returned(kept, width, len(rings))
+    seen = _seen(kept, width, len(rings))
     order = np.argsort([-ring.elevation for ring in rings])
-    rings, returned = [rings[i] for i in order], returned[order]
+    rings, seen = [rings[i] for i in order], seen[:, order]
     heights = tuple(round(ring.height, 3) for ring in rings)
     mount, tilt, afloat = _standing(grounds, above, len(kept))
+    elevations = _falling([round(ring.elevation, 3) for ring in rings])
     sensor = Sensor(
         name=name,
-        elevations=_falling([round(ring.elevation, 3) for ring in rings]),
+        elevations=elevations,
         width=width,
-        min_range=round(max(float(np.floor(min(d[0] for d in depths) * 10) / 10), 0.0), 1),
+        min_range=min(round(max(float(np.floor(min(d[0] for d in depths) * 10) / 10), 0.0), 1), Sensor.min_range),
         max_range=float(np.ceil(max(d[1] for d in depths) / 5) * 5),
         offsets=heights if any(abs(height) > 0.005 for height in heights) else (),
         mount=mount,
         tilt=tilt,
-        blocked=blocked_runs(returned, len(kept)),
+        blocked=blocked_runs(seen, np.array(elevations), tilt),
     )
     turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
-    doubts = turns, afloat, split
-    return LearnedSensor(sensor, tuple(rings), returned, len(kept), tuple(left), missing, thin, merged, *doubts)
+    told = seen.mean(axis=0), len(kept), tuple(left), missing, thin, merged
+    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split)
 
 
 def _standing(
@@ -160,13 +159,15 @@ def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[s
     found: list[tuple[Scan, np.ndarray]] = []
     without: list[Scan] = []
     for scan in scans:
-        ring = rings_of(scan)
+        ring = None if scan.ring is not None and not layers(scan.xyz, scan.ring) else rings_of(scan)
         if ring is None:
             without.append(scan)
         else:
             found.append((scan, ring))
     if not found:
         known = "" if not without or (name := recognise(without[0])[0]) is None else f": {_named(name)}"
+        if without and without[0].ring is not None:
+            raise ValueError(f"expected rings that are beams, found {EVERYWHERE}")
         raise ValueError(
             "expected scans with a ring field, one ring after the other, or beams that elevations show, "
             f"found none in {len(without)}{known}"
@@ -287,35 +288,11 @@ def _step(xyz: np.ndarray, ring: np.ndarray) -> float:
     return found if most == 0 else max(found, 2 * np.pi / (DENSER * most))
 
 
-def _returned(kept: list[tuple[Scan, np.ndarray]], width: int, rows: int) -> np.ndarray:
-    """(rows, width) share of the scans in which a ray returned; points of row -1 are of none."""
-    total = np.zeros((rows, width), np.int32)
-    for scan, row in kept:
+def _seen(kept: list[tuple[Scan, np.ndarray]], width: int, rows: int) -> np.ndarray:
+    """(scans, rows, width) bool: which rays returned in each scan; points of row -1 are of none."""
+    seen = np.zeros((len(kept), rows, width), bool)
+    for one, (scan, row) in zip(seen, kept, strict=True):
         inside = row >= 0
         turn = (1 - np.arctan2(scan.xyz[inside, 1], scan.xyz[inside, 0]) / np.pi) / 2
-        seen = np.zeros_like(total, bool)
-        seen[row[inside], (turn * width).astype(int).clip(0, width - 1)] = True
-        total += seen
-    return total / len(kept)
-
-
-def blocked_runs(returned: np.ndarray, scans: int) -> tuple[tuple[int, int, int], ...]:
-    """(row, first column, last column) of rays that never returned, in rows that return elsewhere; a run may wrap.
-
-    None where there are too few scans to tell.
-    """
-    if scans < BLOCKED_SCANS:
-        return ()
-    width = returned.shape[1]
-    runs = []
-    for row in np.flatnonzero((returned > 0).mean(axis=1) > BLOCKED_ROW):
-        empty = returned[row] == 0
-        if empty.all():
-            continue
-        start = int(np.flatnonzero(~empty)[0])
-        turned = np.concatenate([[False], np.roll(empty, -start), [False]]).astype(int)
-        first, last = np.flatnonzero(np.diff(turned) == 1), np.flatnonzero(np.diff(turned) == -1) - 1
-        for a, b in zip(first, last, strict=True):
-            if b - a + 1 >= BLOCKED_RUN * width:
-                runs.append((int(row), int((a + start) % width), int((b + start) % width)))
-    return tuple(runs)
+        one[row[inside], (turn * width).astype(int).clip(0, width - 1)] = True
+    return seen

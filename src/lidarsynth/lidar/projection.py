@@ -177,7 +177,7 @@ def check_from_top(ring: np.ndarray, xyz: np.ndarray) -> None:
     mean = np.bincount(ring, np.arctan2(z, _length(x, y)))[used] / count[used]
     order = np.corrcoef(np.arange(len(used)), np.argsort(np.argsort(mean)))[0, 1]
     if order > -0.5:
-        found = "them counted from the bottom" if order > 0.9 else "another order"
+        found = "them counted from the bottom" if order > 0.9 else "another order (of two sensors?)"
         raise ValueError(f"expected rings counted from the top, 0 the highest beam, found {found}; give the scan such "
                          "rings, or none")  # fmt: skip
 

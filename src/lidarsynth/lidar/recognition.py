@@ -18,9 +18,13 @@ SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams onl
 STRAY = 0.02  # of a usual ring: a first or last one of fewer points is none
 ENOUGH = 256  # points of a ring, evenly from all of it: their median is the ring's to a few thousandths of a degree
 POINTS = 8_000  # of a scan are enough, where each is compared with each beam
-# For scans without rings, the least `_share_on_beams`. Of train scans and streets of seven sensors it is 0.98 and more,
+SOME = 30_000  # of a scan tell what its rings are
+# For scans without rings, the least `share_on_beams`. Of train scans and streets of seven sensors it is 0.98 and more,
 # with a carrier's 10 m/s taken out mostly above 0.22; for 400 random sensors of nobody at most 0.17.
 POINTWISE = 0.25
+LAYERED = 0.02  # of the variance of directions, what rings explain: of a Livox 0.001, of spinning sensors 0.8 and more
+LEARN = "lidarsynth sensor SCANS --out my.toml"
+EVERYWHERE = "rings that each look everywhere, as of a sensor that does not spin (Livox), which no model here knows"
 
 
 def recognise(
@@ -48,7 +52,10 @@ def recognise(
         name, other = _by_rings(scan.xyz, ring, INVERTED, whole=True)  # type: ignore[arg-type]
         reason = reason if name is None else other
     if name is None:
-        reason = f"expected the beams of {', '.join(known)}, found {reason}: name the sensor with --sensor"
+        spins = scan.ring is None or layers(scan.xyz, scan.ring)
+        beams = ring is not None or rings_by_elevation(scan.xyz) is not None
+        way = ": name the sensor with --sensor" + (f", or learn it: {LEARN}" if beams else "")
+        reason = f"expected the beams of {', '.join(known)}, found {reason + way if spins else EVERYWHERE}"
     return name, where + reason
 
 
@@ -99,6 +106,18 @@ def first_row(ring: np.ndarray, xyz: np.ndarray, sensor: Sensor) -> int | None:
 def elevations_of(xyz: np.ndarray) -> np.ndarray:
     """(..., 3) metres -> (...) degrees above the horizon."""
     return np.degrees(np.arctan2(xyz[..., 2], np.hypot(xyz[..., 0], xyz[..., 1])))
+
+
+def layers(xyz: np.ndarray, ring: np.ndarray) -> bool:
+    """Whether rings (N,) of points (N, 3), in axes of any kind, look elsewhere than others, as beams do. The lines of a
+    sensor that does not spin, such as a Livox, each look everywhere; of a single ring nothing is said."""
+    some = np.linspace(0, len(ring) - 1, min(len(ring), SOME)).astype(int)
+    xyz, (_, ring, count) = xyz[some], np.unique(ring[some], return_inverse=True, return_counts=True)
+    if len(count) < 2:
+        return True
+    way = xyz / np.maximum(np.linalg.norm(xyz, axis=1, keepdims=True), 1e-6)
+    apart = [count @ (np.bincount(ring, v) / count - v.mean()) ** 2 / len(v) for v in way.T.astype(np.float64)]
+    return bool((np.array(apart) >= LAYERED * way.var(axis=0, dtype=np.float64)).any())
 
 
 def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
@@ -216,7 +235,7 @@ def _by_points(xyz: np.ndarray, among: Mapping[str, Sensor]) -> tuple[str | None
     far = _far(xyz)
     elevation = elevations_of(far)
     few = far[np.random.default_rng(0).permutation(len(far))[:POINTS]]
-    shares = {name: _share_on_beams(few, sensor) for name, sensor in among.items()}
+    shares = {name: share_on_beams(few, sensor) for name, sensor in among.items()}
     name = max(shares, key=lambda n: shares[n])
     found = f"no rings, and points from {elevation.min():+.1f} to {elevation.max():+.1f} degrees"
     if shares[name] >= POINTWISE:
@@ -226,7 +245,7 @@ def _by_points(xyz: np.ndarray, among: Mapping[str, Sensor]) -> tuple[str | None
     return by_rings if by_rings is not None and by_rings[0] is not None else (None, found)
 
 
-def _share_on_beams(points: np.ndarray, sensor: Sensor) -> float:
+def share_on_beams(points: np.ndarray, sensor: Sensor) -> float:
     """Share of points within a tenth of the spacing of a beam, less that of those in the fifth midway between beams,
     times the share of beams that have points: chance gives 0, and so do beams of which every second one is a sensor's.
     """

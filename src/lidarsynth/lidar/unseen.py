@@ -6,11 +6,13 @@ import numpy as np
 
 from lidarsynth.lidar.measured import were_new
 from lidarsynth.lidar.own_beams import stray_rings
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
 
 WIDE = 45  # degrees: confidences were fitted on wider holes, too, but what stands there is anyone's guess
+SPARSE = 200  # points: of so few of an XT32 less than half of the new ones are right, of 4,000 four fifths
 FEW = 0.15  # share of the usual points of a degree that are hardly any
 
 
@@ -23,7 +25,10 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
     if before := int(were_new(scan).sum()):
         said.append(f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): "
                     "they are taken as they are, and stay marked")  # fmt: skip
-    if len(scan) and (wide := widest_gap(scan.xyz)) > WIDE:
+    if 0 < len(scan) < SPARSE:
+        said.append(f"expected a turn of a sensor, found {plural(len(scan), 'point')}: most of what is put between is "
+                    "a guess; of default's a least confidence of 0.5 leaves most out")  # fmt: skip
+    elif len(scan) and (wide := widest_gap(scan.xyz)) > WIDE + _never_seen(sensor):
         said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there is "
                     "a guess; of default's a least confidence of 0.5 leaves most out, repaint draws one")  # fmt: skip
     if (turns := several_turns(scan)) is not None:
@@ -31,6 +36,12 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
     if sensor is not None and (strays := stray_rings(scan, sensor)) is not None:
         said.append(strays)
     return "; ".join(said) or None
+
+
+def _never_seen(sensor: Sensor | None) -> float:
+    """Degrees of the turn in which half of a sensor's rays or more are said to be blocked, as behind one that looks
+    ahead: hardly anything is put there."""
+    return 0.0 if sensor is None else 360 * float((sensor.blocked_rays().mean(axis=0) >= 0.5).mean())
 
 
 def widest_gap(xyz: np.ndarray) -> int:

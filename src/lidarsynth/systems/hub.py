@@ -10,8 +10,8 @@ from pathlib import Path
 
 from torch import nn
 
-from lidarsynth.experiment.folder import RECORD, WEIGHTS, save
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment
 
 REPOSITORY = re.compile(r"(?P<id>[\w-][\w.-]*/[\w-][\w.-]*)(@(?P<revision>[\w./-]+))?", re.ASCII)
 HUB = "https://huggingface.co"

@@ -10,8 +10,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lidarsynth.experiment.eight_bits import unpacked
-from lidarsynth.experiment.folder import RECORD, WEIGHTS, on_base, owned, read_experiment
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.folder import on_base, owned, read_experiment
+from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
 from lidarsynth.networks.cascade import Cascade

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import torch
 
-from lidarsynth.experiment.folder import RECORD, WEIGHTS, save
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.folder import save
+from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep as sweep_parts
 from lidarsynth.lidar.whole_file import whole_file, write_whole

@@ -90,8 +90,10 @@ def complete_scan(
     filled = _sure(whole, least)
     shown = {f"input, {recipe}": before, "completed": filled, "truth": truth}
     errors = judged(whole, before, known, truth, judge)  # of the whole: what is left out would count as 0 m
-    if not model.experiment.data.reflectance:
-        errors["lidarsynth"] = replace(errors["lidarsynth"], reflectance_mae=math.nan, reflectance_rmse=math.nan)
+    if not truth.reflectance.any():  # nobody knows what it was
+        errors = {name: _of_range(error) for name, error in errors.items()}
+    elif not model.experiment.data.reflectance:
+        errors["lidarsynth"] = _of_range(errors["lidarsynth"])
     return Filled(filled, lambda: shown, errors)
 
 
@@ -125,6 +127,10 @@ def check_confident(model: ScanModel, how: Filling, least: float | None) -> None
                          "without")  # fmt: skip
     if how.method not in ("auto", "conditional"):
         raise ValueError(f"{name}: expected --method conditional for --min-confidence, found {how.method}")
+
+
+def _of_range(errors: Errors) -> Errors:
+    return replace(errors, reflectance_mae=math.nan, reflectance_rmse=math.nan)
 
 
 def _sure(filled: RangeImage, least: float | None) -> RangeImage:

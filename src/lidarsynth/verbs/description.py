@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarsynth.experiment.folder import RECORD
 from lidarsynth.experiment.presets import PRESETS
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.record import RECORD, Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.systems.description import training_line
-from lidarsynth.systems.table import build_network, system_of
 from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading
-from lidarsynth.weights.load import load_parts, shipped
+
+if TYPE_CHECKING:
+    from lidarsynth.metrics.reconstruction import Errors
 
 
 def describe(what: str, reading: Reading | None = None) -> str:
@@ -34,6 +34,9 @@ def describe(what: str, reading: Reading | None = None) -> str:
         raise ValueError(f"{what}: expected a scan to move or take rings of, found a word, a sensor or a model")
     if what in WORDS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
+    from lidarsynth.systems.table import build_network  # torch takes seconds, which no file above needs
+    from lidarsynth.weights.load import load_parts, shipped
+
     if what in PRESETS and what not in shipped() and not path.is_dir():
         experiment = PRESETS[what]()
         return describe_model(experiment, build_network(experiment), "preset, no weights")
@@ -54,12 +57,14 @@ def describe_sensor(sensor: Sensor) -> str:
     if any(sensor.tilt):
         lines["tilt"] = f"nose {sensor.tilt[0]:+g} and left side {sensor.tilt[1]:+g} degrees up"
     if sensor.blocked:
-        lines["blocked"] = f"{sensor.blocked_rays().mean():.1%} of the rays, by its carrier"
+        lines["blocked"] = f"{sensor.blocked_rays().mean():.1%} of the rays, by its carrier or out of its view"
     return _table(sensor.name, lines)
 
 
 def describe_model(experiment: Experiment, network, source: str) -> str:
     """Network, sensor, diffusion, training, licence, history and results of a model."""
+    from lidarsynth.systems.table import system_of
+
     data, system = experiment.data, system_of(experiment)
     if experiment.model.network in WITHOUT_WEIGHTS:
         return _table(experiment.name, system.description.details(experiment))
@@ -94,6 +99,8 @@ def errors_table(title: str, errors: Mapping[str, Errors]) -> str:
 
 def mean_table(tables: Sequence[Mapping[str, Errors]]) -> str:
     """`errors_table` of the mean over scans."""
+    from lidarsynth.metrics.reconstruction import mean_errors
+
     means = {name: mean_errors([table[name] for table in tables]) for name in tables[0]}
     return errors_table(f"mean of {plural(len(tables), 'scan')}", means)
 

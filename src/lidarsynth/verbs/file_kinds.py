@@ -14,7 +14,7 @@ from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
-from lidarsynth.experiment.folder import RECORD, WEIGHTS
+from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report, sensor_in
 from lidarsynth.lidar.frame import check_frame

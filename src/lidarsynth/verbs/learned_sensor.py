@@ -100,7 +100,9 @@ def summary(learned: LearnedSensor) -> str:
         "  how far above the ground is not known"
         if learned.afloat
         else f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
-        f"  blocked by its carrier: {share:.1%} of the rays" if sensor.blocked else "  nothing seen to be blocked",
+        f"  blocked by its carrier, or out of its view: {share:.1%} of the rays"
+        if sensor.blocked
+        else "  nothing seen to be blocked",
         f"  from {plural(learned.scans, 'scan')}" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
     ]
     return "\n".join(lines)

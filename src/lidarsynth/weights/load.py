@@ -11,9 +11,8 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from lidarsynth.experiment.folder import RECORD, WEIGHTS
 from lidarsynth.experiment.presets import PRESETS, preset
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment
 from lidarsynth.experiment.upsampling_presets import WITHOUT_WEIGHTS
 from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.systems.hub import fetch, is_repository

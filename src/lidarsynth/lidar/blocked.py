@@ -1,0 +1,69 @@
+"""Which rays of a sensor end on its carrier, or are none of its own: those that never return, wherever it goes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+SCANS = 5  # what never returned in fewer scans may have looked at the sky
+RUN = 0.008  # of a turn: shorter runs are chance
+ROW = 0.5  # of a row must have returned, within the view of the sensor around
+CHANCE = 1e-3  # that what is not blocked never returned in so many places
+# Degrees: rays that look higher may meet nothing wherever a street leads; of these only runs whose edges stand still
+# are believed, where in this share of a turn beside them returns are at least half of what is usual for the row.
+LEVEL, BESIDE, USUAL = -5.0, 0.002, 0.5
+
+
+def blocked_runs(
+    seen: np.ndarray, elevations: np.ndarray, tilt: tuple[float, float] = (0.0, 0.0)
+) -> tuple[tuple[int, int, int], ...]:
+    """(row, first column, last column) of rays that never returned, in rows that return elsewhere; a run may wrap.
+
+    seen        (scans, H, W) bool, which rays returned in each scan
+    elevations  (H,) degrees of the rows
+    tilt        degrees of the sensor against the ground, which may raise a row by as much
+
+    None where there are too few scans to tell, or all are of nearly one place. Rays that look up need the more of them,
+    and sharp edges: above the end of a street there is always sky.
+    """
+    if len(seen) < SCANS:
+        return ()
+    returned, width = seen.mean(axis=0), seen.shape[2]
+    view = seen.any(axis=(0, 1))  # of a sensor that looks ahead only, columns behind it never return
+    many, raised = places(seen[:, :, view]), float(np.hypot(*tilt))
+    near = np.arange(1, max(round(BESIDE * width), 3) + 1)
+    runs = []
+    for row in np.flatnonzero((returned[:, view] > 0).mean(axis=1) > ROW):
+        share = returned[row]
+        usual = float(share[share > 0].mean())
+        high = elevations[row] > LEVEL - raised
+        if (1 - usual) ** many > CHANCE or (high and many < SCANS):
+            continue
+        for first, last in _empty_runs(share == 0):
+            beside = [share[(edge + steps) % width].mean() for edge, steps in ((first, -near), (last, near))]
+            if (last - first) % width + 1 >= RUN * width and (not high or min(beside) >= USUAL * usual):
+                runs.append((int(row), first, last))
+    return tuple(runs)
+
+
+def _empty_runs(empty: np.ndarray) -> list[tuple[int, int]]:
+    """First and last column of the runs of a row (W,) bool around a turn that is empty in parts."""
+    if empty.all() or not empty.any():
+        return []
+    width, start = len(empty), int(np.flatnonzero(~empty)[0])
+    edges = np.diff(np.concatenate([[0], np.roll(empty, -start).astype(int), [0]]))
+    ends = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1, strict=True)
+    return [(int(first + start) % width, int(last + start) % width) for first, last in ends]
+
+
+def places(seen: np.ndarray) -> float:
+    """Of how many places scans tell, `seen` as in `blocked_runs`: about 1 of a sensor that stands, nearly as many as
+    there are of one that was elsewhere each time. Each counts by what its lost rays do not share with those of the scan
+    before, by their correlation within rows."""
+    total, before = 1.0, None
+    for mask in seen:
+        now = mask - mask.mean(axis=1, keepdims=True, dtype=np.float32)
+        if before is not None:
+            alike = float((now * before).sum() / np.sqrt(max(float((now**2).sum() * (before**2).sum()), 1e-12)))
+            total += min(1 - alike, 1.0)
+        before = now
+    return total
