@@ -47,7 +47,10 @@ def sensor(
         return
     broken: list[str] = []
     how = Reading(intensity, topic, metadata, read_transform(transform, None, axes), rings=parse_rings(rings))
-    learned = learn(inputs_of(scans, how), out.stem, broken)
+    inputs = inputs_of(scans, how)
+    for line in inputs.cut:
+        warn(line)
+    learned = learn(inputs, out.stem, broken)
     if broken:
         warn(f"{len(broken)} that could not be read {was(len(broken))} left out, the first: {broken[0]}")
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))

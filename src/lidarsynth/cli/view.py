@@ -53,6 +53,8 @@ def view(
         raise ValueError(f"{out}: expected a name that ends in .html, found {out.name[-20:]!r}")
     how = Reading(intensity, topic, metadata, read_transform(transform, mount, axes), rings=parse_rings(rings))
     series = compared(scans, other, how)
+    for line in dict.fromkeys(line for one in series.values() for line in one.cut):
+        warn(line)
     title = next(iter(series))
     if out is None:
         return _serve(Show(title, series), port, browser)

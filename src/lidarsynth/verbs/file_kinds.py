@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bags import POINTS, Bag, Cloud, is_bag, open_bag
+from lidarsynth.data.bags import POINTS, SUFFIXES, Bag, Cloud, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report
@@ -135,6 +135,8 @@ def _bag(path: Path, reading: Reading) -> Lines:
         for topic in bag.topics:
             rate = f", {(topic.count - 1) / bag.seconds:.1f} a second" if bag.seconds > 0 and topic.count > 1 else ""
             lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
+        if bag.cut:
+            lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
         clouds = [topic.name for topic in bag.topics if topic.kind == POINTS]
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
@@ -238,5 +240,5 @@ def _tensors(path: Path) -> Lines:
 
 
 MODELS = (".pth", ".pt", ".h5", ".toml")  # `load_parts` and `get_sensor` know them
-STREAMS = (".bag", ".mcap", ".db3", ".pcap", ".pcapng")
+STREAMS = (*SUFFIXES, ".pcap", ".pcapng")
 KINDS: dict[str, Callable[[Path], Lines | None]] = {".safetensors": _tensors, ".json": json_lines}

@@ -54,7 +54,7 @@ class Loaded:
     given    the columns of the message, or x y z of the file
     dropped  points without a return, or not finite
     scale    what a reflectance of 1 is in the intensities of a message
-    stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
+    stamp, frame_id, time, published, sequence  of a message, as of a `Cloud`
     """
 
     scan: Scan
@@ -64,6 +64,8 @@ class Loaded:
     stamp: int = 0
     frame_id: str = ""
     time: int = 0
+    published: int | None = None
+    sequence: int = 0
 
 
 class Input(Protocol):
@@ -113,7 +115,8 @@ class MessageInput:
             loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields, scale=scale)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
-        return replace(loaded, stamp=cloud.stamp, frame_id=cloud.frame_id, time=cloud.time)
+        own = {name: vars(cloud)[name] for name in ("stamp", "frame_id", "time", "published", "sequence")}
+        return replace(loaded, **own)
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,7 @@ class Inputs:
     stream   gives them; from the start each time
     streams  whether bags or captures are among them
     passed   bags and captures that lie in a folder beside its scan files, which alone are read
+    cut      what is to be said, a line each, of bags that end early
     """
 
     single: bool
@@ -162,6 +166,7 @@ class Inputs:
     stream: Callable[[], Iterator[Input]]
     streams: bool
     passed: tuple[Path, ...] = ()
+    cut: tuple[str, ...] = ()
 
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
@@ -181,8 +186,9 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     count: int | None = len(files)
     each = list(dict.fromkeys(streams))
     folders = dict(zip(each, _unlike([path.stem for path in each], each), strict=True))
+    cut: list[str] = []
     for path in streams:
-        more = _stream_count(path, reading)
+        more = _stream_count(path, reading, cut)
         count = None if more is None or count is None else count + more
 
     def stream() -> Iterator[Input]:
@@ -198,7 +204,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
 
     folders_given = [path for path in paths if path.is_dir() and not is_bag(path) and not _is_scan(path)]
     inside = [p for folder in folders_given for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams]
-    return Inputs(single, count, stream, bool(streams), tuple(inside))
+    return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)))
 
 
 def is_stream(path: Path) -> bool:
@@ -258,11 +264,13 @@ def stem(path: Path) -> str:
     return path.name[: -max(map(len, endings))] if endings else path.stem
 
 
-def _stream_count(path: Path, reading: Reading) -> int | None:
+def _stream_count(path: Path, reading: Reading, cut: list[str]) -> int | None:
+    """Scans of a bag, or None where only reading tells; `cut` gets what is to be said of it."""
     if not is_bag(path):
         return None
     with open_bag(path) as bag:
         name = bag.point_topic(reading.topic)
+        cut += bag.cut
         return sum(topic.count for topic in bag.topics if topic.name == name) or None
 
 
