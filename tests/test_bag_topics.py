@@ -215,6 +215,13 @@ def test_topics_of_ros_1_make_an_mcap_of_ros_1(tmp_path: Path):
         assert all(isinstance(cloud, Cloud) and "new" in cloud.fields for cloud in new.clouds("/points"))
 
 
+def test_points_without_an_intensity_are_told_of_a_bag_as_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with write_bag(tmp_path / "in.mcap") as writer:
+        writer.write_cloud("/points", Cloud(0, "lidar", 0, {axis: np.ones(3, np.float32) for axis in "xyz"}))
+    main(["info", str(tmp_path / "in.mcap")])
+    assert "/points: reflectance  none in the file: --intensity none" in capsys.readouterr().out
+
+
 def test_ros_1_and_ros_2_are_not_put_into_one(tmp_path: Path):
     with open_bag(two_topics(tmp_path / "in.bag")) as bag, write_bag(tmp_path / "out.mcap") as writer:
         message = next(bag.messages())

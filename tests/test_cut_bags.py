@@ -9,7 +9,7 @@ import pytest
 
 from lidarsynth.cli.main import main
 from lidarsynth.data.bag_writer import message_of, points_topic
-from lidarsynth.data.bags import POINTS, Cloud, Message, is_bag, open_bag
+from lidarsynth.data.bags import POINTS, Cloud, Message, is_bag, open_bag, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.verbs.inputs import Reading, inputs_of
 from lidarsynth.viewer.series import series_of
@@ -191,3 +191,16 @@ def test_the_other_parts_of_a_folder_are_read_beside_one_that_holds_nothing(tmp_
     assert inputs.count == len(list(inputs.stream())) == COUNT
     series = series_of([folder], Reading())
     assert series.cut == inputs.cut and len(series[COUNT - 1].scan) == 720
+
+
+@pytest.mark.parametrize("length", [0, 100, 5_000, -1])
+def test_a_database_that_is_cut_is_a_line(length: int, tmp_path: Path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(tmp_path / "drive", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        points = writer.add_connection("/points", POINTS, typestore=typestore("cdr"))
+        for message in clouds("cdr"):
+            writer.write(points, message.time, message.data)
+    part = cut(next((tmp_path / "drive").glob("*.db3")), length)
+    with pytest.raises(FileError, match=rf"^{part}: expected a bag of ROS 1 or ROS 2.*"), open_bag(part) as opened:
+        list(opened.messages())

@@ -23,7 +23,12 @@ def library_errors() -> tuple[type[Exception], ...]:
     from rosbags.serde import SerdeError
     from rosbags.typesys import TypesysError
 
-    return McapError, Error1, Error2, SerdeError, TypesysError, zstandard.ZstdError
+    known = McapError, Error1, Error2, SerdeError, TypesysError, zstandard.ZstdError
+    try:
+        from apsw import Error as SqlError  # with which rosbags reads databases, in some of its versions
+    except ImportError:
+        return known
+    return (*known, SqlError)
 
 
 def check_packages() -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 from zlib import crc32
 
 from lidarsynth.data.bag_errors import BROKEN, library_errors
@@ -51,7 +51,7 @@ class Mended:
         """Whether there is a file."""
         return self.path.exists()
 
-    def open(self, mode: str) -> BinaryIO:
+    def open(self, mode: Literal["rb"]) -> BinaryIO:
         """The bytes of the whole bag."""
         return io.BufferedReader(_Spliced(open(self.path, mode), self))
 

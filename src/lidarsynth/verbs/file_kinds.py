@@ -29,6 +29,7 @@ from lidarsynth.verbs.other_files import other_lines
 from lidarsynth.verbs.viewpoint import viewpoint_note
 
 Lines = dict[str, str]
+NO_INTENSITY = {"reflectance": "none in the file: --intensity none for the other verbs"}
 LOOKED_AT = 400  # packets of a capture that are counted
 
 
@@ -96,8 +97,7 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     except FileError as error:
         if "--intensity none" not in str(error):
             raise
-        none = {"reflectance": "none in the file: --intensity none for the other verbs"}
-        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | none
+        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | NO_INTENSITY
 
 
 def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
@@ -155,7 +155,9 @@ def _first_of_topic(bag: Bag, name: str, reading: Reading) -> tuple[Lines, str |
             return {}, str(first).removeprefix(f"{bag.path}: {name}: ")
         if first is None:
             return {}, None
-        return scan_lines(*scan_from_fields(first.fields, _scale(first), reading.rings), reading), None
+        scale = _scale(first)
+        lines = scan_lines(*scan_from_fields(first.fields, scale, reading.rings), reading)
+        return lines | (NO_INTENSITY if scale == "none" else {}), None
     except ValueError as error:
         return {}, str(error).removeprefix(f"{bag.path}: ")
 
