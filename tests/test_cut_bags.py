@@ -204,3 +204,14 @@ def test_a_database_that_is_cut_is_a_line(length: int, tmp_path: Path):
     part = cut(next((tmp_path / "drive").glob("*.db3")), length)
     with pytest.raises(FileError, match=rf"^{part}: expected a bag of ROS 1 or ROS 2.*"), open_bag(part) as opened:
         list(opened.messages())
+
+
+def test_a_damaged_length_is_no_want_of_memory(tmp_path: Path):
+    """Of the bytes of the second chunk."""
+    bad = mcap(tmp_path / "bad.mcap", "ZSTD")
+    data = bytearray(bad.read_bytes())
+    second = data.index(b"zstd", data.index(b"zstd") + 4) + 4
+    data[second : second + 8] = (1 << 60).to_bytes(8, "little")
+    bad.write_bytes(data)
+    with pytest.raises(FileError, match=r"bad.mcap: expected a bag"), open_bag(bad) as opened:
+        list(opened.messages())

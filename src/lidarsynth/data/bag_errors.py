@@ -9,8 +9,9 @@ from pathlib import Path
 
 from lidarsynth.files.fields import FileError
 
-BROKEN = (
-    OSError, ValueError, LookupError, EOFError, RuntimeError, AssertionError, TypeError, OverflowError, struct.error
+BROKEN = (  # of memory, too: a damaged length asks for more than there is
+    OSError, ValueError, LookupError, EOFError, RuntimeError, AssertionError, TypeError, OverflowError, struct.error,
+    MemoryError,
 )  # fmt: skip
 
 
