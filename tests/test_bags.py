@@ -104,7 +104,7 @@ def test_every_bag_streams_its_clouds(kind: str, tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])
 def test_what_is_written_comes_back_and_other_topics_too(suffix: str, tmp_path: Path):
-    with open_bag(ros1(tmp_path)) as bag, write_bag(tmp_path / f"new{suffix}") as writer:
+    with open_bag(ros1(tmp_path)) as bag, write_bag(tmp_path / f"new{suffix}", bag.topics) as writer:
         for cloud in bag.clouds("/points"):
             assert isinstance(cloud, Cloud)
             writer.write_cloud("/dense", cloud)
@@ -181,7 +181,8 @@ def clouds_at(path: Path, times: list[float], cut: int | None = None) -> Path:
             time, points = int(seconds * 10**9), table(i, False)
             fields = {name: points[name].copy() for name in points.dtype.names or ()}
             data = message_of(Cloud(time, "lidar", time, fields), encoding)
-            writer.put(points_topic("/points", encoding), time, data[: len(data) // 2 if i == cut else None])
+            part = data[: len(data) // 2 if i == cut else None]
+            writer.put(Message(points_topic("/points", encoding), time, part))
     return path
 
 

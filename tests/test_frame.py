@@ -17,7 +17,7 @@ from lidarsynth.lidar.recognition import elevations_of, recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import INVERTED, SENSORS, get_sensor
 from lidarsynth.lidar.view import misfit
-from lidarsynth.verbs.inputs import read_transform
+from lidarsynth.verbs.placement import read_transform
 
 MOVES = {
     "raised": ("0:0:1.73:0:0:0", "m above the origin"),

@@ -25,7 +25,8 @@ from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.verbs.file_kinds import file_lines
-from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of, read_transform
+from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of
+from lidarsynth.verbs.placement import read_transform
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.colouring import colourings
 from lidarsynth.viewer.packing import Shown, packed

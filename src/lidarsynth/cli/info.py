@@ -24,6 +24,7 @@ def info(
 ) -> None:
     """What a model, a preset, a sensor, a file or a folder is."""
     from lidarsynth.verbs.description import describe
-    from lidarsynth.verbs.inputs import Reading, parse_rings, read_transform
+    from lidarsynth.verbs.inputs import Reading
+    from lidarsynth.verbs.placement import parse_rings, read_transform
 
     say(describe(what, Reading(transform=read_transform(transform, mount, axes), rings=parse_rings(rings))))

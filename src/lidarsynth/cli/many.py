@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from lidarsynth.data.bag_writer import BagWriter
+    from lidarsynth.data.bags import Topic
     from lidarsynth.systems.scan_model import ScanModel
     from lidarsynth.verbs.batch import Job, Result, Work
     from lidarsynth.verbs.inputs import Inputs
@@ -66,7 +67,8 @@ class Many:
 def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:
     """Do the job with every scan, say what came of it, and return the results. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
-    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream, parse_rings, read_transform
+    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream
+    from lidarsynth.verbs.placement import parse_rings, read_transform
 
     if many.workers < 0:
         raise ValueError(f"expected --workers of at least 0, found {many.workers}")
@@ -78,6 +80,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
         count = len(inputs.passed)
         what = "bag or capture" if count == 1 else "bags or captures"
         warn(f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them")
+    for line in inputs.cut:
+        warn(line)
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
@@ -290,9 +294,10 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
     model, begun, results = _model(job), time.perf_counter(), []
     out.parent.mkdir(parents=True, exist_ok=True)
+    topic, others = _topics(paths[0], many)
     calls = _calls(job, model, many.workers)
-    with write_bag(out) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
-        topic = _copied(paths[0], writer, many)
+    with write_bag(out, others) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
+        _copy(paths[0], writer, others)
         stream = (Work(item, None, looked_at(number), number) for number, item in enumerate(inputs.stream()))
         for result in run(replace(job, picture=False), stream, many.workers, model, on_step):
             if result.cloud is not None:
@@ -306,17 +311,23 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     return results
 
 
-def _copied(path: Path, writer: BagWriter, many: Many) -> str:
-    """The topic of points; other topics are copied where that was asked for."""
+def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
+    """The topic of points, and the others that are to be copied."""
     from lidarsynth.data.bags import open_bag
 
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
-        others = frozenset(t.name for t in bag.topics if t.name != topic)
-        if many.keep_topics and others:
-            for message in bag.messages(others):
-                writer.copy(message)
-    return topic
+        return topic, [other for other in bag.topics if many.keep_topics and other.name != topic]
+
+
+def _copy(path: Path, writer: BagWriter, topics: list[Topic]) -> None:
+    from lidarsynth.data.bags import open_bag
+
+    if not topics:
+        return
+    with open_bag(path) as bag:
+        for message in bag.messages(frozenset(topic.name for topic in topics)):
+            writer.copy(message)
 
 
 def _tell(result: Result, picture: bool) -> None:

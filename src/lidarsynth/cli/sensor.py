@@ -35,8 +35,9 @@ def sensor(
     """Learn a sensor from its scans: beams, columns, limits, mount, tilt, and what its carrier blocks."""
     from lidarsynth.pictures.learned import learned_figure
     from lidarsynth.pictures.render import save_png
-    from lidarsynth.verbs.inputs import Reading, inputs_of, parse_rings, read_transform
+    from lidarsynth.verbs.inputs import Reading, inputs_of
     from lidarsynth.verbs.learned_sensor import doubts, from_metadata, learn, sensor_toml, summary, write_toml
+    from lidarsynth.verbs.placement import parse_rings, read_transform
 
     if out.suffix != ".toml":
         raise ValueError(f"{out}: expected a name that ends in .toml, found {out.name[-20:]!r}")
@@ -47,7 +48,10 @@ def sensor(
         return
     broken: list[str] = []
     how = Reading(intensity, topic, metadata, read_transform(transform, None, axes), rings=parse_rings(rings))
-    learned = learn(inputs_of(scans, how), out.stem, broken)
+    inputs = inputs_of(scans, how)
+    for line in inputs.cut:
+        warn(line)
+    learned = learn(inputs, out.stem, broken)
     if broken:
         warn(f"{len(broken)} that could not be read {was(len(broken))} left out, the first: {broken[0]}")
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))

@@ -43,7 +43,8 @@ def view(
     rings: Rings = None,
 ) -> None:
     """Scans in the browser, from a page on this machine alone; or, with --out, as one file to send."""
-    from lidarsynth.verbs.inputs import Reading, parse_rings, read_transform
+    from lidarsynth.verbs.inputs import Reading
+    from lidarsynth.verbs.placement import parse_rings, read_transform
     from lidarsynth.viewer.page import write_page
     from lidarsynth.viewer.pairs import compared, entries
     from lidarsynth.viewer.server import Show
@@ -53,6 +54,8 @@ def view(
         raise ValueError(f"{out}: expected a name that ends in .html, found {out.name[-20:]!r}")
     how = Reading(intensity, topic, metadata, read_transform(transform, mount, axes), rings=parse_rings(rings))
     series = compared(scans, other, how)
+    for line in dict.fromkeys(line for one in series.values() for line in one.cut):
+        warn(line)
     title = next(iter(series))
     if out is None:
         return _serve(Show(title, series), port, browser)

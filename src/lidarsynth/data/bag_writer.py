@@ -1,22 +1,27 @@
-"""Point clouds into a new bag: ROS 1 `.bag`, or `.mcap` as ROS 2 records it; other topics are copied as they are."""
+"""Point clouds into a new bag: ROS 1 `.bag`, or `.mcap` as ROS 2 records it, of ROS 1 where messages of that are
+copied; other topics are copied as they are."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.bags import BROKEN, POINTS, Cloud, Message, Topic, library_errors, one_line, typestore
+from lidarsynth.data.bag_errors import BROKEN, library_errors, one_line
+from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
 from lidarsynth.lidar.whole_file import whole_file
 
-Put = Callable[[Topic, int, bytes], None]  # topic, nanoseconds, message
-FORMATS = {".bag": "ros1", ".mcap": "cdr"}  # what each kind of file holds
+Put = Callable[[Message], None]
+FORMATS = {".bag": "ros1", ".mcap": "cdr"}  # what each kind of file holds, unless it is told otherwise
+PROFILES = {"ros1": "ros1", "cdr": "ros2"}  # of MCAP, by the encoding of its messages (mcap.dev/spec/registry)
+NAMES = {"ros1": "ROS 1", "cdr": "ROS 2"}
 MSG_CDR, MSG_ROS1 = "ros2msg", "ros1msg"
 
 
@@ -34,27 +39,46 @@ class BagWriter:
         if topic not in self.topics:
             self.topics[topic] = points_topic(topic, self.encoding)
         with _telling(self.path):
-            self.put(self.topics[topic], cloud.time, message_of(cloud, self.encoding))
+            data = message_of(cloud, self.encoding)
+            self.put(Message(self.topics[topic], cloud.time, data, cloud.published, cloud.sequence))
 
     def copy(self, message: Message) -> None:
         """A message of another bag as it is. Raises FileError where this kind of file cannot hold it."""
-        if self.path.suffix.lower() == ".bag" and message.topic.encoding != "ros1":
-            raise FileError(f"{self.path}: expected messages of ROS 1 to copy into a .bag, found {message.topic.name} "
-                            f"in {message.topic.encoding}; write a .mcap")  # fmt: skip
+        _check_copied(self.path, message.topic, self.encoding)
         with _telling(self.path):
-            self.put(message.topic, message.time, message.data)
+            self.put(message)
 
 
 @contextmanager
-def write_bag(path: str | Path) -> Iterator[BagWriter]:
-    """A new `.bag` or `.mcap`; it appears whole or not at all, over an old one of that name. Raises FileError, and
-    OSError that names it where it cannot be written; what else the block raises passes as it is."""
+def write_bag(path: str | Path, copied: Sequence[Topic] = ()) -> Iterator[BagWriter]:
+    """A new `.bag` or `.mcap`; it appears whole or not at all, over an old one of that name.
+
+    copied  topics whose messages are to be copied: where any is of ROS 1, so is all that a `.mcap` gets
+    Raises FileError, also for topics that do not fit, and OSError that names it where it cannot be written; what else
+    the block raises passes as it is.
+    """
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise FileError(f"{path}: expected a name that ends in {', '.join(FORMATS)} for a bag, found {path.suffix!r}")
-    opened = {".bag": _bag, ".mcap": _mcap}[path.suffix.lower()]
+    encodings = {topic.encoding for topic in copied}
+    encoding = "ros1" if "ros1" in encodings else FORMATS[path.suffix.lower()]
+    for topic in copied:
+        _check_copied(path, topic, encoding)
+    profile = PROFILES[encoding] if encodings <= {encoding} else ""
+    opened = _bag if path.suffix.lower() == ".bag" else partial(_mcap, profile)
     with whole_file(path) as scratch, opened(scratch) as put:
-        yield BagWriter(path, FORMATS[path.suffix.lower()], put)
+        yield BagWriter(path, encoding, put)
+
+
+def _check_copied(path: Path, topic: Topic, encoding: str) -> None:
+    """Raises FileError for a topic that a bag of this encoding cannot hold beside its points; MCAP holds any, but not
+    ROS 1 and ROS 2 in one."""
+    if path.suffix.lower() == ".bag" and topic.encoding != "ros1":
+        raise FileError(f"{path}: expected messages of ROS 1 to copy into a .bag, found {topic.name} in "
+                        f"{topic.encoding}; write a .mcap")  # fmt: skip
+    if topic.encoding in PROFILES and topic.encoding != encoding:
+        raise FileError(f"{path}: expected messages of {NAMES[encoding]} to copy beside points of it, found "
+                        f"{topic.name} of {NAMES[topic.encoding]}")  # fmt: skip
 
 
 @contextmanager
@@ -84,7 +108,7 @@ def message_of(cloud: Cloud, encoding: str) -> bytes:
     types = store.types
     stamp = types["builtin_interfaces/msg/Time"](cloud.stamp // 10**9, cloud.stamp % 10**9)
     first = encoding == "ros1"
-    header = types["std_msgs/msg/Header"](*([0] if first else []), stamp, cloud.frame_id)
+    header = types["std_msgs/msg/Header"](*([cloud.sequence] if first else []), stamp, cloud.frame_id)
     fields = [types["sensor_msgs/msg/PointField"](n, at, kind, 1) for n, at, kind in layout.fields]
     count = len(layout.data) // layout.point_step
     points: Any = types[POINTS](header, 1, count, fields, False, layout.point_step, len(layout.data), layout.data,
@@ -103,7 +127,8 @@ def _bag(path: Path) -> Iterator[Put]:
     with Writer(path) as writer:
         connections: dict[Any, Any] = {}  # one for each node that published, whose last message may be a latched one
 
-        def put(topic: Topic, time: int, data: bytes) -> None:
+        def put(message: Message) -> None:
+            topic = message.topic
             key = topic.name, topic.offered
             if key not in connections:
                 text, offered = topic.schema[1].decode(), dict(topic.offered)
@@ -115,7 +140,7 @@ def _bag(path: Path) -> Iterator[Put]:
                     callerid=offered.get("callerid"),
                     latching=1 if offered.get("latching") == "1" else None,
                 )
-            writer.write(connections[key], time, data)
+            writer.write(connections[key], message.time, message.data)
 
         yield put
 
@@ -130,22 +155,24 @@ def _digest(kind: str, text: str) -> str:
 
 
 @contextmanager
-def _mcap(path: Path) -> Iterator[Put]:
+def _mcap(profile: str, path: Path) -> Iterator[Put]:
     from mcap.writer import Writer
 
     with open(path, "xb") as file:
         writer = Writer(file)
-        writer.start(profile="ros2", library="lidarsynth")
+        writer.start(profile=profile, library="lidarsynth")
         channels: dict[Any, int] = {}
 
-        def put(topic: Topic, time: int, data: bytes) -> None:
+        def put(message: Message) -> None:
+            topic = message.topic
             key = topic.name, topic.offered
             if key not in channels:
                 kind = topic.kind.replace("/msg/", "/") if topic.schema[0] == MSG_ROS1 else topic.kind
-                schema = writer.register_schema(kind, *topic.schema)
+                schema = writer.register_schema(kind, *topic.schema) if kind or topic.schema[1] else 0
                 offered = dict(topic.offered)
                 channels[key] = writer.register_channel(topic.name, topic.encoding, schema, metadata=offered)
-            writer.add_message(channels[key], time, data, time)
+            sent = message.time if message.published is None else message.published
+            writer.add_message(channels[key], message.time, message.data, sent, message.sequence)
 
         yield put
         writer.finish()

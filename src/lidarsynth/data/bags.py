@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import heapq
 import sqlite3
-import struct
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from copy import copy
@@ -16,16 +15,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming, one_line
+from lidarsynth.data.cut_bags import mend
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
 from lidarsynth.lidar.small_file import check_regular
 
 POINTS = "sensor_msgs/msg/PointCloud2"
-MAGIC = b"\x89MCAP0\r\n"  # the first and the last bytes of an MCAP file (mcap.dev/spec)
-SUFFIXES = (".bag", ".mcap", ".db3")
-BROKEN = (
-    OSError, ValueError, LookupError, EOFError, RuntimeError, AssertionError, TypeError, OverflowError, struct.error
-)  # fmt: skip
+SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `rosbag record` leaves
 
 
 @dataclass(frozen=True)
@@ -52,11 +49,19 @@ class Topic:
 
 
 class Message(NamedTuple):
-    """One message: its topic, when it was recorded (nanoseconds), its bytes."""
+    """One message.
+
+    time       nanoseconds, when it was recorded
+    data       its bytes
+    published  nanoseconds, when it was sent, of MCAP; None = `time`
+    sequence   its number, of MCAP; 0 where nobody counted
+    """
 
     topic: Topic
     time: int
     data: bytes
+    published: int | None = None
+    sequence: int = 0
 
 
 @dataclass(frozen=True)
@@ -67,22 +72,29 @@ class Cloud:
     frame_id  the coordinate frame's name
     time      nanoseconds, when it was recorded
     fields    as `point_cloud2.decode`
+    published, sequence  as of a `Message`; of ROS 1 the number is that of the header
     """
 
     stamp: int
     frame_id: str
     time: int
     fields: Fields
+    published: int | None = None
+    sequence: int = 0
 
 
 @dataclass(frozen=True)
 class Bag:
-    """An open bag. `messages(names)` streams those of the topics named, or all; `seconds` is its duration."""
+    """An open bag. `messages(names)` streams those of the topics named, or all; `seconds` is its duration.
+
+    cut  what is to be said, a line a file, of a recording that ends early, as `cut_bags.Mended.words`
+    """
 
     path: Path
     topics: tuple[Topic, ...]
     seconds: float
     source: Callable[[frozenset[str], int], Iterator[Message]]
+    cut: tuple[str, ...] = ()
 
     def messages(self, names: frozenset[str] = frozenset(), start: int = 0) -> Iterator[Message]:
         """Messages in the order of their times, from `start` (nanoseconds) on. Raises FileError for a broken bag."""
@@ -125,7 +137,7 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     path = Path(path)
     if not path.exists():
         raise FileError(f"{path}: expected a bag, found nothing")
-    _packages()
+    check_packages()
     inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
     for file in inside if path.is_dir() else [path]:
         try:
@@ -148,8 +160,10 @@ def cloud_of(message: Message) -> Cloud:
     read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
     try:
         points: Any = read(message.data, POINTS)
-        stamp = points.header.stamp
-        return Cloud(stamp.sec * 10**9 + stamp.nanosec, points.header.frame_id, message.time, decode(points))
+        stamp, frame_id = points.header.stamp, points.header.frame_id
+        number = points.header.seq if message.topic.encoding == "ros1" else message.sequence
+        times = stamp.sec * 10**9 + stamp.nanosec, frame_id, message.time
+        return Cloud(*times, decode(points), message.published, number)
     except FileError:
         raise
     except (*BROKEN, *library_errors()) as error:
@@ -173,12 +187,10 @@ def typestore(encoding: str) -> Any:
 
 def _rosbags(path: Path) -> Generator[Bag, None, None]:
     """A ROS 1 `.bag`, a ROS 2 folder or a `.db3`, through rosbags."""
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-
-    first = path.suffix.lower() == ".bag"
+    first = not path.is_dir() and path.suffix.lower() != ".db3"
     offered = {} if first else _qualities(path)
-    with (Reader1 if first else Reader2)(path) as reader:
+    reader, cut = _ros1(path) if first else _ros2(path)
+    with closing(reader):
         topics = {c.id: _topic(c, "ros1" if first else "cdr", offered) for c in reader.connections}
         parts = _files_of(reader)
 
@@ -189,7 +201,36 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
                 yield Message(topics[connection.id], time, bytes(data))
 
         duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
-        yield Bag(path, _by_name(topics.values()), duration, messages)
+        yield Bag(path, _by_name(topics.values()), duration, messages, cut)
+
+
+def _ros2(path: Path) -> tuple[Any, tuple[str, ...]]:
+    """The reader of a ROS 2 folder or a database, opened, and nothing to be said of it."""
+    from rosbags.rosbag2 import Reader
+
+    reader = Reader(path)
+    reader.open()
+    return reader, ()
+
+
+def _ros1(path: Path) -> tuple[Any, tuple[str, ...]]:
+    """The reader of a ROS 1 bag, opened, and what is to be said of one that ends early. Raises FileError for one
+    without a message."""
+    from rosbags.rosbag1 import Reader
+
+    reader = Reader(path)
+    try:
+        reader.open()
+        return reader, ()
+    except (*BROKEN, *library_errors()):
+        mended: Any = mend(path)
+        if mended is None:
+            raise
+        if not mended.messages:
+            raise FileError(mended.words()) from None
+        reader = Reader(mended)
+        reader.open()
+        return reader, (mended.words(),)
 
 
 def _by_name(topics: Iterable[Topic]) -> tuple[Topic, ...]:
@@ -241,7 +282,10 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
     from contextlib import ExitStack
 
     with ExitStack() as stack:
-        streams = [_whole(stack.enter_context(open(file, "rb")), file) for file in files]
+        mended = {file: found for file in files if (found := mend(file)) is not None}
+        if len(mended) == len(files) and not any(found.messages for found in mended.values()):
+            raise FileError(mended[files[0]].words())
+        streams = [stack.enter_context(mended.get(file, file).open("rb")) for file in files]
         parts = sorted(map(_mcap_part, streams), key=lambda part: part.first)
         topics = {topic.name: topic for topic in _by_name(topic for part in parts for topic in part.topics)}
 
@@ -252,20 +296,7 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
         full = [part for part in parts if part.last]
         seconds = (max(part.last for part in full) - full[0].first) / 1e9 if full else 0.0
-        yield Bag(path, tuple(topics.values()), seconds, messages)
-
-
-def _whole(stream: IO[bytes], file: Path) -> IO[bytes]:
-    """The MCAP file, if it ends as it begins. Raises FileError for one that a killed recorder left."""
-    size = stream.seek(0, 2)
-    stream.seek(0)
-    begun = stream.read(len(MAGIC)) == MAGIC
-    stream.seek(max(size - len(MAGIC), 0))
-    if begun and (size < 2 * len(MAGIC) or stream.read() != MAGIC):
-        raise FileError(f"{file}: expected a whole MCAP file, found one that is cut off, as of a recording that was "
-                        "killed: `mcap recover` makes a whole one of it")  # fmt: skip
-    stream.seek(0)
-    return stream
+        yield Bag(path, tuple(topics.values()), seconds, messages, tuple(found.words() for found in mended.values()))
 
 
 class _Part(NamedTuple):
@@ -323,42 +354,4 @@ def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, T
     stream.seek(0)
     reader = make_reader(stream, validate_crcs=True)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
-        yield Message(topics[channel.topic], message.log_time, message.data)
-
-
-def library_errors() -> tuple[type[Exception], ...]:
-    """What the libraries raise of their own."""
-    import zstandard
-    from mcap.exceptions import McapError
-    from rosbags.rosbag1 import ReaderError as Error1
-    from rosbags.rosbag2 import ReaderError as Error2
-    from rosbags.serde import SerdeError
-    from rosbags.typesys import TypesysError
-
-    return McapError, Error1, Error2, SerdeError, TypesysError, zstandard.ZstdError
-
-
-def _packages() -> None:
-    try:
-        import mcap
-        import rosbags
-    except ImportError:
-        raise FileError("expected rosbags and mcap to read and write bags (pip install 'lidarsynth[ros]'), "
-                        "found none") from None  # fmt: skip
-    del mcap, rosbags
-
-
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Turns whatever a broken bag makes a library raise into one line that names the bag."""
-    try:
-        yield
-    except FileError:
-        raise
-    except (*BROKEN, *library_errors()) as error:
-        raise FileError(f"{path}: expected a bag of ROS 1 or ROS 2, or MCAP, found: {one_line(error)}") from None
-
-
-def one_line(error: Exception) -> str:
-    """What an error says, in one line; its kind where it says nothing."""
-    return " ".join(str(error).split())[:160] or type(error).__name__
+        yield Message(topics[channel.topic], message.log_time, message.data, message.publish_time, message.sequence)

@@ -184,7 +184,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         if work.target is None:
             points = _points(done, loaded, job.transform)
             fields = FIELDS.get(job.verb, message_fields)(points, loaded)
-            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields)
+            told = loaded.published, loaded.sequence
+            cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields, *told)
         else:
             beside = _store(work.target, work.item.path, done, loaded, job)
     except (ValueError, FloatingPointError) as error:

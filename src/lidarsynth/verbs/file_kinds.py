@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bags import POINTS, Bag, Cloud, is_bag, open_bag
+from lidarsynth.data.bags import POINTS, SUFFIXES, Bag, Cloud, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report
@@ -29,6 +29,7 @@ from lidarsynth.verbs.other_files import other_lines
 from lidarsynth.verbs.viewpoint import viewpoint_note
 
 Lines = dict[str, str]
+NO_INTENSITY = {"reflectance": "none in the file: --intensity none for the other verbs"}
 LOOKED_AT = 400  # packets of a capture that are counted
 
 
@@ -93,8 +94,7 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     except FileError as error:
         if "--intensity none" not in str(error):
             raise
-        none = {"reflectance": "none in the file: --intensity none for the other verbs"}
-        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | none
+        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | NO_INTENSITY
 
 
 def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
@@ -132,6 +132,8 @@ def _bag(path: Path, reading: Reading) -> Lines:
         for topic in bag.topics:
             rate = f", {(topic.count - 1) / bag.seconds:.1f} a second" if bag.seconds > 0 and topic.count > 1 else ""
             lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
+        if bag.cut:
+            lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
         clouds = [topic.name for topic in bag.topics if topic.kind == POINTS]
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
@@ -150,7 +152,9 @@ def _first_of_topic(bag: Bag, name: str, reading: Reading) -> tuple[Lines, str |
             return {}, str(first).removeprefix(f"{bag.path}: {name}: ")
         if first is None:
             return {}, None
-        return scan_lines(*scan_from_fields(first.fields, _scale(first), reading.rings), reading), None
+        scale = _scale(first)
+        lines = scan_lines(*scan_from_fields(first.fields, scale, reading.rings), reading)
+        return lines | (NO_INTENSITY if scale == "none" else {}), None
     except ValueError as error:
         return {}, str(error).removeprefix(f"{bag.path}: ")
 
@@ -235,5 +239,5 @@ def _tensors(path: Path) -> Lines:
 
 
 MODELS = (".pth", ".pt", ".h5", ".toml")  # `load_parts` and `get_sensor` know them
-STREAMS = (".bag", ".mcap", ".db3", ".pcap", ".pcapng")
+STREAMS = (*SUFFIXES, ".pcap", ".pcapng")
 KINDS: dict[str, Callable[[Path], Lines | None]] = {".safetensors": _tensors, ".json": json_lines}

@@ -18,12 +18,9 @@ from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
-from lidarsynth.lidar.frame import parse_axes, parse_transform, transformed
+from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.lidar.small_file import LARGEST, check_regular
-
-FARTHEST = 1e9  # metres; no two frames on Earth are as far apart, and points there still have squares in float32
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class Loaded:
     given    the columns of the message, or x y z of the file
     dropped  points without a return, or not finite
     scale    what a reflectance of 1 is in the intensities of a message
-    stamp, frame_id, time  of a message, else 0 and empty; nanoseconds
+    stamp, frame_id, time, published, sequence  of a message, as of a `Cloud`
     sensor   of a range image, whose points were not moved and are on all of its beams; else None
     """
 
@@ -71,6 +68,8 @@ class Loaded:
     stamp: int = 0
     frame_id: str = ""
     time: int = 0
+    published: int | None = None
+    sequence: int = 0
     sensor: Sensor | None = None
 
 
@@ -120,7 +119,8 @@ class MessageInput:
             loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields, scale=scale)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
-        return replace(loaded, stamp=cloud.stamp, frame_id=cloud.frame_id, time=cloud.time)
+        own = {name: vars(cloud)[name] for name in ("stamp", "frame_id", "time", "published", "sequence")}
+        return replace(loaded, **own)
 
 
 @dataclass(frozen=True)
@@ -162,6 +162,7 @@ class Inputs:
     stream   gives them; from the start each time
     streams  whether bags or captures are among them
     passed   bags and captures that lie in a folder beside its scan files, which alone are read
+    cut      what is to be said, a line each, of bags that end early
     """
 
     single: bool
@@ -169,6 +170,7 @@ class Inputs:
     stream: Callable[[], Iterator[Input]]
     streams: bool
     passed: tuple[Path, ...] = ()
+    cut: tuple[str, ...] = ()
 
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
@@ -188,8 +190,9 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
     count: int | None = len(files)
     each = list(dict.fromkeys(streams))
     folders = dict(zip(each, _unlike([path.stem for path in each], each), strict=True))
+    cut: list[str] = []
     for path in streams:
-        more = _stream_count(path, reading)
+        more = _stream_count(path, reading, cut)
         count = None if more is None or count is None else count + more
 
     def stream() -> Iterator[Input]:
@@ -205,7 +208,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
 
     folders_given = [path for path in paths if path.is_dir() and not is_bag(path) and not _is_scan(path)]
     inside = [p for folder in folders_given for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams]
-    return Inputs(single, count, stream, bool(streams), tuple(inside))
+    return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)))
 
 
 def is_stream(path: Path) -> bool:
@@ -265,11 +268,13 @@ def stem(path: Path) -> str:
     return path.name[: -max(map(len, endings))] if endings else path.stem
 
 
-def _stream_count(path: Path, reading: Reading) -> int | None:
+def _stream_count(path: Path, reading: Reading, cut: list[str]) -> int | None:
+    """Scans of a bag, or None where only reading tells; `cut` gets what is to be said of it."""
     if not is_bag(path):
         return None
     with open_bag(path) as bag:
         name = bag.point_topic(reading.topic)
+        cut += bag.cut
         return sum(topic.count for topic in bag.topics if topic.name == name) or None
 
 
@@ -283,52 +288,6 @@ def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
 def _capture_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
     for number, fields in enumerate(capture_turns(path, reading.metadata, reading.topic)):
         yield TurnInput(f"{folder}/{number:06d}", path, reading, fields)
-
-
-def parse_rings(text: str | None) -> tuple[int, int] | None:
-    """(32, 63) from 32-63; None is all. Raises ValueError."""
-    if text is None:
-        return None
-    first, dash, last = text.partition("-")
-    if not (dash and first.isdecimal() and last.isdecimal() and int(first) <= int(last) < 1 << 16):
-        raise ValueError(f"expected --rings FIRST-LAST, such as 32-63, found {text!r:.60}")
-    return int(first), int(last)
-
-
-def read_transform(text: str | None, mount: float | None = None, axes: str = "flu") -> np.ndarray | None:
-    """(4, 4) from x:y:z:roll:pitch:yaw, or a file of 12 or 16 numbers (.txt, .npy), and then down by `mount` metres.
-
-    mount  height of the sensor above the points' z = 0, such as the ground
-    axes   where the points' own x, y and z point, as `parse_axes` reads it; undone first
-    None of them is no transform at all.
-    Raises ValueError for anything that is no rigid motion, and for a shift that is not finite or beyond FARTHEST.
-    """
-    turned = parse_axes(axes)
-    if text is None and mount is None and np.array_equal(turned, np.eye(4)):
-        return None
-    matrix = np.eye(4) if text is None else _matrix_file(Path(text)) if Path(text).is_file() else parse_transform(text)
-    for option, given, shift in (("transform", text, matrix[:3, 3]), ("mount", mount, mount or 0.0)):
-        if not (np.abs(shift) <= FARTHEST).all():
-            raise ValueError(f"expected --{option} of finite metres, at most {FARTHEST:g}, found {given}")
-    down = np.eye(4)
-    down[2, 3] = -(mount or 0.0)
-    return down @ matrix @ turned
-
-
-def _matrix_file(path: Path) -> np.ndarray:
-    check_regular(path, LARGEST)
-    try:
-        numbers = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path)
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: expected 4 x 4 numbers, found: {error}") from None
-    if numbers.size not in (12, 16):
-        raise ValueError(f"{path}: expected 4 x 4 numbers, or the upper 3 x 4, found {numbers.size}")
-    matrix = np.eye(4)
-    matrix.reshape(-1)[: numbers.size] = numbers.reshape(-1)
-    rotation = matrix[:3, :3]
-    if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0):
-        raise ValueError(f"{path}: expected a rotation and a shift, found a matrix that stretches or mirrors")
-    return matrix
 
 
 def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:

@@ -23,12 +23,15 @@ class Series(Protocol):
     """Scans by number: `series[i] -> Shown`, IndexError behind the last; ValueError where that scan is broken.
 
     names  of those known so far; count: how many there are, or None where only reading tells
+    cut    what is to be said, a line each, of bags that end early
     """
 
     @property
     def names(self) -> Sequence[str]: ...
     @property
     def count(self) -> int | None: ...
+    @property
+    def cut(self) -> Sequence[str]: ...
     def __getitem__(self, index: int, /) -> Shown: ...
 
 
@@ -37,6 +40,7 @@ class Files:
 
     def __init__(self, names: Sequence[str], paths: Sequence[Path], reading: Reading):
         self.names, self.paths, self.reading = list(names), list(paths), reading
+        self.cut: Sequence[str] = ()
 
     @property
     def count(self) -> int:
@@ -62,8 +66,8 @@ class Stream:
     count    how many there are, or None
     """
 
-    def __init__(self, open_at: Opener, count: int | None):
-        self.open_at, self.count = open_at, count
+    def __init__(self, open_at: Opener, count: int | None, cut: Sequence[str] = ()):
+        self.open_at, self.count, self.cut = open_at, count, cut
         self.names: list[str] = []
         self._marks: list[int] = []
         self._thread = ThreadPoolExecutor(1)  # a bag of SQLite may be read by the thread only that opened it
@@ -104,7 +108,7 @@ def series_of(paths: Sequence[Path], reading: Reading) -> Series:
     files: list[FileInput] = []
     for item in inputs.stream():
         if not isinstance(item, FileInput):  # of a capture, or of one bag of several
-            return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count)
+            return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count, inputs.cut)
         files.append(item)
     return Files([item.name for item in files], [item.path for item in files], reading)
 
@@ -123,7 +127,7 @@ def _scans_only(path: Path) -> list[Path]:
 def _bag(path: Path, reading: Reading) -> Stream:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
-        count = sum(t.count for t in bag.topics if t.name == topic) or None
+        count, cut = sum(t.count for t in bag.topics if t.name == topic) or None, bag.cut
 
     def open_at(mark: int, number: int) -> Iterator[tuple[int, Input]]:
         with open_bag(path) as bag:
@@ -131,4 +135,4 @@ def _bag(path: Path, reading: Reading) -> Stream:
                 name = f"{topic} {message.time / 1e9:.3f} s"
                 yield message.time, MessageInput(name, path, reading, message)
 
-    return Stream(open_at, count)
+    return Stream(open_at, count, cut)
