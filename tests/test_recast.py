@@ -160,6 +160,32 @@ def test_a_heap_that_is_no_car_becomes_what_is_beside_it() -> None:
     np.testing.assert_array_equal(found.range[~heap], drawn.range[~heap])
 
 
+@pytest.mark.parametrize("turned", [0, 512])
+def test_what_a_heap_lost_goes_with_it_and_the_sky_stays(turned: int) -> None:
+    """Holes in a heap ahead or behind, across the seam of the image, are filled; what is beside and above it is not."""
+    points_of, rng = SENSOR.points(np.full((SENSOR.height, SENSOR.width), 12.0, np.float32)), np.random.default_rng(5)
+    heap = (np.abs(points_of[..., 1]) < 4) & (points_of[..., 0] > 0) & (np.abs(points_of[..., 2] + 1) < 0.7)
+    inner = (np.abs(points_of[..., 1]) < 2.5) & (points_of[..., 0] > 0) & (np.abs(points_of[..., 2] + 1) < 0.4)
+    beside = (np.abs(points_of[..., 1] - 6) < 1) & (points_of[..., 0] > 0) & (np.abs(points_of[..., 2] + 1) < 0.4)
+    heap, inner, beside = (np.roll(part, turned, 1) for part in (heap, inner, beside))
+    drawn = called_a_car(rng.uniform(5, 30, heap.shape), heap)
+    empty = inner | beside
+    drawn = replace(drawn, range=np.where(empty, 0, drawn.range), mask=drawn.mask & ~empty)
+    found, bare = recast(drawn, rng), scene(SENSOR)
+    there = inner & bare.mask & (bare.range < 20)
+    assert there.sum() > 100 and beside.sum() > 100
+    np.testing.assert_allclose(found.range[there], bare.range[there], atol=0.15)
+    assert not found.mask[beside].any()
+    assert not found.mask[~heap & ~bare.mask].any()
+
+
+def test_columns_that_are_gone_are_as_those_beyond_the_nearer_end_of_the_gap() -> None:
+    left = np.array([0, 1, 2, 3, 9, 10, 11])
+    found = module._mirrored(np.array([4, 5, 6, 7, 8]), left, 12)
+    np.testing.assert_array_equal(found, [3, 2, 1, 10, 9])
+    np.testing.assert_array_equal(module._mirrored(np.array([0, 11]), np.array([1, 2, 3, 9, 10]), 12), [1, 10])
+
+
 def test_a_wall_that_is_called_a_car_stays_as_it_was_drawn() -> None:
     rays = SENSOR.directions()
     metres = 9 / np.maximum(rays[..., 0], 0.1)

@@ -67,10 +67,9 @@ SIZE = (0.97, 1.03)  # things are so much smaller or larger
 TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
 OCCLUDED = 0.3  # metres nearer than a thing that hide it
 WALL = (0.4, 1.7)  # metres, standard deviations across and along, of returns that are of a wall
-ALONG, APART = (
-    3,
-    (0.05, 1.5),
-)  # columns, and metres between their returns, that tell in which direction something stands
+BESIDE = 3  # columns beside a heap's that are as lost as its own
+# Columns, and metres between their returns, that tell in which direction something stands.
+ALONG, APART = 3, (0.05, 1.5)
 
 
 @dataclass
@@ -172,7 +171,8 @@ def _thing(
     place, shape = min(zip(places, shapes, strict=True), key=lambda both: both[0].cost)
     if place.cost > kind.most or place.share < kind.least:
         if not _a_wall(points):
-            _fill(canvas, at, at, level, rng)
+            gone = _with_lost(canvas, at)
+            _fill(canvas, gone, gone, level, rng)
         return None
     shade = float(np.median(canvas.reflectance.flat[at]))
     found, rays = _cast(canvas, _mesh(kind, shape, place, level, rng), _tint(kind, shade, rng), rng)
@@ -186,6 +186,26 @@ def _a_wall(points: np.ndarray) -> bool:
     """Whether points (n, 3) stand in a line that is longer than a thing."""
     thin, long = np.sqrt(np.linalg.eigvalsh(np.cov(points[:, :2].T)).clip(0))
     return bool(thin < WALL[0] and long > WALL[1])
+
+
+def _with_lost(canvas: _Canvas, at: np.ndarray) -> np.ndarray:
+    """Pixels `at` (n,), and those that these enclose, along their rings and from beam to beam, and that did not return:
+    of a heap they would have been."""
+    width = canvas.sensor.width
+    middle = np.angle(np.exp(2j * np.pi * (at % width) / width).sum()) * width / (2 * np.pi)
+    heap = np.zeros(canvas.metres.shape, bool)
+    heap.flat[at] = True
+    heap = np.roll(heap, width // 2 - round(middle), 1)
+    wider = np.logical_or.reduce([np.roll(heap, step, 1) for step in range(-BESIDE, BESIDE + 1)])
+    within = _between(wider, 0) & _between(heap, 1)
+    lost = np.roll(within, round(middle) - width // 2, 1) & (canvas.metres == 0) & ~hidden(canvas.sensor)
+    return np.concatenate([at, np.flatnonzero(lost)])
+
+
+def _between(there: np.ndarray, axis: int) -> np.ndarray:
+    """Pixels (H, W) with some that are `there` before and behind, or that are themselves."""
+    before, behind = (np.logical_or.accumulate(one, axis) for one in (there, np.flip(there, axis)))
+    return before & np.flip(behind, axis)
 
 
 def _level(canvas: _Canvas, middle: np.ndarray) -> float:
@@ -319,7 +339,8 @@ def _put(
 
 
 def _fill(canvas: _Canvas, left: np.ndarray, taken: np.ndarray, level: float, rng: np.random.Generator) -> None:
-    """Pixels `left` (n,) as the next ones of their row are that are not `taken`, or the ground before these."""
+    """Pixels `left` (n,) as the farther of the next ones of their row is that are not `taken`, or the ground before it,
+    as bright as the ground beside it."""
     width, free = canvas.sensor.width, ~hidden(canvas.sensor)
     free.flat[taken] = False
     for row in np.unique(left // width):
@@ -327,15 +348,27 @@ def _fill(canvas: _Canvas, left: np.ndarray, taken: np.ndarray, level: float, rn
         if not len(others):
             continue
         before, after, share = beside(gone, others, width)
-        nearer, down = np.where(share <= 0.5, before, after), canvas.rays[row, gone, 2]
-        both, plane = one_surface(canvas.metres[row, before], canvas.metres[row, after], share)
-        behind = np.where(both, plane, canvas.metres[row, nearer])
-        behind = np.where(behind > 0, behind, np.inf)
+        ends = canvas.metres[row, before], canvas.metres[row, after]
+        both, plane = one_surface(*ends, share)
+        ends = [np.where(end > 0, end, np.inf) for end in ends]
+        farther = np.where(ends[0] >= ends[1], before, after)
+        behind = np.where(both, plane, np.maximum(*ends))
+        down = canvas.rays[row, gone, 2]
         ground = np.where(down < -0.01, level / np.minimum(down, -0.01), np.inf)
         metres = np.minimum(behind, ground)
         there = metres <= canvas.sensor.max_range
         noise = range_noise(np.where(there, metres, 0)) * rng.standard_normal(len(gone))
+        flat = others[GROUND[canvas.label[row, others]] & (canvas.metres[row, others] > 0)]
+        as_bright = np.where(ground < behind, _mirrored(gone, flat, width), farther) if len(flat) else farther
         canvas.metres[row, gone] = np.where(there, metres + noise, 0)
-        canvas.reflectance[row, gone] = np.where(there, canvas.reflectance[row, nearer], 0)
-        canvas.label[row, gone] = np.where(there, np.where(ground < behind, ROAD, canvas.label[row, nearer]), 0)
+        canvas.reflectance[row, gone] = np.where(there, canvas.reflectance[row, as_bright], 0)
+        canvas.label[row, gone] = np.where(there, np.where(ground < behind, ROAD, canvas.label[row, farther]), 0)
     canvas.points.reshape(-1, 3)[left] = _upright(canvas.sensor, canvas.sensor.points(canvas.metres, left))
+
+
+def _mirrored(gone: np.ndarray, left: np.ndarray, width: int) -> np.ndarray:
+    """For each column that is gone the one of all that are left, rising, as far beyond the nearer end of the gap."""
+    after = np.searchsorted(left, gone)
+    a, b, share = beside(gone, left, width)
+    there = np.where(share <= 0.5, after - (gone - a) % width, after - 1 + (b - gone) % width)
+    return left[there % len(left)]
