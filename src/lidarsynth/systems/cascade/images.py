@@ -40,7 +40,7 @@ OBSERVED, TUNED = Grain((1.0, 1.0, 1.0), ground=0.6), Grain((1.0, 1.0, 1.0), gro
 # Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
 # before or behind it: of shares of the rays; of a few more, as a crown is deep. Chosen by street-2
 # (docs/training-default.md); streets have 0.08, 0.035 and 0.02 for all of them.
-STRAYING = {"vegetation": ((0.99, 0.075), (0.01, 0.45)), "terrain": ((1.0, 0.035),), "trunk": ((1.0, 0.02),)}
+STRAYING = {"vegetation": ((0.955, 0.08), (0.045, 0.45)), "terrain": ((1.0, 0.035),), "trunk": ((1.0, 0.02),)}
 ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about are drawn alike: things are whole
 # The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it
 # has: so there is as much terrain and fence as in streets, while labels are right more often.
