@@ -393,6 +393,13 @@ def test_info_knows_scans_models_presets_and_sensors(run: Run, tiny: Path, scan:
         assert word in answer.out
 
 
+@pytest.mark.parametrize(("word", "meant"), [("vlp16", "vlp-16"), ("defaut", "default"), ("zzz", None)])
+def test_info_of_an_unknown_word_names_one_that_is_near(run: Run, word: str, meant: str | None):
+    answer = run("info", word)
+    refused(answer, word, *(["found no file or folder of that name"] if meant is None else [f"was {meant} meant?"]))
+    assert ("meant?" in answer.err) == (meant is not None)
+
+
 @pytest.mark.parametrize("found", [
     {"settings": {}, "done": True, "scans": []}, {"settings": {}, "done": 1, "scans": 3, "skipped": 0, "failed": 0,
     "seconds": 1}, {"protocol": 1, "version": 2, "values": [3]}, {"world": 0, "frame": 0, "boxes": 3, "points": 1},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,7 +41,14 @@ def describe(what: str, reading: Reading | None = None) -> str:
     if what in PRESETS and what not in shipped() and not path.is_dir():
         experiment = PRESETS[what]()
         return describe_model(experiment, build_network(experiment), "preset, no weights")
-    return describe_model(*load_parts(what), source=what)
+    try:
+        parts = load_parts(what)
+    except ValueError as error:
+        near = get_close_matches(what.lower(), {*WORDS, *PRESETS, *shipped()}, n=1)
+        if not near or path.exists():
+            raise
+        raise ValueError(f"{error}; was {near[0]} meant?") from None
+    return describe_model(*parts, source=what)
 
 
 def describe_sensor(sensor: Sensor) -> str:
