@@ -45,8 +45,8 @@ ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
 # is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": 0.45, "terrain": 0.6}
-# Logits that are taken off these in generated scans: so much rarer they are in the streets that layouts have learned
-# than in those of the network of classes (docs/training-default.md).
+# Logits that these get in generated scans, being so much rarer in the streets that layouts have learned than in those
+# of the network of classes (docs/training-default.md).
 RARER = {"bicycle": -1.0, "motorcycle": -4.0, "truck": -1.5, "other-vehicle": -0.9, "person": -1.1,
          "bicyclist": -1.9, "motorcyclist": -2.2}  # fmt: skip
 # Rows and columns on either side whose chances count as much as a pixel's own, where they are as far to this share of
