@@ -260,7 +260,7 @@ def test_measured_points_stay_whatever_the_sensor(model):
     measured = {tuple(p) for p in scan.xyz.tolist()}
     assert measured <= {tuple(p) for p in filled.points.xyz.tolist()} and len(filled.points) > len(scan)
     with pytest.raises(ValueError, match="at least 2 beams, found one"):
-        model.upsample(sphere(Sensor("one", (-5.0,), 64)), Sensor("one", (-5.0,), 64))
+        model.upsample(sphere(Sensor("one", (-5.0,), 256)), Sensor("one", (-5.0,), 256))
 
 
 def test_another_sensor_is_for_models_of_any_sensor():
