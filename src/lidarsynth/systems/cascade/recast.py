@@ -183,7 +183,7 @@ def _thing(
 
 
 def _a_wall(points: np.ndarray) -> bool:
-    """Whether points (n, 3) stand in a line that is longer than a thing."""
+    """Whether points (n, 3), metres, stand in a line that is longer than a thing."""
     thin, long = np.sqrt(np.linalg.eigvalsh(np.cov(points[:, :2].T)).clip(0))
     return bool(thin < WALL[0] and long > WALL[1])
 
