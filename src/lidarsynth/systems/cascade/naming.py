@@ -42,9 +42,9 @@ MOSTLY, SOME = 0.7, 0.02
 # Inside, people are told from furniture piece by piece: by the logarithm of their chance there, so much of what the
 # network of streets says, and as much more as brings their IoU to most in held-out insides.
 ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no longer counts
-# Logits that what grows gets where classes are named for the texture that they give: what is drawn is calmer than what
-# is recorded, and read as a wall too often. Chosen by street-2 (docs/training-default.md).
-GROWING = {"vegetation": 0.45, "terrain": 0.6}
+# Logits that what grows gets where classes are named for the texture that they give: what is drawn has less of grass
+# than streets have, and as much of leaves. Chosen by street-2 (docs/training-default.md).
+GROWING = {"vegetation": -0.1, "terrain": 1.6}
 # Logits that these get in generated scans, being so much rarer in the streets that layouts have learned than in those
 # of the network of classes (docs/training-default.md).
 RARER = {"bicycle": -1.0, "motorcycle": -4.0, "truck": -1.5, "other-vehicle": -0.9, "person": -1.1,
