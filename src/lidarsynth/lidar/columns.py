@@ -90,12 +90,18 @@ def own_columns(scan: Scan, sensor: Sensor) -> Sensor:
         return sensor
     usual = full_turn(sensor)
     width = min(sensor.width, found) if found < usual else min(round(sensor.width * found / usual), WIDEST)
-    return sensor.resized(width=width)
+    return sensor if width == sensor.width else sensor.resized(width=width)
 
 
 def as_scanned(scan: Scan, sensor: Sensor) -> Sensor:
     """A sensor that was recognised in a scan, with its beams and columns as the scan has them."""
     return own_columns(scan, own_beams(scan, sensor))
+
+
+def usual_at_most(sensor: Sensor) -> Sensor:
+    """The recognised sensor in no more columns than its table says: classes are no better for more."""
+    usual = WORDS[sensor.name].width if sensor.name in WORDS else sensor.width
+    return sensor.resized(width=min(usual, sensor.width))
 
 
 def columns_note(sensor: Sensor) -> str:

@@ -115,7 +115,7 @@ def _standing(
               "down (--transform 0:0:0:180:0:0 turns them)"  # fmt: skip
         return Sensor.mount, Sensor.tilt, why
     if 2 * len(grounds) < scans:
-        why = f"expected scans that show the ground all around, found {len(grounds)} of {scans}"
+        why = f"expected scans that show the ground around, found {len(grounds)} of {scans}"
         return Sensor.mount, Sensor.tilt, why
     height, pitch, roll = np.median(grounds, axis=0).tolist()
     heights = np.array(grounds)[:, 0]

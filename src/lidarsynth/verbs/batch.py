@@ -18,7 +18,7 @@ from lidarsynth.data.bags import Cloud
 from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
-from lidarsynth.lidar.columns import columns_note
+from lidarsynth.lidar.columns import columns_note, usual_at_most
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
@@ -272,11 +272,14 @@ def _made(
         return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
+        sensor = usual_at_most(sensor) if job.sensor is None else sensor
         named = label_scan(model, scan, sensor, job.how.precision, job.least)
         return named, found(named.points, sensor) + _columns(sensor, job, "; ")
     sensor = named_sensor(scan, path, "--from", job.sensor, model.sensor if model.any_sensor else None)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
-    return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}" + _columns(sensor, job, "; ")
+    done = f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
+    own = filled.image.sensor.width == sensor.width  # else the image is another sensor's
+    return filled, done + _columns(sensor, job, "; ") if own else done
 
 
 def _columns(sensor: Sensor, job: Job, before: str = "") -> str:
