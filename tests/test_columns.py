@@ -116,7 +116,7 @@ def test_a_named_sensor_of_too_many_columns_is_warned_of():
 def test_the_verbs_say_it_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     path = tmp_path / "own.pcd"
     write(path, turn(SENSORS["os1-64"], 512, jitter=0.02))
-    said = "os1-64 in 512 columns, by the scan's own steps (--sensor os1-64: in 1024)"
+    said = "os1-64 in 512 columns, by the scan's own steps; where it is named, in 1024"
     for words in (["info"], ["project", "--out", tmp_path / "a.npz"],
                   ["complete", "--model", "nearest", "--out", tmp_path / "a.ply"]):  # fmt: skip
         main([words[0], str(path), *map(str, words[1:])])
@@ -130,8 +130,13 @@ def test_real_scans_of_usual_rates_keep_their_images(shared: Path):
     assert len(paths) > 3
     for path in paths:
         assert own_columns(read(path), SENSORS["hdl-64e-kitti"]) is SENSORS["hdl-64e-kitti"], path.name
-    for name, sensor in (("fast_gicp_251370668.pcd", "hdl-32e"), ("nuscenes_hdl32e.pcd.bin", "hdl-32e"),
-                         ("pandaset_pandar64_0001.pcd", "pandar64"), ("sensorscalibration_top.pcd", "pandar64")):  # fmt: skip
+    others = {
+        "fast_gicp_251370668.pcd": "hdl-32e",
+        "nuscenes_hdl32e.pcd.bin": "hdl-32e",
+        "pandaset_pandar64_0001.pcd": "pandar64",
+        "sensorscalibration_top.pcd": "pandar64",
+    }
+    for name, sensor in others.items():
         assert own_columns(read(shared / "scans" / "other" / name), SENSORS[sensor]) is SENSORS[sensor], name
 
 

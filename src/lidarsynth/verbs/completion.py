@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.columns import as_scanned
+from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
