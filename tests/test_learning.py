@@ -159,11 +159,15 @@ def test_sky_at_the_end_of_a_street_is_no_carrier():
 
 
 def test_a_sensor_that_looks_ahead_is_learned_so():
-    sensor = Sensor("ahead", tuple(np.linspace(8.0, -16.0, 16).tolist()), 600, 0.3, 100.0)
+    elevations = tuple(np.linspace(8.0, -16.0, 16).tolist())
+    sensor = Sensor("ahead", elevations, 600, 0.3, 100.0, mount=1.1, tilt=(-3.0, 2.0))
     streets = SyntheticStreets(seed=3, length=200, sensor=sensor)
     scans = [streets[16 * i] for i in range(7)]
     ahead = [scan[np.abs(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0])) < np.pi / 3] for scan in scans]
-    found = learn_sensor(ahead, "ahead").sensor
+    learned = learn_sensor(ahead, "ahead")
+    found = learned.sensor
+    assert learned.afloat is None and found.mount == pytest.approx(1.1, abs=0.1)
+    assert found.tilt == pytest.approx((-3.0, 2.0), abs=1.0)
     aside = np.abs(found.ray_angles()[1])
     assert found.blocked_rays()[aside > np.pi / 3 + 0.01].mean() > 0.8
     assert not found.blocked_rays()[aside < np.pi / 3 - 0.01].any()

@@ -10,7 +10,8 @@ from test_recognise import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write
-from lidarsynth.lidar.learning import _step, learn_sensor
+from lidarsynth.lidar.columns import azimuth_step
+from lidarsynth.lidar.learning import learn_sensor
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.lidar.turns import _in_order, several_turns
@@ -193,5 +194,5 @@ def test_columns_are_no_more_than_the_points_allow():
     twist = np.radians(360 / 512 * 0.03 * scan.ring)
     x, y, z = scan.xyz.T
     turned = np.stack([x * np.cos(twist) - y * np.sin(twist), x * np.sin(twist) + y * np.cos(twist), z], axis=1)
-    assert 2 * np.pi / _step(turned, scan.ring) == pytest.approx(512, rel=0.01)
-    assert 2 * np.pi / _step(turned, scan.ring // 8) <= 2 * 8 * 512
+    assert 2 * np.pi / azimuth_step(turned, scan.ring) == pytest.approx(512, rel=0.01)
+    assert 2 * np.pi / azimuth_step(turned, scan.ring // 8) <= 2 * 8 * 512

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarsynth.lidar.blocked import blocked_runs
+from lidarsynth.lidar.columns import azimuth_step
 from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
 from lidarsynth.lidar.ground import is_above, lowest_plane
@@ -21,9 +22,6 @@ NEAR, FEWEST = 3.0, 200  # metres; points of a ring that a fit needs
 THIN, SEEN = 5, 0.5  # points of a ring that is a row all the same; metres, where so few are beyond NEAR
 SAME, CLOSEST = 0.1, 0.02  # of the usual spacing: rings of one beam; degrees: no sensor's beams are closer
 SMEARED = 0.1  # degrees: known sensors' points lie within 0.03 of their beams where nothing has moved them
-# Times as many columns as the fullest ring has points where it has any, LEAST degrees of the turn or more; more columns
-# are steps from one beam's points to another's.
-DENSER, LEAST = 2.0, 30
 SAMPLE = 1500  # points of a ring and scan are enough
 HALVED = 0.5  # of the residual: heights that explain less are bent rings of a moving car
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
@@ -73,7 +71,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     points = _pooled(kept)
     steps, depths, grounds, above = [], [], [], 0
     for scan, ring in kept:
-        steps.append(_step(scan.xyz, ring))
+        steps.append(azimuth_step(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((np.quantile(depth, 0.001), depth.max()))
         grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
@@ -117,7 +115,7 @@ def _standing(
               "down (--transform 0:0:0:180:0:0 turns them)"  # fmt: skip
         return Sensor.mount, Sensor.tilt, why
     if 2 * len(grounds) < scans:
-        why = f"expected scans that show the ground all around, found {len(grounds)} of {scans}"
+        why = f"expected scans that show the ground around, found {len(grounds)} of {scans}"
         return Sensor.mount, Sensor.tilt, why
     height, pitch, roll = np.median(grounds, axis=0).tolist()
     heights = np.array(grounds)[:, 0]
@@ -271,21 +269,6 @@ def _falling(elevations: list[float]) -> tuple[float, ...]:
     for row in range(1, len(elevations)):
         elevations[row] = round(min(elevations[row], elevations[row - 1] - 0.001), 3)
     return tuple(elevations)
-
-
-def _step(xyz: np.ndarray, ring: np.ndarray) -> float:
-    """Radians between neighbouring columns: the median step along the rings, steps over lost points left out, and such
-    that the fullest ring, had it returned as often all around, is at least half full."""
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    order = np.lexsort((azimuth, ring))
-    step = np.diff(azimuth[order])[np.diff(ring[order]) == 0]
-    usual = np.median(step[step > 1e-5])
-    degree = np.floor(np.degrees(azimuth)).astype(int) % 360
-    count = np.bincount(ring.astype(int) * 360 + degree, minlength=360 * (int(ring.max()) + 1)).reshape(-1, 360)
-    seen = (count > 0).sum(axis=1)
-    most = float((360 * count.sum(axis=1) / np.maximum(seen, 1)).max(initial=0, where=seen >= LEAST))
-    found = float(np.mean(step[(step > 0.25 * usual) & (step < 1.5 * usual)]))
-    return found if most == 0 else max(found, 2 * np.pi / (DENSER * most))
 
 
 def _seen(kept: list[tuple[Scan, np.ndarray]], width: int, rows: int) -> np.ndarray:

@@ -347,6 +347,8 @@ SENSORS: dict[str, Sensor] = {
     "os1-128": Sensor("os1-128", _even(22.5, -22.5, 128), 1024, 0.8, 120.0),
     "pandar64": Sensor("pandar64", _PANDAR64, 1800, 0.3, 200.0),
 }
+# Firings of a turn at 10 turns a second, of those whose images have fewer columns.
+FULL_TURNS = {"hdl-64e-kitti": 2083, "hdl-32e": 2170, "vlp-16": 1800, "vlp-32c": 1800}
 
 
 # Those whose beams are others when they hang upside down, as under a drone or in a rack on a roof.

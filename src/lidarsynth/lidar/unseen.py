@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.lidar.columns import own_columns
 from lidarsynth.lidar.measured import were_new
 from lidarsynth.lidar.own_beams import stray_rings
 from lidarsynth.lidar.plural import plural
@@ -35,6 +36,9 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
         said.append(turns)
     if sensor is not None and (strays := stray_rings(scan, sensor)) is not None:
         said.append(strays)
+    if sensor is not None and (found := own_columns(scan, sensor).width) < sensor.width:
+        said.append(f"expected {sensor.width} columns, as {sensor.name} has, found {found}: what lies between them is "
+                    "filled in, too; learn the sensor, or leave out a known one's name")  # fmt: skip
     return "; ".join(said) or None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
-from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import FULL_TURNS, SENSORS, Sensor, get_sensor
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.layout import build
 from lidarsynth.streets.raycast import Caster
@@ -18,7 +18,7 @@ from lidarsynth.streets.sensor_model import OPTICS, Optics
 from lidarsynth.streets.turn import Turn, perfect, shoot
 from lidarsynth.streets.world import POSES, THING, World, visible
 
-FULL_TURN = 2083  # azimuth steps per turn of KITTI's sensor at 10 Hz
+FULL_TURN = FULL_TURNS["hdl-64e-kitti"]
 
 
 def whole(name: str, number: int, least: int) -> int:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 from lidarsynth.experiment.record import Experiment, with_fields
-from lidarsynth.lidar.own_beams import own_beams
+from lidarsynth.lidar.columns import as_scanned, usual_at_most
 from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
@@ -49,8 +49,12 @@ class AnySensorModel(ScanModel, ABC):
                 sensor = self.sensor  # the user's own, on which the model was tuned
             if sensor is None:
                 raise ValueError(f"{reason}{IN_PYTHON}")
-            sensor = own_beams(scan, get_sensor(sensor))
+            sensor = as_scanned(scan, get_sensor(sensor))
         return self.into(sensor)
+
+    def labelling(self, scan: Scan) -> Self:
+        """`suited_to` a scan that is to be labelled: in no more columns than usual; itself after `into`."""
+        return self.into(usual_at_most(self.suited_to(scan).sensor)) if self.own else self
 
     def suited_to_image(self, image: RangeImage) -> Self:
         """The model with images of this one's rays; itself after `into`."""

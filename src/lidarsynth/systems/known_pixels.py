@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarsynth.lidar.own_beams import own_beams
+from lidarsynth.lidar.columns import as_scanned
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
@@ -29,7 +29,7 @@ def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
         sensor_in, reason = recognise(scan)
         if sensor_in is None:
             raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
-        return own_beams(scan, get_sensor(sensor_in))
+        return as_scanned(scan, get_sensor(sensor_in))
     return get_sensor(sensor_in)
 
 

@@ -18,6 +18,7 @@ from lidarsynth.data.bags import Cloud
 from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
+from lidarsynth.lidar.columns import columns_note, usual_at_most
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
@@ -258,22 +259,33 @@ def _made(
     if job.verb == "project":
         image = project(scan, named_sensor(scan, path, "--sensor", job.sensor), job.projection, job.width)
         image = check_seen(image, len(scan))
-        return image, f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
+        done = f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
+        return image, done if job.width else done + _columns(image.sensor, job, "; ")
     assert model is not None
     if job.verb == "complete":
         sensor = None if job.sensor is None else get_sensor(job.sensor)
-        return complete_scan(model, scan, job.corrupt, job.how, on_step, sensor, job.least), ""
+        filled = complete_scan(model, scan, job.corrupt, job.how, on_step, sensor, job.least)
+        return filled, _columns(filled.image.sensor, job) if model.any_sensor else ""
     if job.verb == "realise":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         filled = realise_scan(model, scan, sensor, job.how.seed + work.number)
         return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
+        sensor = usual_at_most(sensor) if job.sensor is None else sensor
         named = label_scan(model, scan, sensor, job.how.precision, job.least)
-        return named, found(named.points, sensor)
+        return named, found(named.points, sensor) + _columns(sensor, job, "; ")
     sensor = named_sensor(scan, path, "--from", job.sensor, model.sensor if model.any_sensor else None)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
-    return filled, f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
+    done = f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
+    own = filled.image.sensor.width == sensor.width  # else the image is another sensor's
+    return filled, done + _columns(sensor, job, "; ") if own else done
+
+
+def _columns(sensor: Sensor, job: Job, before: str = "") -> str:
+    """That a scan's own sensor, which nobody named, has other columns than usual, in words after `before`."""
+    note = columns_note(sensor) if job.sensor is None else ""
+    return note and before + note
 
 
 def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | None) -> Scan:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.lidar.columns import as_scanned
 from lidarsynth.lidar.corruption import corrupt
-from lidarsynth.lidar.own_beams import own_beams
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
@@ -187,5 +187,5 @@ def named_sensor(scan: Scan, path: Path, flag: str, given: Sensor | str | None, 
             return own
         if given is None:
             raise ValueError(reason.replace("--sensor", flag))
-        return own_beams(scan, get_sensor(given))
+        return as_scanned(scan, get_sensor(given))
     return get_sensor(given)

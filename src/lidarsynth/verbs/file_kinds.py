@@ -17,12 +17,13 @@ from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report, sensor_in
+from lidarsynth.lidar.columns import columns_note, own_columns
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.ground import LEANING, stance
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import from_dict
+from lidarsynth.lidar.sensor import from_dict, get_sensor
 from lidarsynth.verbs.inputs import Reading, has_scans, is_stream, moved
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
@@ -114,6 +115,8 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
         "fields": fields,
         "sensor": f"{name} ({reason})" if name else reason,
     }
+    if name and (note := columns_note(own_columns(scan, get_sensor(name)))):
+        lines["columns"] = note
     warning = check_frame(scan).warning()
     if warning:
         return lines | {"frame": warning}

@@ -248,7 +248,7 @@ class CascadeModel(AnySensorModel):
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
         """The image of `label`, with the classes of its pixels."""
         scan, projection, model = as_scan(scan), self.experiment.data.projection, self.with_labels()
-        model = model.suited_to(scan) if sensor is None else model.into(sensor)
+        model = model.labelling(scan) if sensor is None else model.into(sensor)
         pixels = pixel_of_points(scan, model.sensor, projection)
         image = check_seen(project(scan, model.sensor, projection, pixels=pixels), len(scan))
         (image,) = model._as_found(image, image.mask)._named([image], least, recorded=True)
