@@ -502,7 +502,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("generate --model nothing", "nothing: expected"),
         ("generate --nope 3", "--nope"),
         ("generate --sead 3", "found --sead 3; was --seed meant?"),
-        ("data kitti ROOT --out c", "lidarsynth: lidarsynth data: expected SOURCE ROOT CACHE and its options, found --out c\n"),
+        ("data kitti ROOT --out c", "data: expected SOURCE ROOT CACHE and its options, found --out c\n"),
         ("upsample SCAN --out d.ply --sensor-in vlp-16", "found --sensor-in vlp-16; was --from meant?"),
         ("complete SCAN --out d.ply --ring 0-9", "found --ring 0-9; was --rings meant?"),
         ("complete SCAN --out d.ply --model TINY --rings 9", "expected --rings FIRST-LAST, such as 32-63, found '9'"),
