@@ -18,13 +18,11 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 from lidarsynth.systems.denser import TIMES, beam_step, denser, spread
 from lidarsynth.systems.filling import Filling, whole
 from lidarsynth.systems.known_pixels import sensor_that_made
+from lidarsynth.systems.notes import IN_PYTHON
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-
-IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
 
 
 class AnySensorModel(ScanModel, ABC):
