@@ -304,6 +304,11 @@ def test_complete_takes_several_scans_or_a_folder(run: Run, tiny: Path, tmp_path
     write(scans / "c.bin", street())
     refused(run("complete", scans, "--out", tmp_path / "z", *words), "found two named c: ", "c.bin and ", "c.ply\n")
     refused(run("complete", "--out", tmp_path / "z", *words), "found none")
+    (scans / "c.bin.gz").touch()
+    (scans / "more").mkdir()
+    for pattern, found in (("*.gz", "c.bin.gz"), ("m*", "more"), ("*.las", "none")):
+        refused(run("complete", scans / pattern, "--out", tmp_path / "z", *words), f"of this pattern, found {found}\n")
+    assert not (tmp_path / "z").exists()
 
 
 def test_nothing_is_put_before_a_point_beyond_the_range_limits(run: Run, tiny: Path, tmp_path: Path):
