@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming, one_line
-from lidarsynth.data.cut_bags import mend
+from lidarsynth.data.cut_bags import Mended, mend
+from lidarsynth.data.cut_databases import has_log, read_database
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
 from lidarsynth.lidar.small_file import check_regular
@@ -211,12 +212,25 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
 
 
 def _ros2(path: Path) -> tuple[Any, tuple[str, ...]]:
-    """The reader of a ROS 2 folder or a database, opened, and nothing to be said of it."""
+    """The reader of a ROS 2 folder or a database, opened, and what is to be said of a database that ends early. Raises
+    FileError for one without a message."""
     from rosbags.rosbag2 import Reader
 
     reader = Reader(path)
-    reader.open()
-    return reader, ()
+    log = path.is_file() and has_log(path)  # which rosbags passes over
+    try:
+        if not log:
+            reader.open()
+            return reader, ()
+    except (*BROKEN, *library_errors()):
+        if path.is_dir() or (found := read_database(path)) is None:
+            raise
+    else:
+        found = read_database(path)
+    words = Mended(path, b"", 0, b"", found.message_count if found else 0, 0).words()
+    if found is None or not found.rows:
+        raise FileError(words)
+    return found, (words,)
 
 
 def _ros1(path: Path) -> tuple[Any, tuple[str, ...]]:
