@@ -116,7 +116,7 @@ def test_so_are_those_that_are_compressed(compression: str, tmp_path: Path):
 
 @pytest.mark.parametrize("compression", [None, "LZ4", "BZ2"])
 @pytest.mark.parametrize("active", [True, False])
-def test_a_bag_of_ros_1_is_read_up_to_its_last_whole_chunk(active: bool, compression: str | None, tmp_path: Path):
+def test_a_bag_of_ros_1_is_read_up_to_its_last_whole_message(active: bool, compression: str | None, tmp_path: Path):
     """As `rosbag record` leaves it, which writes last where the index is, or a copy that was not gone through with."""
     whole = bag(tmp_path / "in.bag", compression)
     data, size = bytearray(whole.read_bytes()), whole.stat().st_size
@@ -129,9 +129,25 @@ def test_a_bag_of_ros_1_is_read_up_to_its_last_whole_chunk(active: bool, compres
     for length in (0, 5, 13, 40, 4117, *range(5_000, size, size // 40), size - 1):
         part.write_bytes(data[:length])
         counts.append(check_start(part, whole))
+        assert compression is not None or counts[-1] == whole_in(part, whole)
     assert counts == sorted(counts) and counts[0] == 0 and counts[-1] == COUNT and len(set(counts)) >= COUNT // 2
     with open_bag(part) as opened:
         assert dict(opened.topics[0].offered)["latching"] == "1"
+
+
+def test_what_is_behind_a_broken_chunk_of_ros_1_is_counted_as_lost(tmp_path: Path):
+    whole = bag(tmp_path / "in.bag")
+    data = bytearray(whole.read_bytes())
+    with open_bag(whole) as opened:
+        fourth = data.index(list(opened.messages())[3].data)  # the second of the second chunk
+    name = data.rindex(b"conn=", 0, fourth)
+    data[name : name + 5] = b"none="
+    part = tmp_path / "part.bag"
+    part.write_bytes(data[:-1])
+    assert check_start(part, whole) == 3
+    with open_bag(part) as opened:
+        lost = int(opened.cut[0].partition("the last ")[2].partition(" ")[0])
+    assert 0 < len(data) - fourth < lost < len(data) - fourth + 200
 
 
 def test_what_is_behind_a_broken_chunk_or_is_zeros_is_left_out_and_told(tmp_path: Path):
