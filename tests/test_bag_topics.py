@@ -184,6 +184,41 @@ def test_when_a_message_was_sent_and_its_number_stay(tmp_path: Path):
     assert found == notes + [("/points", 10 * n, 10 * n - 4, n + 7) for n in (1, 2, 3)]
 
 
+@pytest.mark.parametrize(("ending", "cut"), [(".mcap", False), (".mcap", True), (".bag", False)])
+def test_attachments_and_metadata_are_kept_too(
+    ending: str, cut: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """But what ROS 2 tells there of the file itself; of a recording that was cut as well. A .bag holds none, and a line
+    says so."""
+    from mcap.reader import make_reader
+    from mcap.records import Attachment, Metadata
+
+    with write_bag(
+        tmp_path / "in.mcap", [Topic("/p", POINTS, "ros1" if ending == ".bag" else "cdr", ("", b""), 0)]
+    ) as writer:
+        around = np.radians(np.arange(0, 360, 0.5, dtype=np.float32))
+        scan = {"x": 9 * np.cos(around), "y": 9 * np.sin(around), "z": 0 * around, "intensity": 0 * around}
+        writer.write_cloud("/points", Cloud(0, "lidar", 10, scan))
+        writer.attach(Attachment(3, 4, "camera.yaml", "text/yaml", b"a: 1"))
+        writer.attach(Metadata("drive", {"driver": "Ada"}))
+        writer.attach(Metadata("rosbag2", {"serialized_metadata": "of in.mcap"}))
+    source, out = tmp_path / "in.mcap", tmp_path / f"out{ending}"
+    if cut:
+        source.write_bytes(source.read_bytes()[:-9])
+    main(["complete", str(source), "--out", str(out), "--keep-topics", "--model", "bilinear", "--sensor", "vlp-16"])
+    said = capsys.readouterr().err
+    if ending == ".bag":
+        assert "found a .bag, which holds none: camera.yaml, drive left out" in said
+        return
+    assert "left out" not in said
+    with open(out, "rb") as file:
+        (attached,) = make_reader(file).iter_attachments()
+        file.seek(0)
+        (told,) = make_reader(file).iter_metadata()
+    assert attached == Attachment(3, 4, "camera.yaml", "text/yaml", b"a: 1")
+    assert told == Metadata("drive", {"driver": "Ada"})
+
+
 def test_a_header_of_ros_1_keeps_its_number(tmp_path: Path):
     with write_bag(tmp_path / "in.bag") as writer:
         writer.write_cloud("/points", Cloud(5, "lidar", 6, CLOUD.fields, sequence=41))

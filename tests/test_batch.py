@@ -394,8 +394,8 @@ def test_arrays_are_scans():
 def test_what_is_no_scan_is_said_in_a_line(verb: str):
     with pytest.raises(ValueError, match="expected a scan or an array of points, found a list"):
         getattr(load("default"), verb)([[1.0, 2.0, 3.0]])
-    with pytest.raises(ValueError, match="nearest: expected a model such as default for 4 times as many beams"):
-        load("nearest").upsample(turn(SENSORS["vlp-16"]), times=4)
+    with pytest.raises(ValueError, match="kitti-streets: expected a model such as default for 4 times as many beams"):
+        load("kitti-streets").upsample(turn(SENSORS["vlp-16"]), times=4)
 
 
 def test_a_model_says_what_it_is_and_saves_itself(tmp_path: Path):

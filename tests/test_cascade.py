@@ -28,11 +28,11 @@ from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade import model as cascade_model
 from lidarsynth.systems.cascade.images import noisy
-from lidarsynth.systems.cascade.known import spread
 from lidarsynth.systems.cascade.layout import DRAFT, draft, one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.naming import FAIR, weights
 from lidarsynth.systems.cascade.surfaces import straightened
+from lidarsynth.systems.denser import spread
 from lidarsynth.weights.load import load_parts
 
 SMALL = Sensor("small", tuple(np.linspace(5, -25, 24).tolist()), 256, 0.5, 120.0, mount=1.8)

@@ -304,6 +304,11 @@ def test_complete_takes_several_scans_or_a_folder(run: Run, tiny: Path, tmp_path
     write(scans / "c.bin", street())
     refused(run("complete", scans, "--out", tmp_path / "z", *words), "found two named c: ", "c.bin and ", "c.ply\n")
     refused(run("complete", "--out", tmp_path / "z", *words), "found none")
+    (scans / "c.bin.gz").touch()
+    (scans / "more").mkdir()
+    for pattern, found in (("*.gz", "c.bin.gz"), ("m*", "more"), ("*.las", "none")):
+        refused(run("complete", scans / pattern, "--out", tmp_path / "z", *words), f"of this pattern, found {found}\n")
+    assert not (tmp_path / "z").exists()
 
 
 def test_nothing_is_put_before_a_point_beyond_the_range_limits(run: Run, tiny: Path, tmp_path: Path):
@@ -502,6 +507,7 @@ def test_broken_scans_are_one_line_and_leave_nothing(run: Run, tiny: Path, tmp_p
         ("generate --model nothing", "nothing: expected"),
         ("generate --nope 3", "--nope"),
         ("generate --sead 3", "found --sead 3; was --seed meant?"),
+        ("data kitti ROOT --out c", "data: expected SOURCE ROOT CACHE and its options, found --out c\n"),
         ("upsample SCAN --out d.ply --sensor-in vlp-16", "found --sensor-in vlp-16; was --from meant?"),
         ("complete SCAN --out d.ply --ring 0-9", "found --ring 0-9; was --rings meant?"),
         ("complete SCAN --out d.ply --model TINY --rings 9", "expected --rings FIRST-LAST, such as 32-63, found '9'"),

@@ -116,7 +116,7 @@ def test_so_are_those_that_are_compressed(compression: str, tmp_path: Path):
 
 @pytest.mark.parametrize("compression", [None, "LZ4", "BZ2"])
 @pytest.mark.parametrize("active", [True, False])
-def test_a_bag_of_ros_1_is_read_up_to_its_last_whole_chunk(active: bool, compression: str | None, tmp_path: Path):
+def test_a_bag_of_ros_1_is_read_up_to_its_last_whole_message(active: bool, compression: str | None, tmp_path: Path):
     """As `rosbag record` leaves it, which writes last where the index is, or a copy that was not gone through with."""
     whole = bag(tmp_path / "in.bag", compression)
     data, size = bytearray(whole.read_bytes()), whole.stat().st_size
@@ -129,9 +129,25 @@ def test_a_bag_of_ros_1_is_read_up_to_its_last_whole_chunk(active: bool, compres
     for length in (0, 5, 13, 40, 4117, *range(5_000, size, size // 40), size - 1):
         part.write_bytes(data[:length])
         counts.append(check_start(part, whole))
+        assert compression is not None or counts[-1] == whole_in(part, whole)
     assert counts == sorted(counts) and counts[0] == 0 and counts[-1] == COUNT and len(set(counts)) >= COUNT // 2
     with open_bag(part) as opened:
         assert dict(opened.topics[0].offered)["latching"] == "1"
+
+
+def test_what_is_behind_a_broken_chunk_of_ros_1_is_counted_as_lost(tmp_path: Path):
+    whole = bag(tmp_path / "in.bag")
+    data = bytearray(whole.read_bytes())
+    with open_bag(whole) as opened:
+        fourth = data.index(list(opened.messages())[3].data)  # the second of the second chunk
+    name = data.rindex(b"conn=", 0, fourth)
+    data[name : name + 5] = b"none="
+    part = tmp_path / "part.bag"
+    part.write_bytes(data[:-1])
+    assert check_start(part, whole) == 3
+    with open_bag(part) as opened:
+        lost = int(opened.cut[0].partition("the last ")[2].partition(" ")[0])
+    assert 0 < len(data) - fourth < lost < len(data) - fourth + 200
 
 
 def test_what_is_behind_a_broken_chunk_or_is_zeros_is_left_out_and_told(tmp_path: Path):
@@ -193,15 +209,54 @@ def test_the_other_parts_of_a_folder_are_read_beside_one_that_holds_nothing(tmp_
     assert series.cut == inputs.cut and len(series[COUNT - 1].scan) == 720
 
 
-@pytest.mark.parametrize("length", [0, 100, 5_000, -1])
-def test_a_database_that_is_cut_is_a_line(length: int, tmp_path: Path):
+def database(folder: Path) -> Path:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    with Writer(tmp_path / "drive", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with Writer(folder / "drive", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         points = writer.add_connection("/points", POINTS, typestore=typestore("cdr"))
-        for message in clouds("cdr"):
+        for message in reversed(list(clouds("cdr"))):
             writer.write(points, message.time, message.data)
-    part = cut(next((tmp_path / "drive").glob("*.db3")), length)
+    return folder / "drive" / "drive.db3"
+
+
+def test_every_whole_message_of_a_cut_database_is_read(tmp_path: Path):
+    """By their times, of those that were recorded first: here from the last one back."""
+    whole = database(tmp_path)
+    sent = [message.data for message in clouds("cdr")]
+    for length, least in ((90_000, 2), (whole.stat().st_size - 9000, 6)):
+        with open_bag(cut(whole, length)) as bag:
+            found = list(bag.messages(frozenset(["/points"])))
+            assert [m.time for m in bag.messages(start=COUNT - 1)] == [COUNT - 1, COUNT]
+            (line,) = bag.cut
+            assert EARLY in line and f": {len(found)} messages read" in line and bag.topics[0].count == len(found)
+            assert bag.topics[0].schema[1] and bag.topics[0].kind == POINTS
+        assert least <= len(found) < COUNT
+        assert [(m.time, m.data) for m in found] == list(enumerate(sent, 1))[-len(found) :]
+    with pytest.raises(FileError, match="expected a bag with a whole message"), open_bag(cut(whole, 45_056)):
+        pass
+
+
+def test_messages_in_the_log_of_a_killed_recorder_are_read(tmp_path: Path):
+    import shutil
+    import sqlite3
+    from contextlib import closing
+
+    with closing(sqlite3.connect(database(tmp_path))) as base:
+        base.execute("PRAGMA journal_mode = WAL")
+        base.execute("INSERT INTO messages SELECT 99, topic_id, 99, data FROM messages WHERE id = 1")
+        base.commit()
+        for ending in ("", "-wal"):
+            shutil.copy(tmp_path / "drive" / f"drive.db3{ending}", tmp_path / f"killed.db3{ending}")
+    before = (tmp_path / "killed.db3").read_bytes()
+    with open_bag(tmp_path / "killed.db3") as bag:
+        assert [message.time for message in bag.messages()] == [*range(1, COUNT + 1), 99]
+        assert EARLY in bag.cut[0] and bag.seconds == pytest.approx(98e-9)
+    assert (tmp_path / "killed.db3").read_bytes() == before
+
+
+@pytest.mark.parametrize("length", [0, 100, 5_000, -1])
+def test_a_database_that_is_cut_is_a_line(length: int, tmp_path: Path):
+    part = cut(database(tmp_path), length)
     with pytest.raises(FileError, match=rf"^{part}: expected a bag of ROS 1 or ROS 2.*"), open_bag(part) as opened:
         list(opened.messages())
 

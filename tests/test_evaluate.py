@@ -763,6 +763,7 @@ def test_the_verb_gathers_parts_and_refuses_in_one_line(tmp_path: Path, real: Pa
         ((samples, "--reference", real, "--out", tmp_path), "found "),
         (("--reference", real), "expected SAMPLES to judge"),
         ((tmp_path / "no", "--reference", real), "found no such file or folder"),
+        ((tmp_path / "no", "--reference", tmp_path / "nor"), f"{tmp_path / 'no'}: expected a cache, or samples"),
     ):
         code, _, error = run("evaluate", *words)
         assert code == 2 and reason in error and error.count("\n") == 1

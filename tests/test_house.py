@@ -12,6 +12,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import pytest
 
 import lidarsynth
@@ -274,6 +275,15 @@ def test_what_a_file_is_is_said_without_torch(tmp_path: Path):
     done = run_python("-X", "importtime", "-m", "lidarsynth", "info", str(tmp_path / "own.toml"))
     assert done.returncode == 0 and "4 from +3.00 to -3.00 degrees" in done.stdout
     assert "| torch" not in done.stderr
+
+
+def test_a_scan_is_projected_without_torch(tmp_path: Path):
+    angle = np.linspace(-3, 3, 500)
+    np.save(tmp_path / "a.npy", np.column_stack([9 * np.cos(angle), 9 * np.sin(angle), 0 * angle, 0.5 + 0 * angle]))
+    words = str(tmp_path / "a.npy"), "--sensor", "vlp-16", "--out", str(tmp_path / "a.npz")
+    done = run_python("-X", "importtime", "-m", "lidarsynth", "project", *words)
+    assert done.returncode == 0 and (tmp_path / "a.npz").exists() and (tmp_path / "a.png").exists()
+    assert "lidarsynth.verbs.batch" in done.stderr and "| torch" not in done.stderr
 
 
 def cpu_seconds(*arguments: str) -> float:

@@ -6,7 +6,7 @@ import pytest
 import lidarsynth as ls
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.streets.reader import SyntheticStreets
-from lidarsynth.systems.cascade.known import beam_step
+from lidarsynth.systems.denser import beam_step
 
 HDL = ls.get_sensor("hdl-64e-kitti")
 
@@ -51,3 +51,21 @@ def test_the_sensors_own_beams_are_filled_in_as_complete_does(street: ls.RangeIm
     both = dense.mask & whole.mask
     assert both.mean() > 0.9 * whole.mask.mean()
     assert np.median(np.abs(dense.range - whole.range)[both]) < 0.05
+
+
+def test_interpolations_put_beams_between_those_of_the_scans_own_sensor():
+    """Row i of the scan is row 4 i, and those between are on the straight line; `nearest` repeats its rows."""
+    sensor = ls.get_sensor("vlp-16")
+    scan = SyntheticStreets(4321, 1, sensor)[0]
+    own = ls.project(scan, sensor)
+    straight = ls.load("bilinear").upsample(scan, times=4)
+    assert straight.sensor.elevations[::4] == pytest.approx(sensor.elevations) and straight.shape[0] == 61
+    answered = (own.mask.mean(1) > 0.02).nonzero()[0]
+    np.testing.assert_array_equal(straight.range[4 * answered], own.range[answered])
+    first = answered[np.flatnonzero(np.diff(answered) == 1)[0]]
+    expected = 0.75 * own.range[first] + 0.25 * own.range[first + 1]
+    np.testing.assert_allclose(straight.range[4 * first + 1], expected, rtol=1e-5)
+    near = ls.load("nearest").upsample(scan)
+    np.testing.assert_array_equal(near.range[4 * first + 1], own.range[first])
+    every = {point.tobytes() for point in straight.to_scan().xyz}
+    assert {point.tobytes() for point in scan.xyz} <= every

@@ -32,7 +32,7 @@ class Many:
         str | None,
         arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
     ] = None
-    keep_topics: Annotated[bool, arg(help="copy all other topics of a bag into the new bag.")] = False
+    keep_topics: Annotated[bool, arg(help="copy all other topics, attachments and metadata into the new bag.")] = False
     metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None
     transform: Annotated[
         str | None,
@@ -297,7 +297,8 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     topic, others = _topics(paths[0], many)
     calls = _calls(job, model, many.workers)
     with write_bag(out, others) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
-        _copy(paths[0], writer, others)
+        if many.keep_topics:
+            _copy(paths[0], writer, others)
         stream = (Work(item, None, looked_at(number), number) for number, item in enumerate(inputs.stream()))
         for result in run(replace(job, picture=False), stream, many.workers, model, on_step):
             if result.cloud is not None:
@@ -323,11 +324,13 @@ def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
 def _copy(path: Path, writer: BagWriter, topics: list[Topic]) -> None:
     from lidarsynth.data.bags import open_bag
 
-    if not topics:
-        return
     with open_bag(path) as bag:
-        for message in bag.messages(frozenset(topic.name for topic in topics)):
+        for message in bag.messages(frozenset(topic.name for topic in topics)) if topics else ():
             writer.copy(message)
+        left = [record.name for record in bag.attached() if not writer.attach(record)]
+    if left:
+        warn(f"{writer.path}: expected a .mcap for attachments and metadata, found a .bag, which holds none: "
+             f"{', '.join(left[:NAMED])}{', ...' if left[NAMED:] else ''} left out")  # fmt: skip
 
 
 def _tell(result: Result, picture: bool) -> None:

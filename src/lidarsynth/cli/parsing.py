@@ -69,9 +69,17 @@ def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     return _with_arguments
 
 
+def _plain_words(verb: Callable[..., None] | None) -> list[str]:
+    """The arguments of a verb that stand without an option's name, such as ROOT."""
+    hints = get_type_hints(verb, include_extras=True).items() if verb else ()
+    return [name.upper() for name, hint in hints if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
+
+
 def _options(described: Any) -> dict[str, str]:
-    """The options of a verb, or of a class of them, by their names and by those of the parameters."""
+    """The options of a verb, or of a class of them, by their names and by those of the parameters; None has none."""
     options = {}
+    if described is None:
+        return options
     for name, hint in get_type_hints(described, include_extras=True).items():
         called = [
             word for part in getattr(hint, "__metadata__", ()) if (word := getattr(part, "name", None)) is not None
@@ -89,16 +97,18 @@ def _refusals(verb: Callable[..., None] | None) -> AbstractContextManager[None]:
 
 
 def _refuse(verb: Callable[..., None] | None, event: events.ParseErrorEvent) -> NoReturn:
-    raise ValueError(f"{event.prog}: {_said(_options(verb) if verb else {}, event)}") from None
+    raise ValueError(f"{event.prog}: {_said(verb, event)}") from None
 
 
-def _said(options: Mapping[str, str], event: events.ParseErrorEvent) -> str:
+def _said(verb: Callable[..., None] | None, event: events.ParseErrorEvent) -> str:
     """What was expected and what was found."""
     if isinstance(event, events.MissingArgs):
         names = ", ".join(missing.arg.display_name() for missing in event.missing_arguments)
         return f"expected {names}, found {' '.join(event.unrecognized_tokens) or 'none'}"
     if isinstance(event, events.UnrecognizedArgs):
-        return f"expected one of its options, found {' '.join(event.tokens)}{_meant(event.tokens[0], options)}"
+        found, plain = event.tokens[0], " ".join(_plain_words(verb))
+        near = {name: own for name, own in _options(verb).items() if name[:3] == found[:3]}  # a first letter is no slip
+        return f"expected {plain and f'{plain} and '}its options, found {' '.join(event.tokens)}{_meant(found, near)}"
     if isinstance(event, events.InvalidChoice):
         choices = ", ".join(choice for choice in event.choices if choice != "None")
         name = event.argument.display_name()

@@ -8,17 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from lidarsynth.data.bag_errors import BROKEN, library_errors, one_line
-from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, typestore
+from lidarsynth.data.bags import POINTS, Attached, Cloud, Message, Topic, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
 from lidarsynth.lidar.whole_file import whole_file
 
-Put = Callable[[Message], None]
+Put: TypeAlias = "Callable[[Message | Attached], None]"
 FORMATS = {".bag": "ros1", ".mcap": "cdr"}  # what each kind of file holds, unless it is told otherwise
 PROFILES = {"ros1": "ros1", "cdr": "ros2"}  # of MCAP, by the encoding of its messages (mcap.dev/spec/registry)
 NAMES = {"ros1": "ROS 1", "cdr": "ROS 2"}
@@ -47,6 +47,14 @@ class BagWriter:
         _check_copied(self.path, message.topic, self.encoding)
         with _telling(self.path):
             self.put(message)
+
+    def attach(self, record: Attached) -> bool:
+        """An attachment, or metadata, of another MCAP file as it is. Whether this kind of file can hold it."""
+        if self.path.suffix.lower() == ".bag":
+            return False
+        with _telling(self.path):
+            self.put(record)
+        return True
 
 
 @contextmanager
@@ -127,7 +135,8 @@ def _bag(path: Path) -> Iterator[Put]:
     with Writer(path) as writer:
         connections: dict[Any, Any] = {}  # one for each node that published, whose last message may be a latched one
 
-        def put(message: Message) -> None:
+        def put(message: Message | Attached) -> None:
+            assert isinstance(message, Message)
             topic = message.topic
             key = topic.name, topic.offered
             if key not in connections:
@@ -156,6 +165,7 @@ def _digest(kind: str, text: str) -> str:
 
 @contextmanager
 def _mcap(profile: str, path: Path) -> Iterator[Put]:
+    from mcap.records import Attachment, Metadata
     from mcap.writer import Writer
 
     with open(path, "xb") as file:
@@ -163,7 +173,12 @@ def _mcap(profile: str, path: Path) -> Iterator[Put]:
         writer.start(profile=profile, library="lidarsynth")
         channels: dict[Any, int] = {}
 
-        def put(message: Message) -> None:
+        def put(message: Message | Attached) -> None:
+            if isinstance(message, Metadata):
+                return writer.add_metadata(message.name, message.metadata)
+            if isinstance(message, Attachment):
+                whose = message.name, message.media_type, message.data
+                return writer.add_attachment(message.create_time, message.log_time, *whose)
             topic = message.topic
             key = topic.name, topic.offered
             if key not in channels:

@@ -13,14 +13,19 @@ from contextlib import closing, contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming, one_line
-from lidarsynth.data.cut_bags import mend
+from lidarsynth.data.cut_bags import Mended, mend
+from lidarsynth.data.cut_databases import has_log, read_database
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
 from lidarsynth.lidar.small_file import check_regular
 
+if TYPE_CHECKING:
+    from mcap.records import Attachment, Metadata
+
+Attached: TypeAlias = "Attachment | Metadata"
 POINTS = "sensor_msgs/msg/PointCloud2"
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `rosbag record` leaves
 
@@ -87,7 +92,8 @@ class Cloud:
 class Bag:
     """An open bag. `messages(names)` streams those of the topics named, or all; `seconds` is its duration.
 
-    cut  what is to be said, a line a file, of a recording that ends early, as `cut_bags.Mended.words`
+    attached  gives the attachments and metadata of MCAP, records of its library, but what ROS 2 tells there of the file
+    cut       what is to be said, a line a file, of a recording that ends early, as `cut_bags.Mended.words`
     """
 
     path: Path
@@ -95,6 +101,7 @@ class Bag:
     seconds: float
     source: Callable[[frozenset[str], int], Iterator[Message]]
     cut: tuple[str, ...] = ()
+    attached: Callable[[], Iterator[Attached]] = lambda: iter(())
 
     def messages(self, names: frozenset[str] = frozenset(), start: int = 0) -> Iterator[Message]:
         """Messages in the order of their times, from `start` (nanoseconds) on. Raises FileError for a broken bag."""
@@ -205,12 +212,25 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
 
 
 def _ros2(path: Path) -> tuple[Any, tuple[str, ...]]:
-    """The reader of a ROS 2 folder or a database, opened, and nothing to be said of it."""
+    """The reader of a ROS 2 folder or a database, opened, and what is to be said of a database that ends early. Raises
+    FileError for one without a message."""
     from rosbags.rosbag2 import Reader
 
     reader = Reader(path)
-    reader.open()
-    return reader, ()
+    log = path.is_file() and has_log(path)  # which rosbags passes over
+    try:
+        if not log:
+            reader.open()
+            return reader, ()
+    except (*BROKEN, *library_errors()):
+        if path.is_dir() or (found := read_database(path)) is None:
+            raise
+    else:
+        found = read_database(path)
+    words = Mended(path, b"", 0, b"", found.message_count if found else 0, 0).words()
+    if found is None or not found.rows:
+        raise FileError(words)
+    return found, (words,)
 
 
 def _ros1(path: Path) -> tuple[Any, tuple[str, ...]]:
@@ -296,7 +316,8 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
         full = [part for part in parts if part.last]
         seconds = (max(part.last for part in full) - full[0].first) / 1e9 if full else 0.0
-        yield Bag(path, tuple(topics.values()), seconds, messages, tuple(found.words() for found in mended.values()))
+        words = tuple(found.words() for found in mended.values())
+        yield Bag(path, tuple(topics.values()), seconds, messages, words, lambda: _attached(streams))
 
 
 class _Part(NamedTuple):
@@ -355,3 +376,15 @@ def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, T
     reader = make_reader(stream, validate_crcs=True)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
         yield Message(topics[channel.topic], message.log_time, message.data, message.publish_time, message.sequence)
+
+
+def _attached(streams: Iterable[IO[bytes]]) -> Iterator[Attached]:
+    """Attachments and metadata of MCAP files, whether their summaries list them or not."""
+    from mcap.records import Attachment, Metadata
+    from mcap.stream_reader import StreamReader
+
+    for stream in streams:
+        stream.seek(0)
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Attachment) or (isinstance(record, Metadata) and record.name != "rosbag2"):
+                yield record

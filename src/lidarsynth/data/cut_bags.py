@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+import math
 import struct
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, NamedTuple
 from zlib import crc32
 
 from lidarsynth.data.bag_errors import BROKEN, library_errors
@@ -242,8 +244,8 @@ class _Found:
 
 
 def _ros1(path: Path, file: BinaryIO, size: int) -> Mended | None:
-    """Of a ROS 1 bag: all before the first chunk that is not whole, or without the places of its messages after it.
-    None for one that is encrypted."""
+    """Of a ROS 1 bag: all before the first chunk that is not whole, or without the places of its messages after it; of
+    that one the messages that are whole, as another chunk. None for one that is encrypted."""
     file.seek(len(ROS1))
     begin = _ros1_header(file, size)
     if begin is None or begin[0].get("encryptor"):
@@ -253,23 +255,24 @@ def _ros1(path: Path, file: BinaryIO, size: int) -> Mended | None:
     connections: dict[int, bytes] = {}
     chunks: list[bytes] = []
     while (found := _ros1_chunk(file, size, connections)) is not None:
-        counts, times = found
-        chunks.append(_ros1_record({
-            "op": bytes([ROS1_CHUNK_INFO]), "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", end),
-            "start_time": struct.pack("<II", *min(times)), "end_time": struct.pack("<II", *max(times)),
-            "count": struct.pack("<I", len(counts)),
-        }, b"".join(struct.pack("<II", *pair) for pair in counts.items())))  # fmt: skip
-        messages, end = messages + counts.total(), file.tell()
+        chunks.append(found.told(end))
+        messages, end = messages + found.counts.total(), file.tell()
     file.seek(end)
     ended = (after := _ros1_header(file, size)) is not None and after[0]["op"][0] == ROS1_CONNECTION
-    told = {"op": bytes([ROS1_HEADER]), "index_pos": struct.pack("<Q", end)}
+    rest, left = b"", 0 if ended else size - end
+    file.seek(end)
+    if not ended and (torn := _ros1_torn_chunk(file, size, connections)) is not None:
+        rest, left, found = torn
+        chunks.append(found.told(end))
+        messages += found.counts.total()
+    told = {"op": bytes([ROS1_HEADER]), "index_pos": struct.pack("<Q", end + len(rest))}
     told |= {"conn_count": struct.pack("<I", len(connections)), "chunk_count": struct.pack("<I", len(chunks))}
     head = ROS1 + _ros1_record(told, b" " * (room - len(_ros1_record(told, b""))))
-    tail = b"".join((*connections.values(), *chunks))
-    return Mended(path, head, end, tail, messages, 0 if ended else size - end)
+    tail = b"".join((rest, *connections.values(), *chunks))
+    return Mended(path, head, end, tail, messages, left)
 
 
-def _ros1_header(file: BinaryIO, size: int) -> tuple[dict[str, bytes], int] | None:
+def _ros1_header(file: BinaryIO, size: float) -> tuple[dict[str, bytes], int] | None:
     """The header of the record that `file` is at, and how many bytes follow it; None where they are not all there."""
     from rosbags.rosbag1.reader import Header, ReaderError, read_uint32
 
@@ -286,36 +289,91 @@ def _ros1_record(header: dict[str, bytes], data: bytes) -> bytes:
     return struct.pack("<I", len(told)) + told + struct.pack("<I", len(data)) + data
 
 
-def _ros1_chunk(
-    file: BinaryIO, size: int, connections: dict[int, bytes]
-) -> tuple[Counter[int], list[tuple[int, int]]] | None:
-    """Messages by connection, and their times (seconds, nanoseconds), of the chunk that `file` is at, which is then
-    past the places of its messages; its connections are added to those known. None where it is not sound."""
-    from rosbags.rosbag1.reader import decompressors
+class _Inside(NamedTuple):
+    """What is in a chunk of a ROS 1 bag: by connection the places of its messages, as (seconds, nanoseconds, byte), and
+    the records of its own connections; `end` is where the last whole record ends."""
 
-    if (found := _ros1_header(file, size)) is None or found[0]["op"][0] != ROS1_CHUNK:
-        return None
-    counts, times, own = Counter[int](), list[tuple[int, int]](), dict[int, bytes]()
-    try:
-        data = decompressors[found[0]["compression"].decode()](file.read(found[1]))
-        inside, at = BytesIO(data), 0
-        while at < len(data):
-            header, length = _ros1_header(inside, len(data)) or ({}, 0)
+    places: dict[int, list[tuple[int, int, int]]]
+    own: dict[int, bytes]
+    end: int
+
+    @property
+    def counts(self) -> Counter[int]:
+        """Messages by connection."""
+        return Counter({number: len(places) for number, places in self.places.items()})
+
+    def told(self, at: int) -> bytes:
+        """The record that tells of the chunk, which stands at `at`."""
+        times = [place[:2] for places in self.places.values() for place in places]
+        return _ros1_record({
+            "op": bytes([ROS1_CHUNK_INFO]), "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", at),
+            "start_time": struct.pack("<II", *min(times)), "end_time": struct.pack("<II", *max(times)),
+            "count": struct.pack("<I", len(self.places)),
+        }, b"".join(struct.pack("<II", *pair) for pair in self.counts.items()))  # fmt: skip
+
+
+def _ros1_inside(data: bytes, connections: dict[int, bytes]) -> _Inside | None:
+    """What is in a chunk of these bytes, up to the first record that is not whole; None where no message of a known
+    connection is."""
+    inside, end, places, own = BytesIO(data), 0, dict[int, list[tuple[int, int, int]]](), dict[int, bytes]()
+    with suppress(*BROKEN, *library_errors()):  # a record that is none ends it
+        while end < len(data) and (found := _ros1_header(inside, len(data))) is not None:
+            header, length = found
             after = inside.seek(length, 1)
             (number,) = struct.unpack("<I", header["conn"])
             if header["op"][0] == ROS1_CONNECTION:
-                own[number] = data[at:after]
+                own[number] = data[end:after]
             elif header["op"][0] == ROS1_MESSAGE:
-                counts[number] += 1
-                times.append(struct.unpack("<II", header["time"]))
-            at = after
+                places.setdefault(number, []).append((*struct.unpack("<II", header["time"]), end))
+            end = after
+    return _Inside(places, own, end) if places and places.keys() <= {*connections, *own} else None
+
+
+def _ros1_chunk(file: BinaryIO, size: int, connections: dict[int, bytes]) -> _Inside | None:
+    """What is in the chunk that `file` is at, which is then past the places of its messages; its connections are added
+    to those known. None where it is not sound."""
+    from rosbags.rosbag1.reader import decompressors
+
+    if (begin := _ros1_header(file, size)) is None or begin[0]["op"][0] != ROS1_CHUNK:
+        return None
+    try:
+        data = decompressors[begin[0]["compression"].decode()](file.read(begin[1]))
     except (*BROKEN, *library_errors()):
         return None
-    if not counts or not counts.keys() <= {*connections, *own}:
+    found = _ros1_inside(data, connections)
+    if found is None or found.end < len(data):
         return None
-    for _ in counts:
-        if (found := _ros1_header(file, size)) is None or found[0]["op"][0] != ROS1_INDEX:
+    for _ in found.places:
+        if (begin := _ros1_header(file, size)) is None or begin[0]["op"][0] != ROS1_INDEX:
             return None
-        file.seek(found[1], 1)
-    connections |= own
-    return counts, times
+        file.seek(begin[1], 1)
+    connections |= found.own
+    return found
+
+
+def _ros1_torn_chunk(file: BinaryIO, size: int, connections: dict[int, bytes]) -> tuple[bytes, int, _Inside] | None:
+    """Of the chunk that `file` is at, and that is cut off: the records of one with what is whole of it, and of its
+    places, how many bytes up to the file's end are not, and what is in it; its connections are added to those known.
+    None where nothing is."""
+    import bz2
+
+    import lz4.frame
+
+    opened = {b"none": bytes, b"bz2": bz2.BZ2Decompressor().decompress,
+              b"lz4": lz4.frame.LZ4FrameDecompressor().decompress}  # fmt: skip
+    if (begin := _ros1_header(file, math.inf)) is None or begin[0]["op"][0] != ROS1_CHUNK:
+        return None
+    try:
+        held = opened[begin[0]["compression"]](file.read(min(begin[1], MAX_BYTES)))
+    except (*BROKEN, *library_errors()):
+        return None
+    if (found := _ros1_inside(held, connections)) is None:
+        return None
+    connections |= found.own
+    chunk = {"op": bytes([ROS1_CHUNK]), "compression": b"none", "size": struct.pack("<I", found.end)}
+    records = [_ros1_record(chunk, held[: found.end])]
+    for number, places in found.places.items():
+        told = {"op": bytes([ROS1_INDEX]), "ver": struct.pack("<I", 1)}
+        told |= {"conn": struct.pack("<I", number), "count": struct.pack("<I", len(places))}
+        records.append(_ros1_record(told, b"".join(struct.pack("<III", *place) for place in places)))
+    return b"".join(records), len(held) - found.end + size - file.tell(), found

@@ -205,7 +205,8 @@ class _Run:
 def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
     files, real_files = _statistics_files(samples), _statistics_files(reference)
     warnings, hashes, told = (), {}, {}
-    real, truth, judged = None, None, None
+    real, truth = None, None
+    judged = None if files else run.images(samples)  # first: what is wrong with these is said first
     if real_files:
         real, warnings = merged(real_files, run.protocol)
         told["reference"] = ", ".join(map(str, real_files))
@@ -217,13 +218,12 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
     if truth and not run.sensor:
         fallback = run.sensor_of(truth, fallback)
     loaded = Loaded()
-    if files:
+    if judged is None:
         fake, more = merged(files, run.protocol)
         told["samples"], warnings = ", ".join(map(str, files)), warnings + more
         if truth:
             loaded = run.networks(fake.sensor)
     else:
-        judged = run.images(samples)
         sensor = run.sensor_of(judged, fallback)
         loaded, told["samples"] = run.networks(sensor), judged.source
         fake, _ = run.statistics(judged, sensor, "samples", loaded)

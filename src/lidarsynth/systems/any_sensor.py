@@ -6,18 +6,23 @@ from abc import ABC
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.columns import as_scanned, usual_at_most
+from lidarsynth.lidar.measured import with_measured
+from lidarsynth.lidar.projection import pixel_of_points
 from lidarsynth.lidar.recognition import lies_on, recognise
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
-from lidarsynth.systems.scan_model import ScanModel
+from lidarsynth.systems.denser import TIMES, beam_step, denser, spread
+from lidarsynth.systems.filling import Filling, whole
+from lidarsynth.systems.known_pixels import sensor_that_made
+from lidarsynth.systems.notes import IN_PYTHON
+from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-
-IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
 
 
 class AnySensorModel(ScanModel, ABC):
@@ -59,6 +64,39 @@ class AnySensorModel(ScanModel, ABC):
     def suited_to_image(self, image: RangeImage) -> Self:
         """The model with images of this one's rays; itself after `into`."""
         return self.into(image.sensor) if self.own and not same_rays(image.sensor, self.sensor) else self
+
+    def upsampled(
+        self,
+        scan: Scan | np.ndarray,
+        how: Filling,
+        sensor_in: Sensor | str | None = None,
+        on_step: OnStep = None,
+        times: int | None = None,
+    ) -> RangeImage:
+        """`upsample` of a record: of the scan's own sensor in `times` as many beams, or, after `into`, of that one.
+
+        Of a scan that holds every k-th beam of its sensor, as many times these: the sensor's own, where that is k.
+
+        `to_scan()` gives every measured point bit by bit beside the new ones.
+        """
+        if not self.own:
+            if times is not None:
+                raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
+            return super().upsampled(scan, how, sensor_in, on_step)
+        if how.precision is not None:
+            model = self.at_precision(how.precision)
+            return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
+        scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
+        own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
+        sparse = check_seen(self.into(own).image_of(scan), len(scan))
+        beams, dense, every = denser(own, beam_step(sparse), times)
+        sparse = sparse if beams == own else self.into(beams).image_of(scan)
+        model = self.into(dense)
+        image, known = spread(sparse, dense, every)
+        filled = model.fill(image, known, how, on_step)
+        loose = replace(scan, ring=None)
+        pixels = pixel_of_points(loose, filled.sensor, "spherical")
+        return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))
 
 
 def imaged_by(experiment: Experiment, sensor: Sensor, fixed: bool = False) -> Experiment:

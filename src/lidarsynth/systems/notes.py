@@ -11,6 +11,8 @@ from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 
+IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
+
 
 class Knows(Protocol):
     """What a model says of itself; see `ScanModel`."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,18 +26,20 @@ from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
-from lidarsynth.metrics.reconstruction import Errors
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
-from lidarsynth.systems.any_sensor import IN_PYTHON, AnySensorModel
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.scan_model import OnStep, ScanModel
+from lidarsynth.systems.notes import IN_PYTHON
 from lidarsynth.verbs.companions import LABEL, check_companions
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 from lidarsynth.verbs.viewpoint import viewpoint_note
+
+if TYPE_CHECKING:  # `project` needs no torch
+    from lidarsynth.metrics.reconstruction import Errors
+    from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 THIN = 0.1  # of the usual points of a ring; fewer do not make it one more than a sensor's beams
 FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
@@ -174,7 +176,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     begun, warning = time.perf_counter(), None
     try:
         loaded = work.item.read()
-        if job.sensor is None and (job.verb != "complete" or isinstance(model, AnySensorModel)):
+        if job.sensor is None and (job.verb != "complete" or _of_any_sensor(model)):
             job = replace(job, sensor=loaded.sensor)  # other models complete any sensor's scans in their own images
         with_points(loaded.scan, str(work.item.path))
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
@@ -201,6 +203,13 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
     errors = {} if isinstance(done, RangeImage) else done.errors
     whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
     return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud, beside)
+
+
+def _of_any_sensor(model: ScanModel | None) -> bool:
+    """Whether a model completes each scan in the image of its own sensor."""
+    from lidarsynth.systems.any_sensor import AnySensorModel
+
+    return isinstance(model, AnySensorModel)
 
 
 def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,12 +16,12 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor
-from lidarsynth.metrics.reconstruction import Errors, reconstruction_errors
-from lidarsynth.networks.interpolation import METHODS
 from lidarsynth.pictures.portrait import before_and_after, portrait
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.interpolation.model import interpolated
-from lidarsynth.systems.scan_model import OnStep, ScanModel
+
+if TYPE_CHECKING:
+    from lidarsynth.metrics.reconstruction import Errors
+    from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 DEFAULT = Filling()  # whatever the model does best
 
@@ -149,6 +150,10 @@ def judged(
     filled: RangeImage, before: RangeImage, known: np.ndarray, truth: RangeImage, judge: np.ndarray
 ) -> dict[str, Errors]:
     """Errors of the pixels to `judge`: of the model, of each interpolation of `known`, and of leaving them empty."""
+    from lidarsynth.metrics.reconstruction import reconstruction_errors
+    from lidarsynth.networks.interpolation import METHODS
+    from lidarsynth.systems.interpolation.model import interpolated
+
     results = {"lidarsynth": filled}
     results |= {name: interpolated(before, known, name) for name in METHODS}
     return {name: reconstruction_errors(r, truth, judge) for name, r in {**results, "left empty": before}.items()}

@@ -22,6 +22,8 @@ from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
+NAMED = 3  # files of a pattern that are no scans
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -220,9 +222,11 @@ def _expanded(path: Path) -> list[Path]:
     """The path, the files of a folder, or those that a glob finds; bags in a folder come too."""
     if not path.exists() and any(c in str(path) for c in "*?["):
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        if not found:
-            raise ValueError(f"{path}: expected files of this pattern, found none")
-        return [p for p in found if _is_scan(p)] + sorted(filter(is_stream, found), key=by_number)
+        read = [p for p in found if _is_scan(p)] + sorted(filter(is_stream, found), key=by_number)
+        if not read:
+            others = ", ".join(p.name for p in found[:NAMED]) + (", ..." if found[NAMED:] else "")
+            raise ValueError(f"{path}: expected scans, bags or captures of this pattern, found {others or 'none'}")
+        return read
     if path.is_dir() and not is_bag(path) and not _is_scan(path):
         bags = sorted(filter(is_stream, path.iterdir()), key=by_number)
         return bags if bags and not has_scans(path) else scan_files(path)

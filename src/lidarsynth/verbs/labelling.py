@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from lidarsynth.files.fields import PLACE, Fields
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import Filled
 from lidarsynth.verbs.inputs import Loaded
+
+if TYPE_CHECKING:
+    from lidarsynth.systems.scan_model import ScanModel
 
 MOST = 4  # classes that are told
 

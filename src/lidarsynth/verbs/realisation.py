@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from lidarsynth.files.fields import PLACE, Fields, find
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import Filled
 from lidarsynth.verbs.inputs import Loaded
+
+if TYPE_CHECKING:
+    from lidarsynth.systems.scan_model import ScanModel
 
 
 def realise_scan(model: ScanModel, scan: Scan, sensor: Sensor, seed: int = 0) -> Filled:

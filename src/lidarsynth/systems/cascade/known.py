@@ -16,10 +16,8 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of
-from lidarsynth.streets.hdl64e import dimness, hidden, written_out
+from lidarsynth.streets.hdl64e import dimness, hidden
 
-ANSWERS = 0.02  # of the rays of a beam
-FEW = 3  # beams that may be apart by chance
 ANOTHER, STEP, LOWEST = 0.2, 0.05, 0.2  # share of a mount by which another is told; metres
 
 
@@ -71,41 +69,6 @@ def unanswered(image: RangeImage, size: tuple[int, int]) -> Known:
 
 def _tensor(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))[None, None]
-
-
-def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, np.ndarray]:
-    """A scan's own image as every `times`-th row of a denser sensor's, and which pixels were looked at: those rows."""
-    shape = (sensor.height, sensor.width)
-    metres, shade, mask = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
-    metres[::times], shade[::times], mask[::times] = sparse.range, sparse.reflectance, sparse.mask
-    known = np.zeros(shape, bool)
-    known[::times] = (sparse.mask.mean(1) > ANSWERS)[:, None]  # a beam that hardly answers may not be there
-    xyz = None
-    if sparse.xyz is not None:
-        xyz = np.zeros((*shape, 3), np.float32)
-        xyz[::times] = sparse.xyz
-    return RangeImage(metres, shade, mask, sensor, xyz=xyz), known
-
-
-def beam_step(sparse: RangeImage) -> tuple[int, int]:
-    """(k, first): the scan holds every k-th beam of its sensor from the first on; 1 where it has beams side by side."""
-    beams = np.flatnonzero(sparse.mask.mean(1) > ANSWERS)
-    step = int(np.gcd.reduce(np.diff(beams))) if len(beams) > FEW else 1
-    return step, int(beams[0]) % step if len(beams) else 0
-
-
-def denser(sensor: Sensor, held: tuple[int, int], times: int) -> tuple[Sensor, Sensor, int]:
-    """(of, dense, every): `times` as many beams as a scan of the sensor holds, `held` as `beam_step` says; beam i of
-    the sensor `of`, in which the scan's image is, is beam `every` * i of `dense`.
-
-    Raises ValueError for `times` below 2.
-    """
-    step, first = held
-    if times > 1 and times % step == 0:
-        times //= step
-        return sensor, written_out(sensor).denser(times) if times > 1 else sensor, times
-    some = written_out(sensor).rows(range(first, sensor.height, step)) if step > 1 else sensor
-    return some, written_out(some).denser(times), times
 
 
 def best_known(told: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

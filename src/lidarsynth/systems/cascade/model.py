@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lidarsynth.diffusion.samplers import checked_seed, generators
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor
@@ -45,7 +44,7 @@ from lidarsynth.systems.cascade.images import (
     textured,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import beam_step, denser, known_of, rays_told, spread, standing, unanswered
+from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, grids, sampling, times
 from lidarsynth.systems.cascade.naming import GROWING, RARER, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
@@ -56,11 +55,9 @@ from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.cascade.unit import as_streets
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling, whole
-from lidarsynth.systems.known_pixels import sensor_that_made, with_known
+from lidarsynth.systems.known_pixels import with_known
 from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep
-
-TIMES = 4  # as many beams
 
 
 @dataclass(frozen=True, repr=False)
@@ -198,39 +195,6 @@ class CascadeModel(AnySensorModel):
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
         return own._named([filled], recorded=True)[0]
-
-    def upsampled(
-        self,
-        scan: Scan | np.ndarray,
-        how: Filling,
-        sensor_in: Sensor | str | None = None,
-        on_step: OnStep = None,
-        times: int | None = None,
-    ) -> RangeImage:
-        """`upsample` of a record: of the scan's own sensor in `times` as many beams, or, after `into`, of that one.
-
-        Of a scan that holds every k-th beam of its sensor, as many times these: the sensor's own, where that is k.
-
-        `to_scan()` gives every measured point bit by bit beside the new ones.
-        """
-        if not self.own:
-            if times is not None:
-                raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
-            return super().upsampled(scan, how, sensor_in, on_step)
-        if how.precision is not None:
-            model = self.at_precision(how.precision)
-            return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
-        scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
-        own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
-        sparse = check_seen(self.into(own).image_of(scan), len(scan))
-        beams, dense, every = denser(own, beam_step(sparse), times)
-        sparse = sparse if beams == own else self.into(beams).image_of(scan)
-        model = self.into(dense)
-        image, known = spread(sparse, dense, every)
-        filled = model.fill(image, known, how, on_step)
-        loose = replace(scan, ring=None)
-        pixels = pixel_of_points(loose, filled.sensor, "spherical")
-        return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
