@@ -186,6 +186,8 @@ def test_wrong_arguments_get_one_line(model: ls.ScanModel, scan: ls.Scan, image:
     named = replace(scan, extra={"name": np.full(len(scan), "a")})
     empty = scan[:0]
     calls = {
+        "expected metres from the sensor, found half .* and more away": lambda: model.complete(1000 * scan.xyz),
+        "expected points of .*, found the named fields f0, f1: Scan": lambda: model.complete(np.zeros(9, "f4, f4")),
         "expected a Scan, found a ndarray": lambda: ls.project(scan.xyz, "vlp-16"),  # type: ignore[arg-type]
         "expected a range image, .* found a Scan": lambda: ls.corrupt(scan, "beams:4"),  # type: ignore[arg-type]
         "known must be .* bool, got a str": lambda: model.complete(image, "beams:4"),  # type: ignore[arg-type]
