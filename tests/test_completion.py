@@ -284,7 +284,7 @@ def test_refusals_say_both_sides(model: LidarModel):
     with pytest.raises(ValueError, match="hides some of the measured pixels, found 'points:1', which hides none"):
         complete_scan(model, scan, "points:1")
     with pytest.raises(ValueError, match="expected points within hdl-64e-kitti/16's view, found none of"):
-        complete_scan(model, replace(scan, xyz=scan.xyz * np.float32(1000)))
+        complete_scan(model, replace(scan, xyz=scan.xyz * np.float32(0.01)))
     cloud = Scan(np.random.default_rng(0).uniform(-9, 9, (500, 3)).astype(np.float32), np.ones(500, np.float32))
     with pytest.raises(ValueError, match=r"cloud\.ply: .* name the sensor with --from"):
         named_sensor(cloud, Path("cloud.ply"), "--from", None)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import lidarsynth as ls
 from lidarsynth.lidar.depth import CODECS, decode, encode, from_x_0, to_x_0, valid
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
@@ -76,12 +77,32 @@ def test_images_become_x_0_and_images_again(codec):
     np.testing.assert_allclose(back.reflectance, image.reflectance, atol=1e-7)
 
 
-def test_samples_beyond_the_data_range_are_clamped():
-    x_0 = torch.full((2, 16, 64), 7.0)
-    x_0[0, 0] = -7.0
+def test_samples_a_little_beyond_the_data_range_are_clamped():
+    x_0 = torch.full((2, 16, 64), 1.04)
+    x_0[0, 0] = -1.04
     image = from_x_0(x_0 * torch.ones((), requires_grad=True), SENSOR, "log")
     assert not image.mask[0].any() and image.reflectance[0].max() == 0
     assert image.range.max() <= 80 and image.reflectance.max() <= 1
+
+
+def test_arrays_and_ranges_alone_become_images():
+    x_0 = to_x_0(image_of(np.random.default_rng(0).uniform(2, 79, (16, 64)).astype(np.float32)))
+    x_0[:, 0] = -1
+    expected = from_x_0(x_0, SENSOR)
+    for given in (x_0.numpy(), x_0.double(), x_0.numpy()[:1], x_0.to(torch.bfloat16)[:1]):
+        image = from_x_0(given, SENSOR)
+        np.testing.assert_array_equal(image.mask, expected.mask)
+        np.testing.assert_allclose(image.range, expected.range, rtol=0.05)
+        assert image.reflectance.any() == (len(given) == 2)
+    assert from_x_0(np.full((2, 64, 1024), -1.0), "hdl-64e").sensor is ls.SENSORS["hdl-64e"]
+
+
+def test_other_codes_are_no_x_0():
+    code = torch.rand(2, 16, 64, generator=torch.Generator().manual_seed(0))
+    wide, coded = 1.5 * (2 * code - 1), r"a code of 0 to 1 becomes 2 \* code - 1"
+    for given, found in ((80 * code, "metres"), (wide, "metres"), (code * torch.nan, "nan to nan"), (code, coded)):
+        with pytest.raises(ValueError, match=f"expected x_0 of -1 to 1.* found .*{found}"):
+            from_x_0(given, SENSOR)
 
 
 def test_unknown_words_and_shapes_are_refused():
@@ -93,5 +114,5 @@ def test_unknown_words_and_shapes_are_refused():
         ValueError, match="expected a depth codec of log, inverse, metric, log-63m, inverse-minmax, found ''"
     ):
         decode(torch.ones(1), SENSOR, "")
-    with pytest.raises(ValueError, match=r"x_0 must be \(2, H, W\), got \(1, 2, 16, 64\)"):
+    with pytest.raises(ValueError, match=r"x_0 must be \(2, H, W\), .*, got \(1, 2, 16, 64\)"):
         from_x_0(torch.zeros(1, 2, 16, 64), SENSOR)

@@ -186,6 +186,8 @@ def test_wrong_arguments_get_one_line(model: ls.ScanModel, scan: ls.Scan, image:
     named = replace(scan, extra={"name": np.full(len(scan), "a")})
     empty = scan[:0]
     calls = {
+        "expected metres from the sensor, found half .* and more away": lambda: model.complete(1000 * scan.xyz),
+        "expected points of .*, found the named fields f0, f1: Scan": lambda: model.complete(np.zeros(9, "f4, f4")),
         "expected a Scan, found a ndarray": lambda: ls.project(scan.xyz, "vlp-16"),  # type: ignore[arg-type]
         "expected a range image, .* found a Scan": lambda: ls.corrupt(scan, "beams:4"),  # type: ignore[arg-type]
         "known must be .* bool, got a str": lambda: model.complete(image, "beams:4"),  # type: ignore[arg-type]
@@ -208,3 +210,14 @@ def test_wrong_arguments_get_one_line(model: ls.ScanModel, scan: ls.Scan, image:
 
 def test_what_load_gives_is_a_scan_model(model: ls.ScanModel):
     assert isinstance(model, ls.ScanModel) and isinstance(ls.load("nearest"), ls.ScanModel)
+
+
+def test_points_out_of_the_view_of_the_sensor_that_is_named_are_told(model: ls.ScanModel, scan: ls.Scan):
+    axes = np.ascontiguousarray(scan.xyz[:, [1, 2, 0]])  # y up
+    fixed = model.into("vlp-16")
+    works = [fixed.label, lambda points: model.label(points, "vlp-16"), lambda points: model.realise(points, "vlp-16")]
+    for work in works:
+        with pytest.warns(UserWarning, match="^expected points of vlp-16 in its frame .*, found .* outside its view"):
+            work(axes)
+        work(scan.xyz)
+    fixed.label(SyntheticStreets(5, 1, ls.get_sensor("hdl-32e")).image(0).to_scan())  # another known sensor's

@@ -478,8 +478,8 @@ def test_errors_name_the_sample_and_say_both_sides(tmp_path: Path, real: Path):
     torch.save({"f": print}, tmp_path / "code/0.pth")
     with pytest.raises(ValueError, match="damaged or unsafe file"):
         ls.evaluate(tmp_path / "code", real)
-    with pytest.raises(ValueError, match=r"found 1 with array\(.*\]\]") as caught:
-        image_set([np.zeros((2, 3))])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match=r"image 0: expected a range image, .* found \{'a': array\(.*\]\]") as caught:
+        ls.evaluate([{"a": np.zeros((2, 3))}], real)
     assert "\n" not in str(caught.value)
 
 

@@ -55,7 +55,7 @@ def drawer(
 def noise(sensor: Sensor, seed: int) -> RangeImage:
     """x_1 ~ N(0, I), clamped to [-1, 1], as a scan: what sampling starts from, and the worst a table can show."""
     generator = torch.Generator().manual_seed(seed)
-    return from_x_0(torch.randn(2, sensor.height, sensor.width, generator=generator), sensor)
+    return from_x_0(torch.randn(2, sensor.height, sensor.width, generator=generator).clamp(-1, 1), sensor)
 
 
 def generation_row(

@@ -12,9 +12,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from lidarsynth.files.arrays import is_text
-from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, MAX_POINTS, MEDIAN
+from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, MAX_POINTS
 from lidarsynth.files.formats import BESIDE, read
-from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.scan import MEDIAN, Scan
 
 
 class Name(NamedTuple):

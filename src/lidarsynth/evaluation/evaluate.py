@@ -15,21 +15,22 @@ from typing import Literal, TypeAlias
 from lidarsynth.data.cache import sha256 as sha256_of_file
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
-from lidarsynth.evaluation.image_sets import ImageSet, image_set, resized
+from lidarsynth.evaluation.image_sets import ImageSet, Numbered, image_set, is_numbered, resized
 from lidarsynth.evaluation.notes import (
     one_set,
+    other_frames,
     tensors_taken,
     unlike_metres,
     unlike_pairs,
     unlike_sensors,
     unused_sensor,
+    upside_down,
 )
 from lidarsynth.evaluation.pairs import Pairs, classes_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
-from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import GRIDS, Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
@@ -41,7 +42,7 @@ NAMED = 8  # parts that lack, of a note
 GATHERED = 2  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
-Samples: TypeAlias = "str | Path | Sequence[RangeImage] | Sequence[str | Path]"
+Samples: TypeAlias = "str | Path | Sequence[str | Path] | Numbered"
 
 
 def evaluate(
@@ -57,8 +58,9 @@ def evaluate(
 ) -> Report:
     """Judge samples against a reference under a named protocol (`evaluation.protocols.PROTOCOLS`).
 
-    samples    a folder of scans, of our `.npz` images, of official R2DM or LiDARGen `.pth` samples; a cache; a list of
-               range images; or files of statistics that `gather_part` wrote, which are merged
+    samples    a folder of scans, of our `.npz` images, of official R2DM or LiDARGen `.pth` samples; a cache; a list, or
+               what else has a length and gives its i-th, of range images, scans, arrays of points (N, 3) or (N, 4), or
+               such samples; or files of statistics that `gather_part` wrote, which are merged
     reference  the same. What is gathered of it stays in the cache folder, as a file of statistics to share
     sensor     of samples that are points or tensors, where neither the reference nor the protocol tells
     seed       of the subsets of the squared MMDs
@@ -122,7 +124,8 @@ class _Run:
         """What is unlike in the images that were read, or statistics stand for, and judged as those of `drawn`."""
         sides = {"samples": judged, "the reference": truth}
         told = unused_sensor(self.sensor, judged, drawn) + unlike_sensors(sides, drawn)
-        return told + tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides)
+        told += tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides) + other_frames(sides)
+        return told if self.protocol.clouds else told + upside_down(sides, drawn, self.projection(drawn))
 
     def projection(self, sensor: Sensor) -> str:
         """Of points: the protocol's into images of its own sensor; by rings into those that published programs take."""
@@ -338,16 +341,16 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
 
 def _single(samples: Samples) -> Samples:
     """A list of one path as the path. Raises ValueError for what is no set of scans."""
-    if not isinstance(samples, str | Path | Sequence):
+    if not isinstance(samples, str | Path) and not is_numbered(samples):
         raise ValueError(f"expected a folder, files or a list of range images, found a {type(samples).__name__}")
-    if not isinstance(samples, str | Path) and len(samples) == 1 and isinstance(samples[0], str | Path):
+    if isinstance(samples, list | tuple) and len(samples) == 1 and isinstance(samples[0], str | Path):
         return samples[0]
     return samples
 
 
 def _statistics_files(source: Samples) -> list[Path]:
     """The files of statistics that a source names, or [] where it names images. Raises ValueError for both at once."""
-    sources = [source] if isinstance(source, str | Path) else list(source)
+    sources = [source] if isinstance(source, str | Path) else source if isinstance(source, list | tuple) else []
     paths = [Path(item) for item in sources if isinstance(item, str | Path)]
     if not [path for path in paths if path.suffix == ENDING]:
         return []

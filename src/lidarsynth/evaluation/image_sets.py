@@ -4,32 +4,47 @@ from __future__ import annotations
 
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.data.folder import scans_below
 from lidarsynth.evaluation.protocol import Clouds
-from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor
+from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor, within
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
-from lidarsynth.files.fields import MAX_BYTES, check_metres
+from lidarsynth.files.fields import MAX_BYTES
 from lidarsynth.files.formats import READERS, holds_image, naming, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.projection import project_thinned, thin
-from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, no_metres
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import check_regular
 from lidarsynth.networks.tensors import read_pickle
 
 TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen
 Item: TypeAlias = RangeImage | Scan | Tensor
+HELD = "a range image, a scan, points (N, 3) or (N, 4), or a tensor (5, H, W) or (2, H, W)"  # by a list
+
+
+@runtime_checkable
+class Numbered(Protocol):
+    """What has a length and gives its i-th: a list, a stacked array, a data set that reads or makes each when asked.
+
+    Each is a range image, a scan, an array of points as `lidar.scan.as_scan` takes it, or a published sample (5, H, W)
+    or (2, H, W), as an array or a tensor. One is held at a time; some are asked for several times, and must then be
+    the same.
+    """
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, i: int, /) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -94,19 +109,16 @@ class ImageSet:
         return ValueError(text if text.startswith(self.names[i]) else f"{self.names[i]}: {text}")
 
 
-def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path], intensity: str = "auto") -> ImageSet:
-    """The images of a cache, a folder at any depth, one file, or a list. Raises ValueError when there is none.
+def image_set(source: str | Path | Numbered, intensity: str = "auto") -> ImageSet:
+    """The images of a cache, a folder at any depth, one file, or by number. Raises ValueError when there is none.
 
     intensity  scale of files of points, as in `files.formats.read`
     """
     if not isinstance(source, str | Path):
-        images: list = list(source)
-        if not images:
+        names = tuple(f"image {i}" for i in range(len(source)))
+        if not names:
             raise ValueError("expected at least one range image, found an empty list")
-        if other := [image for image in images if not isinstance(image, RangeImage)]:
-            found = " ".join(repr(other[0]).split())
-            raise ValueError(f"expected one folder, or a list of range images, found {len(images)} with {found:.80}")
-        return ImageSet(tuple(f"image {i}" for i in range(len(images))), images.__getitem__, "a list of images", "")
+        return ImageSet(names, lambda i: _taken(source[i], names[i]), "a list of images", "")
     path = Path(source)
     if (path / INDEX).is_file():
         cache = CachedImages(path)
@@ -121,6 +133,30 @@ def image_set(source: str | Path | Sequence[RangeImage] | Sequence[str | Path], 
         raise ValueError(f"{path}: expected at least one range image, found {len(files)} files of none")
     names = tuple(str(file) if k is None else f"{file}[{k}]" for file, k in items)
     return ImageSet(names, lambda i: read_item(*items[i], intensity), str(path), stamp)
+
+
+def is_numbered(source: object) -> bool:
+    """Whether it is a list of scans or like one; a scan, a range image and a dict are not."""
+    return isinstance(source, Numbered) and not isinstance(source, Mapping | Scan)
+
+
+def _taken(given: object, name: str) -> Item:
+    """One of `Numbered` as it is stored elsewhere. Raises ValueError that begins with its name."""
+    if isinstance(given, RangeImage):
+        return given
+    if isinstance(given, Tensor):
+        given = given.detach().cpu()
+        given = given if given.ndim == 3 else given.float().numpy()
+    elif isinstance(given, np.ndarray) and given.ndim == 3:
+        given = torch.from_numpy(np.ascontiguousarray(given))
+    if isinstance(given, Tensor):
+        return given
+    if not isinstance(given, np.ndarray | Scan):
+        raise ValueError(f"{name}: expected {HELD}, or one folder for all, found {' '.join(repr(given).split()):.80}")
+    try:
+        return as_scan(given)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def _files(path: Path) -> list[Path]:
@@ -205,19 +241,27 @@ def _read_tensor(path: Path) -> Tensor:
 
 def judged(item: Item) -> Item:
     """What counts of a stored form: an empty pixel holds nothing. Raises ValueError for a tensor or image whose ranges
-    are not those of its points, and for ranges that are no metres."""
+    are not those of its points, for ranges that are no metres, and an image's reflectance outside 0 to 1 (up to 0.05 is
+    clipped)."""
     if isinstance(item, Tensor):
         check_points(item)
         if item.ndim == 3 and len(item) == 5:
-            check_metres(item[0].detach().double().numpy())
+            _check_metres(item[0].detach().double().numpy())
         return item
     if isinstance(item, RangeImage):
-        check_metres(item.range[item.mask])
+        _check_metres(item.range[item.mask])
         image = emptied(item)
+        if image.reflectance.min() < 0 or image.reflectance.max() > 1:
+            image = replace(image, reflectance=within("a reflectance", image.reflectance, 1))
         if image.xyz is not None:
             check_distances("range", image.range, image.xyz)
         return image
     return item
+
+
+def _check_metres(far: np.ndarray) -> None:
+    if text := no_metres(far):
+        raise ValueError(text)
 
 
 def emptied(image: RangeImage) -> RangeImage:

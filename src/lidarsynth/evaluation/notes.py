@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
 from torch import Tensor
 
 from lidarsynth.evaluation.image_sets import ImageSet, Item, stem_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.sample_tensors import beams_off
+from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 
 METRES = 1.5  # no outdoor scan ends so near
+BEYOND = 0.05  # share of an image's returns outside its sensor's limits, of which a note is made
 LOOKED_AT = 8  # scans or tensors of a set, at least and from everywhere, whether all are of one sensor
 GRID = "R2DM's grid is hdl-64e"
 Sides = Mapping[str, ImageSet | None]  # what is judged, in words -> its images; None where statistics stand for them
@@ -47,7 +50,11 @@ def _sensors_of(images: ImageSet) -> list[str]:
 
 
 def _some(images: ImageSet) -> Iterator[Item]:
-    return (images.item(i) for i in range(0, len(images), max(1, len(images) // LOOKED_AT)))
+    return (images.item(i) for i in _numbers(images))
+
+
+def _numbers(images: ImageSet) -> range:
+    return range(0, len(images), max(1, len(images) // LOOKED_AT))
 
 
 def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tuple[str, ...]:
@@ -84,13 +91,54 @@ def unused_sensor(named: str | Sensor | None, images: ImageSet | None, own: Sens
 
 
 def unlike_metres(sides: Sides) -> tuple[str, ...]:
-    """A note where the images of a side, by the first and the last, have ranges as they come out of a network."""
+    """A note where the images of a side, by the first and the last, have ranges as they come out of a network, or
+    beyond the limits of their own sensor."""
     notes = []
     for side, images in sides.items():
-        some = [images.item(i) for i in {0, len(images) - 1}] if images else []
-        farthest = max((float(item.range.max(initial=0)) for item in some if isinstance(item, RangeImage)), default=0)
+        taken = [images.item(i) for i in {0, len(images) - 1}] if images else []
+        some = [item for item in taken if isinstance(item, RangeImage) and item.mask.any()]
+        farthest = max((float(item.range.max()) for item in some), default=0)
+        beyond = max(map(_beyond, some), default=0)
         if 0 < farthest <= METRES:
             notes.append(f"ranges of {side} are {farthest:.2f} m at most: expected metres, not shares of a limit")
+        elif beyond > BEYOND:
+            sensor = some[0].sensor
+            notes.append(f"{beyond:.0%} of the returns of {side} are outside {sensor.min_range:g} to "
+                         f"{sensor.max_range:g} m, the limits of {sensor.name}: expected metres")  # fmt: skip
+    return tuple(notes)
+
+
+def _beyond(image: RangeImage) -> float:
+    """The share of an image's returns outside its sensor's limits, which count."""
+    far = image.range[image.mask]
+    return float(((far < image.sensor.min_range) | (far > image.sensor.max_range)).mean())
+
+
+def upside_down(sides: Sides, drawn: Sensor, projection: str) -> tuple[str, ...]:
+    """A note where the rows of one side, by some images, are as those of the other from the last to the first."""
+    if None in sides.values():
+        return ()
+    one, other = (_rows(images, drawn, projection) for images in sides.values() if images)
+    straight, turned = (np.abs(rows - other).mean() for rows in (one, one[::-1]))
+    if turned >= straight / 2:
+        return ()
+    return (f"rows of {' are as those of '.join(sides)} from the last to the first: row 0 is the highest beam",)
+
+
+def _rows(images: ImageSet, drawn: Sensor, projection: str) -> np.ndarray:
+    """(H,) the mean logarithm of the range, of some images; no return counts as 0 m."""
+    some = [images.image(i, drawn, projection, resize=True) for i in _numbers(images)]
+    return np.mean([np.log1p(image.range).mean(axis=1) for image in some], axis=0)
+
+
+def other_frames(sides: Sides) -> tuple[str, ...]:
+    """Notes where the points of a side, by the first scan, are not in their sensor's frame."""
+    notes = []
+    for side, images in sides.items():
+        first = images.item(0) if images else None
+        if isinstance(first, Scan) and (faults := check_frame(first).faults):
+            notes.append(f"expected points of {side} in the sensor's frame (x forward, z up), found them "
+                         f"{', '.join(faults)}")  # fmt: skip
     return tuple(notes)
 
 

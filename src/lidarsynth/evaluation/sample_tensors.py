@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+from lidarsynth.lidar.depth import OVERSHOOT
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import GRIDS, Sensor
 
-OVERSHOOT = 0.05  # what comes out of a network may pass its limits by so much, and is clipped; other codes by far more
 NEAR, SHARE = 0.05, 0.02  # metres, and share of the depth: how far it may be from |x, y, z|
 FEW = 0.01  # share of the pixels in which it may be farther
 # Metres. LiDARGen codes r + 0.1 mm, so that what is empty is not 0, and judges from here on; 0 +- OVERSHOOT is nearer.
@@ -30,24 +30,26 @@ def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
     values = tensor.detach().float().numpy()
     if not np.isfinite(values).all():
         raise ValueError(f"expected finite values, found {np.sum(~np.isfinite(values))} of NaN or infinity")
-    reflectance = _within("a reflectance", values[-1], 1)
+    reflectance = within("a reflectance", values[-1], 1)
     if len(values) == 5:
-        distance = _within("a depth in metres", values[0], np.inf)
+        distance = within("a depth in metres", values[0], np.inf)
     else:
         farthest = max(1.0, float(np.log2(sensor.max_range + 1) / 6))
-        distance = np.exp2(6 * _within("a range code log2(r + 1) / 6", values[0], farthest).clip(0, 1)) - 1
+        distance = np.exp2(6 * within("a range code log2(r + 1) / 6", values[0], farthest).clip(0, 1)) - 1
         distance *= distance > NEAREST
     mask = distance > 0
     xyz = np.moveaxis(values[1:4], 0, -1).copy() if len(values) == 5 else None
     return RangeImage(distance, reflectance * mask, mask, sensor, xyz=xyz)
 
 
-def _within(what: str, values: np.ndarray, high: float) -> np.ndarray:
+def within(what: str, values: np.ndarray, high: float) -> np.ndarray:
     """The values, clipped to 0 to `high`. Raises ValueError where some are farther off than OVERSHOOT."""
     least, greatest = float(values.min()), float(values.max())
     if least < -OVERSHOOT or greatest > high + OVERSHOOT:
         limits = "at least 0" if high == np.inf else f"0 to {high:.4g}"
-        raise ValueError(f"expected {what} of {limits}, found {least:.4g} to {greatest:.4g}: another code or scale")
+        coded = " (lidar.depth.from_x_0 takes -1 to 1)" if least >= -1 - OVERSHOOT and greatest <= 1 + OVERSHOOT else ""
+        raise ValueError(f"expected {what} of {limits}, found {least:.4g} to {greatest:.4g}: another code or scale"
+                         f"{coded}")  # fmt: skip
     return values.clip(0, high)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarsynth.files.whole_numbers import EXACT, stray
 from lidarsynth.lidar.plural import plural, was
-from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.scan import Scan, no_metres
 from lidarsynth.lidar.sensor import MOST, SENSORS
 
 Fields = dict[str, np.ndarray]  # what a format's reader returns: one (N,) array per field, under the file's own names
@@ -22,7 +22,6 @@ EARTH = 2e7  # metres; no coordinate of a map is greater
 MAX_RINGS = MOST  # as many as an image may have beams: its rings come back
 SHORTS = 1 << 16  # whole numbers that the labels of a table have
 LONGEST = 10.0  # seconds that a turn may last
-MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
 SCALED = "reflectance by the format"  # a further field: intensities as 0-1, of formats that fix their scale; for "auto"
 PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
@@ -98,7 +97,8 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
         raise FileError(f"expected metres from the sensor, at most {MAX_METRES:.0f}, found a coordinate of {far:.4g}"
                         f"{_why_far(xyz, far)}")  # fmt: skip
     xyz = xyz.astype(np.float32, copy=False)
-    check_metres(np.abs(xyz[::16]).max(axis=1))
+    if text := no_metres(np.abs(xyz[::16]).max(axis=1)):
+        raise FileError(text)
     values = reflectance_from(values[kept], "unit" if intensity == "none" else intensity)
     ring, time, label = (fields[key][kept] if (key := find(fields, n)) else None for n in ("ring", "time", "label"))
     classes = None if label is None else _training_classes(label)
@@ -134,14 +134,6 @@ def dropped_points(count: int) -> str:
 
 def _returned(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
-
-
-def check_metres(far: np.ndarray) -> None:
-    """Raises FileError where half of so far away, or farther, is what no turn of a sensor is; 0 = no return."""
-    returns = far[far > 0]
-    if returns.size and (half := float(np.median(returns))) > MEDIAN:
-        raise FileError(f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "
-                        "centimetres, millimetres or coordinates of a map?")  # fmt: skip
 
 
 def on_rings(fields: Fields, first: int, last: int) -> Fields:

@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+
+OVERSHOOT = 0.05  # what comes out of a network may pass its limits by so much, and is clipped; other codes by far more
 
 
 @dataclass(frozen=True)
@@ -82,11 +84,26 @@ def to_x_0(image: RangeImage, codec: str = "log") -> Tensor:
     return 2 * torch.stack([encode(distance, image.sensor, codec), reflectance]) - 1
 
 
-def from_x_0(x_0: Tensor, sensor: Sensor, codec: str = "log") -> RangeImage:
-    """x_0 (2, H, W), clamped to [-1, 1] -> RangeImage of the sensor; pixels outside its limits are empty."""
-    if x_0.ndim != 3 or x_0.shape[0] != 2:
-        raise ValueError(f"x_0 must be (2, H, W), got {tuple(x_0.shape)}")
-    unit = (x_0.detach().float().cpu().clamp(-1, 1) + 1) / 2
+def from_x_0(x_0: Tensor | np.ndarray, sensor: Sensor | str, codec: str = "log") -> RangeImage:
+    """x_0 (2, H, W) in [-1, 1], range code and reflectance, or (1, H, W), the code alone -> RangeImage of the sensor.
+
+    codec  how the ranges are coded, a word of CODECS. Pixels outside the sensor's limits are empty
+
+    Raises ValueError for another shape, NaN, and values that are not so coded: outside -1 to 1 by more than 0.05 (less
+    is clipped; a sampler that passes by more is clamped first), or all of them in 0 to 1.
+    """
+    sensor, x_0 = get_sensor(sensor), torch.as_tensor(x_0).detach().float().cpu()
+    if x_0.ndim != 3 or x_0.shape[0] not in (1, 2):
+        raise ValueError(f"x_0 must be (2, H, W), or (1, H, W) without reflectance, got {tuple(x_0.shape)}")
+    least, greatest = x_0.aminmax()
+    if not (least >= -1 - OVERSHOOT and greatest <= 1 + OVERSHOOT):  # NaN is not
+        raise ValueError(f"expected x_0 of -1 to 1, found {least:.4g} to {greatest:.4g}: metres, another scale, or of "
+                         "a network that has to be clamped first")  # fmt: skip
+    if least >= 0 and greatest > least:
+        raise ValueError(f"expected x_0 of -1 to 1, where -1 is no return, found {least:.4g} to {greatest:.4g}: a code "
+                         "of 0 to 1 becomes 2 * code - 1")  # fmt: skip
+    unit = (x_0.clamp(-1, 1) + 1) / 2
     distance = decode(unit[0], sensor, codec)
     mask = distance > 0
-    return RangeImage(distance.numpy(), (unit[1] * mask).numpy(), mask.numpy(), sensor)
+    reflectance = unit[1] * mask if len(unit) == 2 else torch.zeros_like(distance)
+    return RangeImage(distance.numpy(), reflectance.numpy(), mask.numpy(), sensor)

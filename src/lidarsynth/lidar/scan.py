@@ -10,6 +10,7 @@ import numpy as np
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 ODD = (np.ma.MaskedArray, np.matrix)  # arrays that do not compute as others do
+MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
 _UNKNOWN = np.zeros(0, np.float32)  # stands for a reflectance that is not given
 
 
@@ -122,7 +123,7 @@ def _chosen(values: np.ndarray, index: np.ndarray | Sequence[int] | slice) -> np
 
 def as_scan(points: Scan | np.ndarray) -> Scan:
     """A scan as it is, an array as `scan_of` takes it. Raises ValueError for anything else, and as `scan_of` for points
-    that are not finite and reflectances in another scale."""
+    that are not finite, ranges that are no metres and reflectances in another scale."""
     if isinstance(points, Scan):
         _check(points.xyz, points.reflectance)
         return points
@@ -131,11 +132,23 @@ def as_scan(points: Scan | np.ndarray) -> Scan:
     return scan_of(points)
 
 
+def no_metres(far: np.ndarray) -> str:
+    """Why distances (N,), 0 = no return, are none of one turn: half of them are farther than any sensor's; or ''."""
+    returns = far[far > 0]
+    if not returns.size or (half := float(np.median(returns))) <= MEDIAN:
+        return ""
+    return (f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "
+            "centimetres, millimetres or coordinates of a map?")  # fmt: skip
+
+
 def scan_of(points: np.ndarray) -> Scan:
     """The scan of an array (N, 3) x y z in metres, or (N, 4) with a reflectance of 0 to 1.
 
-    Raises ValueError for another shape, or a reflectance in another scale.
+    Raises ValueError for another shape, ranges that are no metres, or a reflectance in another scale.
     """
+    if points.dtype.names:
+        raise ValueError("expected points of (N, 3) x y z or (N, 4) x y z reflectance, found the named fields "
+                         f"{', '.join(points.dtype.names)}: Scan(xyz, reflectance, ring) takes each alone")  # fmt: skip
     if points.ndim != 2 or points.shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
         raise ValueError(f"expected points of (N, 3) x y z or (N, 4) x y z reflectance, found {points.shape} of "
                          f"{points.dtype}")  # fmt: skip
@@ -173,6 +186,8 @@ def check_seen(image: RangeImage, count: int) -> RangeImage:
 def _check(xyz: np.ndarray, light: np.ndarray, where: str = "") -> None:
     if not np.isfinite(xyz).all():
         raise ValueError("expected finite points, found NaN or infinite ones; leave them out")
+    if text := no_metres(np.abs(xyz[::16]).max(axis=1, initial=0)):
+        raise ValueError(text)
     if np.isnan(light.max(initial=0)):
         raise ValueError(f"expected a reflectance of 0 to 1{where}, found NaN; put 0 where nobody knows it")
     if not (light.min(initial=0) >= 0 and light.max(initial=0) <= 1):

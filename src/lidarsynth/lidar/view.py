@@ -40,17 +40,11 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
         return f"them on {rings} rings, more than its {sensor.height} beams (of two sensors? --rings A-B takes one)"
     if ring is not None and not layers(xyz, ring):
         return EVERYWHERE
-    lift = float(np.mean(sensor.offsets)) if sensor.offsets else 0.0
-    far = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR] - np.array([0, 0, lift], np.float32)
+    far = _far(xyz)
     if len(far) < 100:
         return None
-    elevation, (top, bottom) = elevations_of(far), (sensor.elevations[0], sensor.elevations[-1])
-    outside = float(((elevation > top + MARGIN) | (elevation < bottom - MARGIN)).mean())
-    if outside > OUTSIDE:
-        return f"{outside:.0%} of them outside its view of {bottom:+.1f} to {top:+.1f} degrees"
-    below = int((np.array(sensor.elevations) < np.quantile(elevation, LOWEST) - MARGIN).sum())
-    if below > BELOW * sensor.height:
-        return f"none on its {below} lowest beams of {sensor.height}"
+    if found := out_of_view(xyz, sensor):
+        return found
     turns = rings_in_order(xyz) if ring is None else None
     rings = 0 if turns is None else _count(turns)
     if rings > MISCOUNTED * sensor.height:
@@ -59,8 +53,32 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
         return other
     if ring is not None or turns is not None or is_even_grid(sensor):
         return None
-    few = far[np.random.default_rng(0).permutation(len(far))[:POINTS]] + np.array([0, 0, lift], np.float32)
+    few = far[np.random.default_rng(0).permutation(len(far))[:POINTS]]
     return BESIDE if share_on_beams(few, sensor) < BETWEEN else None
+
+
+def out_of_view(xyz: np.ndarray, sensor: Sensor) -> str | None:
+    """That points (N, 3) beyond 3 m are above or below the sensor's view, or none on its lowest beams, in words, or
+    None; the cheap part of `misfit`."""
+    far = _far(xyz)
+    if len(far) < 100:
+        return None
+    elevation, (top, bottom) = elevations_of(far - _lift(sensor)), (sensor.elevations[0], sensor.elevations[-1])
+    outside = float(((elevation > top + MARGIN) | (elevation < bottom - MARGIN)).mean())
+    if outside > OUTSIDE:
+        return f"{outside:.0%} of them outside its view of {bottom:+.1f} to {top:+.1f} degrees"
+    below = int((np.array(sensor.elevations) < np.quantile(elevation, LOWEST) - MARGIN).sum())
+    return f"none on its {below} lowest beams of {sensor.height}" if below > BELOW * sensor.height else None
+
+
+def _far(xyz: np.ndarray) -> np.ndarray:
+    """The points (N, 3) beyond 3 m."""
+    return xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > FAR]
+
+
+def _lift(sensor: Sensor) -> np.ndarray:
+    """(3,) metres from the sensor's origin to the mean origin of its beams."""
+    return np.array([0, 0, np.mean(sensor.offsets) if sensor.offsets else 0.0], np.float32)
 
 
 def _of_another(scan: Scan, sensor: Sensor) -> str | None:

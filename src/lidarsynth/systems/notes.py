@@ -10,6 +10,7 @@ from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
+from lidarsynth.lidar.view import out_of_view
 
 IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
 
@@ -34,9 +35,23 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
     else:
         if (text := stranger(model, scan, sensor)) is not None:
             warnings.warn(f'{model.experiment.name} {text}; use load("default")', stacklevel=3)
+        if (text := displaced(model, scan, sensor)) is not None:
+            warnings.warn(text, stacklevel=3)
         if filling and (text := caution(scan, None if sensor is None else get_sensor(sensor))) is not None:
             warnings.warn(text, stacklevel=3)
     return scan
+
+
+def displaced(model: Knows, scan: Scan, sensor: Sensor | str | None = None) -> str | None:
+    """That points which are no known sensor's are out of the view of the one that was named for them, here or by
+    `into`; or None. Those of a known one are another's, and as they should be."""
+    if not len(scan) or (sensor is None and not (model.any_sensor and model.experiment.data.fixed)):
+        return None
+    own = model.sensor if sensor is None else get_sensor(sensor)
+    found = out_of_view(scan.xyz, own)
+    if found is None or recognise(scan)[0] is not None:
+        return None
+    return f"expected points of {own.name} in its frame (x forward, z up, it at the origin), found {found}"
 
 
 def made_by(scan: Scan | RangeImage, sensor: Sensor | str | None) -> tuple[Scan, Sensor | str | None]:

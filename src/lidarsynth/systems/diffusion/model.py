@@ -203,7 +203,7 @@ class LidarModel(ScanModel):
 
     def _image(self, x_0: Tensor) -> RangeImage:
         """x_0 (2, H, W) as an image; mixed pixels are mended if `data.mend`, R2DM's stay as published."""
-        image = from_x_0(x_0, self.sensor, self.experiment.data.codec)
+        image = from_x_0(x_0.clamp(-1, 1), self.sensor, self.experiment.data.codec)
         return without_mixed_pixels(image) if self.conditional and self.experiment.data.mend else image
 
     @property

@@ -206,7 +206,7 @@ class GanModel(ScanModel):
             limits = self.sensor.min_range, self.sensor.max_range
             metres = to_depth(((code[0] + 1) / 2).float().cpu().clamp(0, 1), *limits).numpy()
             return RangeImage(metres, np.zeros_like(metres), metres > 0, self.sensor)
-        return from_x_0(torch.cat([code, torch.full_like(x, -1)]), self.sensor, self.experiment.data.codec)
+        return from_x_0(torch.cat([code, torch.full_like(x, -1)]).clamp(-1, 1), self.sensor, self.experiment.data.codec)
 
     def _latent(self, rng: torch.Generator) -> Tensor:
         """(Z,) ~ N(0, I), on the CPU."""
