@@ -58,14 +58,14 @@ def test_interpolations_put_beams_between_those_of_the_scans_own_sensor():
     sensor = ls.get_sensor("vlp-16")
     scan = SyntheticStreets(4321, 1, sensor)[0]
     own = ls.project(scan, sensor)
-    straight = ls.load("bilinear").upsample(scan, times=4)
+    straight = ls.load("bilinear").upsample(scan, sensor, times=4)
     assert straight.sensor.elevations[::4] == pytest.approx(sensor.elevations) and straight.shape[0] == 61
     answered = (own.mask.mean(1) > 0.02).nonzero()[0]
     np.testing.assert_array_equal(straight.range[4 * answered], own.range[answered])
     first = answered[np.flatnonzero(np.diff(answered) == 1)[0]]
     expected = 0.75 * own.range[first] + 0.25 * own.range[first + 1]
     np.testing.assert_allclose(straight.range[4 * first + 1], expected, rtol=1e-5)
-    near = ls.load("nearest").upsample(scan)
+    near = ls.load("nearest").upsample(scan, sensor)
     np.testing.assert_array_equal(near.range[4 * first + 1], own.range[first])
     every = {point.tobytes() for point in straight.to_scan().xyz}
     assert {point.tobytes() for point in scan.xyz} <= every
