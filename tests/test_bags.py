@@ -136,7 +136,7 @@ def test_what_is_no_bag_is_one_line(name: str, tmp_path: Path):
     with pytest.raises(FileError, match=f"{name}: expected a bag"), open_bag(tmp_path / name):
         pass
     whole = ros1(tmp_path).read_bytes()
-    (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "cut.bag").write_bytes(whole[:5000])  # within the first message
     with pytest.raises(FileError, match=r"cut.bag: expected a bag"), open_bag(tmp_path / "cut.bag") as bag:
         list(bag.clouds("/points"))
 

@@ -385,7 +385,12 @@ def test_arrays_are_scans():
     expected = model.complete(Scan(scan.xyz, np.full(len(scan), 0.5, np.float32)))
     np.testing.assert_array_equal(image.range, expected.range)
     assert Scan(scan.xyz).reflectance.sum() == 0 and len(scan_of(scan.xyz).reflectance) == len(scan)
-    for wrong, words in ((table * 300, "0 to 1 in the fourth"), (table[0], "(N, 3)"), (table * np.nan, "finite")):
+    for wrong, words in (
+        (table * [1, 1, 1, 300], "0 to 1 in the fourth"),
+        (table * 300, "millimetres"),
+        (table[0], "(N, 3)"),
+        (table * np.nan, "finite"),
+    ):
         with pytest.raises(ValueError, match=words.replace("(", r"\(").replace(")", r"\)")):
             model.complete(wrong)
 
