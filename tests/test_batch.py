@@ -231,6 +231,17 @@ def test_a_full_disk_stops_at_once_and_what_a_kill_left_is_swept(
     assert "2 scans in" in capsys.readouterr().out
 
 
+def test_a_scan_whose_picture_does_not_fit_on_the_disk_is_not_done(scans, tmp_path, capsys, monkeypatch):
+    words = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), "--sensor", "vlp-16"]
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.verbs.batch.save_png", full)
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+    assert "No space left" in capsys.readouterr().err and not (tmp_path / "o").exists()
+    main([*words, "--skip-existing"])
+    assert names(tmp_path / "o") == ["000.npz", "000.png", "001.npz", "001.png", "report.json"]
+
+
 def full(*names: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -306,9 +306,11 @@ def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | N
 
 
 def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) -> tuple[str, ...]:
-    """Write the result, and return the endings of what is beside a .bin or .npy."""
+    """Write the result, the scan last: where it is, all is. Returns the endings of what is beside a .bin or .npy."""
     beside: tuple[str, ...] = ()
     target.parent.mkdir(parents=True, exist_ok=True)
+    if job.picture:
+        save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
         write(target, image)
@@ -322,6 +324,4 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
             label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
         write(target, without_places(placed))
-    if job.picture:
-        save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
     return beside
