@@ -11,8 +11,10 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from lidarsynth.lidar.plural import plural
@@ -174,7 +176,7 @@ def answer(verb: Callable[[], object]) -> None:
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)  # the help of a narrower terminal would never be laid out
     try:
-        with _terminable():
+        with _terminable(), _warned():
             verb()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
@@ -193,6 +195,22 @@ def answer(verb: Callable[[], object]) -> None:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise  # a fault of ours
         _refuse(f"expected enough memory, found too little: {error}".partition("\n")[0])
+
+
+@contextmanager
+def _warned() -> Iterator[None]:
+    """Warnings of the library's own are lines as `warn` says them, without the place in the program."""
+    former, package = warnings.formatwarning, Path(__file__).parents[1]
+
+    def line(message: Warning | str, category: type[Warning], file: str, number: int, text: str | None = None) -> str:
+        own = Path(file).is_relative_to(package)
+        return f"lidarsynth: {message}\n" if own else former(message, category, file, number, text)
+
+    warnings.formatwarning = line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = former
 
 
 @contextmanager
