@@ -23,7 +23,7 @@ from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
 from lidarsynth.pictures.portrait import portrait
@@ -278,7 +278,10 @@ def _made(
     if job.verb == "realise":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         filled = realise_scan(model, scan, sensor, job.how.seed + work.number)
-        return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
+        done = f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
+        usual = sensor if job.sensor is not None else WORDS.get(sensor.name, sensor)
+        note = columns_note(filled.image.sensor, usual.width)
+        return filled, f"{done}; {note}" if note else done
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         sensor = usual_at_most(sensor) if job.sensor is None else sensor
