@@ -45,8 +45,8 @@ def save_model_and_sensor() -> None:
 
 def write_bag_of(scan: Scan, path: Path, count: int) -> dict[str, np.ndarray]:
     """The columns of a bag of so many messages, each of the same scan."""
+    from lidarsynth.data.bag_records import Cloud
     from lidarsynth.data.bag_writer import write_bag
-    from lidarsynth.data.bags import Cloud
 
     fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
               "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip

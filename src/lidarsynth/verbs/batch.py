@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidarsynth.data.bags import Cloud
+from lidarsynth.data.bag_records import Cloud
 from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
