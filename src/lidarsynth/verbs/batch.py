@@ -312,11 +312,9 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
     """Write the result, the scan last: where it is, all is. Returns the endings of what is beside a .bin or .npy."""
     beside: tuple[str, ...] = ()
     target.parent.mkdir(parents=True, exist_ok=True)
-    if job.picture:
-        save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
-        write(target, image)
+        content: RangeImage | Scan = image
     else:
         placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
         if target.suffix.lower() in BARE:
@@ -326,5 +324,8 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         if LABEL in beside:
             label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
-        write(target, without_places(placed))
+        content = without_places(placed)
+    if job.picture:
+        save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
+    write(target, content)
     return beside
