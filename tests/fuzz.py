@@ -35,8 +35,9 @@ from test_captures import pcap, pcapng, udp, velodyne_packet
 from lidarsynth.benchmark.config import read_config
 from lidarsynth.benchmark.store import Seconds, Store
 from lidarsynth.data.bag_errors import naming
+from lidarsynth.data.bag_records import Cloud
 from lidarsynth.data.bag_writer import write_bag
-from lidarsynth.data.bags import Cloud, open_bag
+from lidarsynth.data.bags import open_bag
 from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.data.ouster import read_metadata, sensor_of
 from lidarsynth.data.street_sets import _claim, _settings

@@ -9,8 +9,9 @@ import pytest
 from test_recognise import turn
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import Cloud, cloud_of
 from lidarsynth.data.bag_writer import write_bag
-from lidarsynth.data.bags import Cloud, cloud_of, open_bag
+from lidarsynth.data.bags import open_bag
 from lidarsynth.files.fields import scan_from_fields, seconds_from
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, Cloud, Message, Topic, typestore
 from lidarsynth.data.bag_writer import message_of, points_topic, write_bag
-from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, open_bag, typestore
+from lidarsynth.data.bags import open_bag
 from lidarsynth.files.fields import FileError
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")

@@ -9,8 +9,9 @@ import pytest
 from full_scan import full_scan
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, Cloud, Message, Topic, cloud_of, typestore
 from lidarsynth.data.bag_writer import FORMATS, message_of, points_topic, write_bag
-from lidarsynth.data.bags import POINTS, Cloud, Message, Topic, cloud_of, is_bag, open_bag, typestore
+from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.files.fields import PLACE, FileError, find, scan_from_fields
 from lidarsynth.verbs.batch import Job, Work, run
 from lidarsynth.verbs.inputs import Reading, inputs_of

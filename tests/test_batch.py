@@ -161,7 +161,7 @@ def test_a_killed_run_tells_how_its_scans_were_made(
 ):
     words = ["complete", str(scans / "d1"), "--out", str(tmp_path / "o"), *WORDS, "--model", "bilinear"]
     with monkeypatch.context() as patch:
-        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        patch.setattr("lidarsynth.cli.many.tell_of_many", killed)
         with pytest.raises(SystemExit, match="130"):
             main(words)
     assert told(tmp_path / "o")["unfinished"] and names(tmp_path / "o") == ["000.ply", "report.json"]
@@ -174,7 +174,7 @@ def test_a_killed_run_tells_how_its_scans_were_made(
     assert "unfinished" not in told(tmp_path / "o") and told(tmp_path / "o")["skipped"] == 1
     capsys.readouterr()
     with monkeypatch.context() as patch:  # another recipe, killed after its first scan: two recipes are in the folder
-        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        patch.setattr("lidarsynth.cli.many.tell_of_many", killed)
         with pytest.raises(SystemExit, match="130"):
             main([*words, "--seed", "1"])
     for seed, said in (("0", "seed 0 for 1"), ("1", "scans of two settings")):
@@ -229,6 +229,17 @@ def test_a_full_disk_stops_at_once_and_what_a_kill_left_is_swept(
     assert capsys.readouterr().err.count("No space left") == 1 and names(place) == [".mine.part"]
     main(words)
     assert "2 scans in" in capsys.readouterr().out
+
+
+def test_a_scan_whose_picture_does_not_fit_on_the_disk_is_not_done(scans, tmp_path, capsys, monkeypatch):
+    words = ["project", str(scans / "d2"), "--out", str(tmp_path / "o"), "--sensor", "vlp-16"]
+    with monkeypatch.context() as patch:
+        patch.setattr("lidarsynth.verbs.batch.save_png", full)
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+    assert "No space left" in capsys.readouterr().err and not (tmp_path / "o").exists()
+    main([*words, "--skip-existing"])
+    assert names(tmp_path / "o") == ["000.npz", "000.png", "001.npz", "001.png", "report.json"]
 
 
 def full(*names: object) -> None:
@@ -476,7 +487,7 @@ def test_a_model_that_was_trained_further_does_not_go_on(
     save(tmp_path / "run", experiment, network)
     words = ["complete", str(scans / "d2"), "--out", str(tmp_path / "o"), *WORDS, "--skip-existing", "--model"]
     with monkeypatch.context() as patch:
-        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        patch.setattr("lidarsynth.cli.many.tell_of_many", killed)
         with pytest.raises(SystemExit, match="130"):
             main([*words, str(tmp_path / "run")])
     report = told(tmp_path / "o")
@@ -496,7 +507,7 @@ def test_a_model_that_was_trained_further_does_not_go_on(
     (tmp_path / "o" / "report.json").write_text(json.dumps(report))
     (tmp_path / "o" / "000.ply").unlink()
     with monkeypatch.context() as patch:
-        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        patch.setattr("lidarsynth.cli.many.tell_of_many", killed)
         with pytest.raises(SystemExit, match="130"):
             main([*words, "run"])
     assert "mixed" not in told(tmp_path / "o"), "one of before goes on, and tells from now on"
@@ -571,7 +582,7 @@ def test_a_whole_run_that_is_killed_among_shards_of_another_recipe_is_mixed(
         main([*words, "--shard", part, "--width", "256"])
     (tmp_path / "o" / "report.json").unlink()
     with monkeypatch.context() as patch:
-        patch.setattr("lidarsynth.cli.many._tell_of_many", killed)
+        patch.setattr("lidarsynth.cli.many.tell_of_many", killed)
         with pytest.raises(SystemExit, match="130"):
             main([*words, "--width", "512"])
     assert told(tmp_path / "o")["unfinished"] and told(tmp_path / "o")["mixed"]

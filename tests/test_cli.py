@@ -635,7 +635,7 @@ def test_refusals_of_a_process():
 
 def test_every_file_of_the_command_line_is_a_verb_or_serves_them():
     files = {path.stem for path in Path(parsing.__file__).parent.glob("*.py")} - {"__init__"}
-    assert files - VERBS.keys() == {"arguments", "main", "many", "parsing", "scan_files", "terminal"}
+    assert files - VERBS.keys() == {"arguments", "main", "many", "outcomes", "parsing", "scan_files", "terminal"}
 
 
 def test_the_version_and_without_a_verb_the_help(run: Run):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, Cloud, Message, typestore
 from lidarsynth.data.bag_writer import message_of, points_topic
-from lidarsynth.data.bags import POINTS, Cloud, Message, is_bag, open_bag, typestore
+from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.files.fields import FileError
 from lidarsynth.verbs.inputs import Reading, inputs_of
 from lidarsynth.viewer.series import series_of

@@ -11,8 +11,8 @@ from full_scan import full_scan
 
 import lidarsynth as ls
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import Cloud
 from lidarsynth.data.bag_writer import write_bag
-from lidarsynth.data.bags import Cloud
 from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import WRITERS, read, write

@@ -32,6 +32,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.reconstruction import voxel_errors
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.streets.hdl64e import own_car
 from lidarsynth.verbs.learned_sensor import sensor_toml
 
 SENSOR = SENSORS["hdl-64e"].resized(width=64)
@@ -492,6 +493,7 @@ def recoded(form: str, images: list[RangeImage]) -> list[torch.Tensor]:
             "both coded to -1 to 1": (2 * code - 1, 2 * light - 1),
             "range coded to -1 to 1": (2 * code - 1, light),
             "metres": (image.range, light),
+            "exchanged": (light, code),
             "reflectance to 255": (code, 255 * light),
             "points, reflectance to 255": (image.range, *xyz, 255 * light),
             "points, reflectance to -1": (image.range, *xyz, light - 1),
@@ -509,6 +511,7 @@ def recoded(form: str, images: list[RangeImage]) -> list[torch.Tensor]:
         ("both coded to -1 to 1", "expected a reflectance of 0 to 1, found -1 to "),
         ("range coded to -1 to 1", r"expected a range code log2\(r \+ 1\) / 6 of 0 to 1.057, found -1 to "),
         ("metres", r"expected a range code log2\(r \+ 1\) / 6 of 0 to 1.057, found 0 to "),
+        ("exchanged", r"expected a range code and then a reflectance, found .* are they exchanged\?"),
         ("reflectance to 255", "expected a reflectance of 0 to 1, found 0 to 25"),
         ("points, reflectance to 255", "expected a reflectance of 0 to 1, found 0 to 25"),
         ("points, reflectance to -1", "expected a reflectance of 0 to 1, found -1 to "),
@@ -526,6 +529,40 @@ def test_samples_in_another_code_are_refused(form: str, reason: str, tmp_path: P
             ls.evaluate(tmp_path / "samples", real, protocol)
         assert "\n" not in str(refusal.value)
     assert run("evaluate", tmp_path / "samples", "--reference", real, "--out", tmp_path / "r.json")[0] == 2
+
+
+def test_images_whose_channels_are_exchanged_are_refused(real: Path):
+    exchanged = [replace(image, range=image.reflectance, reflectance=image.range) for image in STREETS[:2]]
+    with pytest.raises(ValueError, match=r"image 0: expected ranges in metres and .* found ranges of at most 1 and a "
+                                         r"reflectance of up to [0-9.]+: are they exchanged\?$"):  # fmt: skip
+        ls.evaluate(exchanged, real, "bev-1")
+
+
+@pytest.mark.parametrize(
+    ("how", "turn"),
+    [
+        ("mirrored left to right", lambda array: array[:, ::-1]),
+        ("turned by half a turn", lambda array: np.roll(array, 256, axis=1)),
+        ("mirrored front to back", lambda array: np.roll(array[:, ::-1], 256, axis=1)),
+        (None, lambda array: array),
+    ],
+)
+def test_images_that_are_mirrored_or_turned_are_told_by_the_car_that_they_show(how, turn):
+    sensor = SENSORS["hdl-64e-kitti"].resized(width=512)
+    seen = [street(i, sensor) for i in range(2)]
+    real = [image.keep(image.mask & ~own_car(sensor)) for image in seen]
+    turned = [replace(image, **{name: turn(getattr(image, name)) for name in ("range", "reflectance", "mask")})
+              for image in real]  # fmt: skip
+
+    def told(samples: list[RangeImage], reference: list[RangeImage]) -> list[str]:
+        return [text for text in ls.evaluate(samples, reference, "bev-1").warnings if "look" in text]
+
+    for side, texts in (("samples", told(turned, real)), ("the reference", told(real, turned))):
+        assert len(texts) == (how is not None)
+        assert how is None or texts[0].startswith(f"images of {side} look {how}: ")
+    assert told(seen, real) == []  # of a car that hides nothing
+    thin = [image.keep(np.isin(np.arange(64), range(0, 64, 4))[:, None] & image.mask) for image in real]
+    assert told(thin, real) == []
 
 
 def test_samples_that_pass_their_limits_a_little_are_clipped(tmp_path: Path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lidarsynth as ls
-from lidarsynth.cli.many import _named
+from lidarsynth.cli.outcomes import named_failure
 from lidarsynth.files.fields import PLACE, FileError, written_names
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
@@ -184,7 +184,7 @@ def test_bad_arrays_are_told_by_the_library():
 
 def test_a_failure_names_its_file_and_which_message_of_it():
     def told(source: str, name: str, error: str) -> str:
-        return _named(Result(name, Path(source), None, 0.0, error))
+        return named_failure(Result(name, Path(source), None, 0.0, error))
 
     assert told("a.bag", "a/000002", "expected points, found none") == "a.bag: 000002: expected points, found none"
     assert told("a.bag", "a/000002", "a.bag: a/000002: expected points") == "a.bag: a/000002: expected points"

@@ -3,18 +3,23 @@
 import errno
 import fcntl
 import json
+import resource
 import shutil
 import subprocess
 import sys
+import threading
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
 import pytest
 import torch
+from forked import Forked
 
 from lidarsynth.cli import terminal
+from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import write_cache
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import PRESETS, preset
@@ -25,6 +30,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.training import checkpoint
 from lidarsynth.training.checkpoint import STATE, checkpoints, damage_of
+from lidarsynth.training.machine import silent_threads
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
 from lidarsynth.weights.load import load
@@ -220,6 +226,49 @@ def test_a_full_disk_says_where_and_what_to_do_and_leaves_what_was_there(cache, 
     ):
         list(run(tiny(8, **{"training.decay": "constant"}), cache, tmp_path / "new/out", options=QUIET))
     assert not list((tmp_path / "new").rglob(".saving-*")) and damage_of(checkpoints(out)[-1]) == ""
+
+
+def test_a_state_that_no_longer_fits_on_the_disk_is_told_as_such(cache, tmp_path):
+    for most in range(60_000, 480_000, 60_000):
+        words = ["train", "tiny", "--data", cache, "--out", tmp_path / "out", "--training.steps", 2, "--workers", 0]
+        done = Forked(*words, run=partial(limited, most))
+        _, errors = done.communicate()
+        line = errors.strip().splitlines()[-1]
+        assert (done.returncode, "Traceback" in errors) == (2, False), errors
+        assert line.startswith(f"lidarsynth: {tmp_path / 'out'}: expected room for a checkpoint, found: "), errors
+    assert not checkpoints(tmp_path / "out") and not list((tmp_path / "out").rglob(".*"))
+
+
+def limited(most: int, words: list[str]) -> None:
+    """The command line where no file may be larger than `most` bytes."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+    main(words)
+
+
+def test_a_thread_that_a_full_disk_ends_prints_no_traceback(monkeypatch):
+    told = []
+    monkeypatch.setattr(threading, "excepthook", lambda failure: told.append(failure.exc_type))
+    with silent_threads():
+        for error in (OSError(errno.ENOSPC, "No space left on device"), ValueError("a fault of ours")):
+            thread = threading.Thread(target=raised, args=(error,))
+            thread.start()
+            thread.join()
+    assert told == [ValueError]
+
+
+def raised(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+@pytest.mark.parametrize(("words", "stream"), [(["--version"], 1), (["info", "vlp-16"], 1), (["info", "nothing"], 2)])
+def test_a_full_disk_under_what_is_said_is_no_traceback(words: list[str], stream: int):
+    with open("/dev/full", "w") as full:
+        out, err = (full if stream == number else subprocess.PIPE for number in (1, 2))
+        command = [sys.executable, "-m", "lidarsynth", *words]
+        done = subprocess.run(command, stdout=out, stderr=err, text=True, timeout=60)
+    assert done.returncode == 2
+    assert stream == 2 or done.stderr.startswith("lidarsynth: expected room to write, found: No space left on device")
 
 
 def test_what_a_killed_run_left_is_swept_also_when_it_goes_on(cache, trained, tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from networks import tiny_cascade
 from test_cascade import SMALL, perfect
+from test_columns import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.fields import PLACE, full_scale, scan_from_fields
@@ -16,6 +17,7 @@ from lidarsynth.files.formats import read, write, write_labels
 from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
@@ -43,8 +45,8 @@ def save_model_and_sensor() -> None:
 
 def write_bag_of(scan: Scan, path: Path, count: int) -> dict[str, np.ndarray]:
     """The columns of a bag of so many messages, each of the same scan."""
+    from lidarsynth.data.bag_records import Cloud
     from lidarsynth.data.bag_writer import write_bag
-    from lidarsynth.data.bags import Cloud
 
     fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
               "ring": scan.ring.astype(np.uint16), "object": scan.extra["object"]}  # type: ignore[union-attr]  # fmt: skip
@@ -77,6 +79,19 @@ def test_fields_and_points_survive(place: Path, capsys: pytest.CaptureFixture[st
     library = load("model").realise(sim, "own.toml")
     np.testing.assert_array_equal(library.xyz, real.xyz)
     np.testing.assert_array_equal(library.reflectance, real.reflectance)
+
+
+def test_columns_of_the_scans_own_are_said_in_the_line(place: Path, capsys: pytest.CaptureFixture[str]):
+    note = "own in 512 columns, by the scan's own steps"  # and so it is where the sensor is named
+    for width, told in ((512, 1), (256, 0)):
+        write("sim.pcd", perfect(SMALL.resized(width=width)))
+        main(["realise", "sim.pcd", "--out", "real.pcd", "--model", "model", *WORDS])
+        assert capsys.readouterr().out.count(f" points; {note}\n") == told
+    dense = turn(SENSORS["os1-64"], 2048, jitter=0.0, keep=1.0)
+    write("sim.pcd", dense)
+    for words in ((), ("--sensor", "os1-64")):
+        main(["realise", "sim.pcd", "--out", "real.pcd", "--model", "model", "--no-picture", *words])
+        assert f"of {len(dense)} points; os1-64 in 2048 columns, by the scan's own steps\n" in capsys.readouterr().out
 
 
 def test_axes_and_files_of_simulators(place: Path, capsys: pytest.CaptureFixture[str]):

@@ -1,6 +1,8 @@
 """Sensors: their rays, their own files, and one clear line for each thing that can be wrong in such a file."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +113,35 @@ def test_tables_and_sensors_are_inverses(name):
     sensor = get_sensor(name)
     assert from_dict(sensor.to_dict()) == sensor
     assert from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
+
+
+@pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e", "vlp-16", "os1-128"])
+def test_elevations_in_radians_are_warned_of(name, tmp_path):
+    elevations = SENSORS[name].elevations
+    assert Sensor("mine", elevations).elevations == elevations
+    with pytest.warns(UserWarning, match=r"sensor mine: expected elevations in degrees, found .*: are they radians\?"):
+        Sensor("mine", tuple(np.radians(elevations)))
+    path = tmp_path / "mine.toml"
+    path.write_text(f"elevations = {np.radians(elevations).tolist()}\n")
+    with pytest.warns(UserWarning, match="radians"):
+        get_sensor(path)
+
+
+def test_narrow_sensors_of_few_beams_and_parts_of_others_are_no_radians():
+    for beams in ((0.3, 0.0, -0.3), tuple(np.linspace(1, -1, 16)), tuple(np.linspace(0.5, -0.5, 11))):
+        assert Sensor("ahead", beams).height == len(beams)  # warnings are errors here
+    for sensor in SENSORS.values():
+        sensor.rows([row for row, beam in enumerate(sensor.elevations) if abs(beam) <= 1] or [0])
+
+
+def test_the_command_line_says_a_warning_as_its_own_line(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("beams = 32\ntop = 0.26\nbottom = -0.44\n")
+    words = [sys.executable, "-m", "lidarsynth", "info", path]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0
+    assert done.stderr.endswith("elevations in degrees, found 32 of 0.26 to -0.44: are they radians?\n")
+    assert done.stderr.startswith("lidarsynth: sensor mine: expected") and done.stderr.count("\n") == 1
 
 
 def test_files_of_the_user_make_sensors(tmp_path):

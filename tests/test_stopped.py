@@ -14,6 +14,7 @@ from test_recognise import turn
 from test_training_run import SENSOR, noise_image
 
 from lidarsynth.cli.main import main
+from lidarsynth.cli.terminal import answer
 from lidarsynth.data.cache import write_cache
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.sensor import SENSORS
@@ -87,6 +88,31 @@ def test_an_interruption_while_processes_begin_is_one_line(tmp_path: Path):
     assert code == 130 and errors.endswith("lidarsynth: stopped\n") and "Traceback" not in errors
 
 
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("group", [False, True])
+def test_sigterm_is_one_line_and_the_same_command_goes_on(group: bool, tmp_path: Path):
+    words = ["streets", "--out", "set", "-n", "24", "--sensor", "vlp-16", "--workers", "2", "--no-picture"]
+    with running(tmp_path, *words) as process:
+        once(lambda: len(list((tmp_path / "set").rglob("velodyne/*.bin"))) > 0, process)
+        for _ in range(2):  # as timeout(1) does
+            (os.killpg if group else os.kill)(process.pid, signal.SIGTERM)
+            time.sleep(0.002)
+        code, errors = ended(process)
+    assert code == 143 and errors.endswith("lidarsynth: stopped by SIGTERM\n") and "Traceback" not in errors
+    there = {path: path.read_bytes() for path in (tmp_path / "set").rglob("*.bin")}
+    assert not list((tmp_path / "set").rglob(".*")) and len(there) < 24 * 3
+    with running(tmp_path, *words) as process:
+        assert ended(process)[0] == 0
+    assert len(list((tmp_path / "set").rglob("velodyne/*.bin"))) == 24
+    assert all(path.read_bytes() == content for path, content in there.items())
+
+
+def test_sigterm_ends_as_it_did_where_a_command_is_done():
+    with pytest.raises(SystemExit, match="143"):
+        answer(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
 TRAIN = ["train", "tiny", "--data", "cache", "--out", "run", "--workers", "2", "--threads", "1", "--sample-every", "0",
          "--training.steps", "100000", "--training.batch_size", "1"]  # fmt: skip
 
@@ -100,6 +126,17 @@ def training(tmp_path: Path) -> Path:
 def begun(folder: Path, process: subprocess.Popen) -> None:
     losses = folder / "run" / "losses.csv"
     once(lambda: losses.exists() and losses.read_text().count("\n") > 2, process)
+
+
+@pytest.mark.timeout(300)
+def test_two_sigterms_of_a_training_are_one(training: Path):
+    with running(training, *TRAIN) as process:
+        begun(training, process)
+        for _ in range(2):
+            os.kill(process.pid, signal.SIGTERM)
+            time.sleep(0.005)
+        code, errors = ended(process)
+    assert code == 0 and list((training / "run" / "checkpoints").glob("step-*")), errors
 
 
 @pytest.mark.timeout(300)

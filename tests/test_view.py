@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, Cloud, cloud_of, typestore
 from lidarsynth.data.bag_writer import message_of, write_bag
-from lidarsynth.data.bags import POINTS, Cloud, cloud_of, open_bag, typestore
+from lidarsynth.data.bags import open_bag
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import FunctionType
 
 from lidarsynth.cli.arguments import fields_joined
+from lidarsynth.cli.parsing import parsed
 from lidarsynth.cli.terminal import answer, say
 
 
@@ -26,8 +27,12 @@ def main(argv: list[str] | None = None) -> None:
     """Run one verb: exits 0, or 2 with one line that says what was expected and what was found."""
     argv = sys.argv[1:] if argv is None else argv
     if argv[:1] == ["--version"]:
-        from importlib.metadata import version
+        answer(_version)
+    else:
+        answer(lambda: parsed(VERBS, fields_joined(argv) if argv[:1] == ["train"] else argv)())
 
-        say(f"lidarsynth {version('lidarsynth')}")
-        return
-    answer(VERBS, fields_joined(argv) if argv[:1] == ["train"] else argv)
+
+def _version() -> None:
+    from importlib.metadata import version
+
+    say(f"lidarsynth {version('lidarsynth')}")

@@ -1,4 +1,4 @@
-"""What `complete`, `upsample`, `realise` and `project` share: options for many scans, running and reporting them."""
+"""What `complete`, `upsample`, `realise`, `label` and `project` share: options for many scans, and doing the work."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 from lidarsynth.cli.arguments import Rings, arg
+from lidarsynth.cli.outcomes import NAMED, check_any, named_failure, refuse_all, say_summary, tell, tell_of_many
 from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
-from lidarsynth.lidar.plural import plural, was
+from lidarsynth.lidar.plural import was
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lidarsynth.data.bag_records import Topic
     from lidarsynth.data.bag_writer import BagWriter
-    from lidarsynth.data.bags import Topic
     from lidarsynth.systems.scan_model import ScanModel
     from lidarsynth.verbs.batch import Job, Result, Work
     from lidarsynth.verbs.inputs import Inputs
 
-PICTURES, NAMED = 10, 5  # scans that get a picture unasked; failures that are named one by one
+PICTURES = 10  # scans that get a picture unasked
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,8 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
     with step_bar(work[0].item.path.name, _calls(job, model)) as on_step:
         (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:
-        raise ValueError(_named(result))
-    _tell(result, job.picture)
+        raise ValueError(named_failure(result))
+    tell(result, job.picture)
     return [result]
 
 
@@ -171,7 +172,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         others = report.is_file() and not same(report, settings["recipe"], told=False)  # of a part, to be kept
         nothing = results and not skipped and all(result.error is not None for result in results)
         if nothing and (shard[1] == 1 or others):  # else the other parts may be whole
-            _refuse_all(results)
+            refuse_all(results)
         out.mkdir(parents=True, exist_ok=True)
         before = rows_before([*replaced, report], skipped)
         write_report(report, report_of(results, len(skipped), seconds, settings, before))
@@ -184,9 +185,9 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
     if replaced:
         warn(f"{report}: of this run's scans now, in place of {', '.join(path.name for path in replaced[:NAMED])}"
              f"{', ...' if replaced[NAMED:] else ''}, of shards that were made here before")  # fmt: skip
-    _summary(results, len(skipped), seconds, merged or report)
+    say_summary(results, len(skipped), seconds, merged or report)
     if merged is not None:
-        _check_any(merged)
+        check_any(merged)
     return results
 
 
@@ -209,7 +210,7 @@ def _done(
                 _begin(report, settings, many.skip_existing)
             results.append(result)
             on_scan()
-            _tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
+            tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
     return results
 
 
@@ -305,10 +306,10 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
                 writer.write_cloud(topic, result.cloud)
             results.append(replace(result, cloud=None))
             on_scan()
-            _tell_of_many(result, False, False, len(results))
+            tell_of_many(result, False, False, len(results))
         if results and all(result.error is not None for result in results):
-            _refuse_all(results)  # before the bag is in its place
-    _summary(results, 0, time.perf_counter() - begun, out)
+            refuse_all(results)  # before the bag is in its place
+    say_summary(results, 0, time.perf_counter() - begun, out)
     return results
 
 
@@ -331,65 +332,3 @@ def _copy(path: Path, writer: BagWriter, topics: list[Topic]) -> None:
     if left:
         warn(f"{writer.path}: expected a .mcap for attachments and metadata, found a .bag, which holds none: "
              f"{', '.join(left[:NAMED])}{', ...' if left[NAMED:] else ''} left out")  # fmt: skip
-
-
-def _tell(result: Result, picture: bool) -> None:
-    from lidarsynth.files.fields import dropped_points
-
-    if result.dropped:
-        say(f"{result.source}: {dropped_points(result.dropped)}, {result.points[0]} stay")
-    if result.warning:
-        warn(result.warning)
-    if result.note:
-        say(f"{result.source}: {result.note}")
-    if result.target is not None:
-        beside = f", with {', '.join(result.beside)} beside it" if result.beside else ""
-        say(f"wrote {result.target}" + (f" and {result.target.with_suffix('.png')}" if picture else "") + beside)
-
-
-def _tell_of_many(result: Result, picture: bool, each: bool, number: int) -> None:
-    """A line per scan where they are few; of many only warnings and failures, and of those the first few."""
-    if result.error is not None:
-        if number > 1:  # the first is kept until it is known whether all fail
-            warn(_named(result))
-    elif each:
-        _tell(result, picture)
-    elif result.warning and number <= NAMED:
-        warn(result.warning)
-
-
-def _summary(results: list[Result], skipped: int, seconds: float, where: Path) -> None:
-    failed = [result for result in results if result.error is not None]
-    if failed and failed[0] is results[0]:
-        warn(_named(failed[0]))
-    done = len(results) - len(failed)
-    text = f"{plural(done, 'scan')} in {seconds:.1f} s"
-    text += f", {done / seconds:.1f} a second" if done and seconds > 1 else ""
-    text += f"; {skipped} {was(skipped)} there already" if skipped else ""
-    text += f"; {len(failed)} failed: {', '.join(result.name for result in failed[:NAMED])}" if failed else ""
-    text += ", ..." if len(failed) > NAMED else ""
-    say(f"{text}; see {where}")
-
-
-def _named(result: Result) -> str:
-    """A failure with the file that it is of, and which message or turn of one that holds many."""
-    text, name = str(result.error).removeprefix(f"{result.source}: "), Path(result.name).name
-    one_of_many = not result.source.name.startswith(name) and name not in text
-    return text if str(result.source) in text else f"{result.source}: {f'{name}: ' if one_of_many else ''}{text}"
-
-
-def _check_any(merged: Path) -> None:
-    """Raises ValueError where the report of all shards tells that every scan failed."""
-    from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
-
-    report = read_json(merged, LARGEST_INDEX)
-    if report["failed"] and not report["done"] + report["skipped"]:
-        raise ValueError(f"{merged}: expected scans, found all {report['failed']} of {report['settings']['shards']} "
-                         "shards broken")  # fmt: skip
-
-
-def _refuse_all(failed: list[Result]) -> NoReturn:
-    first = _named(failed[0])
-    raise ValueError(
-        first if len(failed) == 1 else f"expected scans, found all {len(failed)} broken; the first: {first}"
-    )

@@ -5,14 +5,18 @@ from __future__ import annotations
 import codecs
 import errno
 import io
+import math
 import os
+import signal
 import sys
+import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from lidarsynth.cli.parsing import parsed
 from lidarsynth.lidar.plural import plural
 
 if TYPE_CHECKING:
@@ -22,6 +26,7 @@ if TYPE_CHECKING:
 NARROWEST = 40  # columns
 MOST = 1200  # characters of a refusal
 REFUSED, STOPPED, UNHEARD = 2, 130, 141  # exit codes; the last two as shells have them for Ctrl-C and a closed pipe
+TERMINATED, MOMENT = 143, 1.0  # likewise for SIGTERM; seconds, in which a second one is the same: timeout(1) sends two
 
 
 def say(text: str) -> None:
@@ -110,21 +115,24 @@ def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
     from tqdm import tqdm
 
     bar, asked = None, time.perf_counter()
-    for progress in run:  # its first is where the run stands
-        if progress.note:
-            tqdm.write(f"lidarsynth: {progress.note}", file=sys.stderr)
-        if bar is None:
-            bar = tqdm(total=steps, initial=progress.step, unit="step", mininterval=max(0.5, _seconds()))
-        elif not bar.disable:
-            between = max(time.perf_counter() - asked - progress.seconds, 0)
-            bar.start_t, bar.last_print_t = bar.start_t + between, bar.last_print_t + between
-        losses = " ".join(f"{name} {value:.4f}" for name, value in progress.losses.items())
-        bar.set_postfix_str(f"{losses} norm {progress.grad_norm:.2f} rate {progress.learning_rate:.1e}", refresh=False)
-        bar.update(progress.step - bar.n)
-        yield progress.step
-        asked = time.perf_counter()
-    if bar is not None:
-        bar.close()
+    try:
+        for progress in run:  # its first is where the run stands
+            if progress.note:
+                tqdm.write(f"lidarsynth: {progress.note}", file=sys.stderr)
+            if bar is None:
+                bar = tqdm(total=steps, initial=progress.step, unit="step", mininterval=max(0.5, _seconds()))
+            elif not bar.disable:
+                between = max(time.perf_counter() - asked - progress.seconds, 0)
+                bar.start_t, bar.last_print_t = bar.start_t + between, bar.last_print_t + between
+            losses = " ".join(f"{name} {value:.4f}" for name, value in progress.losses.items())
+            rest = f"norm {progress.grad_norm:.2f} rate {progress.learning_rate:.1e}"
+            bar.set_postfix_str(f"{losses} {rest}", refresh=False)
+            bar.update(progress.step - bar.n)
+            yield progress.step
+            asked = time.perf_counter()
+    finally:  # what a run ends with stands on a line of its own
+        if bar is not None:
+            bar.close()
 
 
 def load_with_bar(source: str, device: str) -> ScanModel:
@@ -155,10 +163,10 @@ def check_device(device: str) -> None:
     check(device)
 
 
-def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> None:
-    """Run the verb of a command line (None = the process's own) and turn every failure into one line and an exit code.
+def answer(verb: Callable[[], object]) -> None:
+    """Do what a command line asks for and turn every failure into one line and an exit code.
 
-    Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 141 where nobody reads stdout any more.
+    Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 143 for SIGTERM, 141 where nobody reads stdout.
     """
     if sys.stderr is None:  # closed by who started us, as 2>&- does
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for as long as the process lasts
@@ -168,13 +176,15 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)  # the help of a narrower terminal would never be laid out
     try:
-        parsed(verbs, sys.argv[1:] if argv is None else argv)()
+        with _terminable(), _warned():
+            verb()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         sys.exit(UNHEARD)
-    except KeyboardInterrupt:
-        print("lidarsynth: stopped", file=sys.stderr)
-        sys.exit(STOPPED)
+    except KeyboardInterrupt as stop:
+        terminated = stop.args == (signal.SIGTERM,)
+        _tell_last("stopped by SIGTERM" if terminated else "stopped")
+        sys.exit(TERMINATED if terminated else STOPPED)
     except OSError as error:
         _refuse(_of_system(error))
     except (ValueError, ImportError, FloatingPointError) as error:
@@ -185,6 +195,44 @@ def answer(verbs: Mapping[str, Callable[..., None]], argv: list[str] | None) -> 
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise  # a fault of ours
         _refuse(f"expected enough memory, found too little: {error}".partition("\n")[0])
+
+
+@contextmanager
+def _warned() -> Iterator[None]:
+    """Warnings of the library's own are lines as `warn` says them, without the place in the program."""
+    former, package = warnings.formatwarning, Path(__file__).parents[1]
+
+    def line(message: Warning | str, category: type[Warning], file: str, number: int, text: str | None = None) -> str:
+        own = Path(file).is_relative_to(package)
+        return f"lidarsynth: {message}\n" if own else former(message, category, file, number, text)
+
+    warnings.formatwarning = line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = former
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM (of timeout, Slurm, a machine that goes down) raises KeyboardInterrupt(SIGTERM): what ends well by Ctrl-C
+    ends well by it, too."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    last = -math.inf
+
+    def stop(number: int, frame: object) -> None:
+        nonlocal last
+        former, last = last, time.monotonic()
+        if last - former >= MOMENT:
+            raise KeyboardInterrupt(number)
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _sayable(error: UnicodeError) -> tuple[str, int]:
@@ -209,5 +257,11 @@ def _refuse(reason: str) -> NoReturn:
     line = "".join(c if c.isprintable() else "?" for c in " ".join(reason.split()))
     line = line if len(line) <= MOST else f"{line[: MOST // 2]} ... {line[-MOST // 3 :]}"
     start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over a progress bar that stood there
-    print(f"{start}lidarsynth: {line or 'stopped for no known reason'}", file=sys.stderr)
+    _tell_last(line or "stopped for no known reason", start)
     sys.exit(REFUSED)
+
+
+def _tell_last(line: str, start: str = "") -> None:
+    """The line that a command ends with; the exit code holds where stderr is a file on the very disk that is full."""
+    with suppress(OSError):
+        print(f"{start}lidarsynth: {line}", file=sys.stderr, flush=True)

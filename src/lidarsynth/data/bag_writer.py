@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lidarsynth.data.bag_errors import BROKEN, library_errors, one_line
-from lidarsynth.data.bags import POINTS, Attached, Cloud, Message, Topic, typestore
+from lidarsynth.data.bag_records import POINTS, Attached, Cloud, Message, Topic, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
 from lidarsynth.lidar.whole_file import whole_file

@@ -75,22 +75,25 @@ def pool_of(
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits, and processes that begin meanwhile never see it: it is the parent's to handle."""
-    handler = signal.getsignal(signal.SIGINT)
+    """Ctrl-C and SIGTERM wait, and processes that begin meanwhile never see Ctrl-C: it is the parent's to handle."""
+    found = {int(number): signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in found.items() if callable(handler)}
     main = threading.current_thread() is threading.main_thread()
-    if not main or not callable(handler) or sys.platform == "win32":
+    if not main or signal.SIGINT not in handlers or sys.platform == "win32":
         yield
         return
     came: list[tuple[int, Any]] = []
-    signal.signal(signal.SIGINT, lambda *call: came.append(call))  # another thread may be the one that gets it
+    for number in handlers:
+        signal.signal(number, lambda *call: came.append(call))  # another thread may be the one that gets it
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which processes inherit, and handlers not
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     if came:
-        handler(*came[0])
+        handlers[came[0][0]](*came[0])
 
 
 def _start(make: Callable[[Any], Any]) -> None:

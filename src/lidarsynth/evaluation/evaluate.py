@@ -20,6 +20,7 @@ from lidarsynth.evaluation.notes import (
     one_set,
     other_frames,
     tensors_taken,
+    turned_images,
     unlike_metres,
     unlike_pairs,
     unlike_sensors,
@@ -125,7 +126,10 @@ class _Run:
         sides = {"samples": judged, "the reference": truth}
         told = unused_sensor(self.sensor, judged, drawn) + unlike_sensors(sides, drawn)
         told += tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides) + other_frames(sides)
-        return told if self.protocol.clouds else told + upside_down(sides, drawn, self.projection(drawn))
+        if self.protocol.clouds:
+            return told
+        drawing = drawn, self.projection(drawn)
+        return told + upside_down(sides, *drawing) + turned_images(sides, *drawing)
 
     def projection(self, sensor: Sensor) -> str:
         """Of points: the protocol's into images of its own sensor; by rings into those that published programs take."""

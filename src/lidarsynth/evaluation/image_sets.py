@@ -23,6 +23,7 @@ from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import MAX_BYTES
 from lidarsynth.files.formats import READERS, holds_image, naming, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
+from lidarsynth.lidar.depth import OVERSHOOT
 from lidarsynth.lidar.projection import project_thinned, thin
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, no_metres
 from lidarsynth.lidar.sensor import Sensor
@@ -251,6 +252,10 @@ def judged(item: Item) -> Item:
     if isinstance(item, RangeImage):
         _check_metres(item.range[item.mask])
         image = emptied(item)
+        farthest, brightest = float(image.range.max()), float(image.reflectance.max())
+        if farthest <= 1 + OVERSHOOT < brightest:
+            found = f"ranges of at most {farthest:.3g} and a reflectance of up to {brightest:.3g}: are they exchanged?"
+            raise ValueError(f"expected ranges in metres and a reflectance of 0 to 1, found {found}")
         if image.reflectance.min() < 0 or image.reflectance.max() > 1:
             image = replace(image, reflectance=within("a reflectance", image.reflectance, 1))
         if image.xyz is not None:

@@ -104,9 +104,15 @@ def usual_at_most(sensor: Sensor) -> Sensor:
     return sensor.resized(width=min(usual, sensor.width))
 
 
-def columns_note(sensor: Sensor) -> str:
-    """In words that a recognised sensor has other columns than its table says, or nothing."""
-    usual = WORDS[sensor.name].width if sensor.name in WORDS else sensor.width
+def columns_note(sensor: Sensor, usual: int | None = None) -> str:
+    """In words that a recognised sensor has other columns than its table says, or nothing.
+
+    usual  columns that it would have had, where naming the sensor does not hold them: of `realise`
+    """
+    held = usual is None
+    if usual is None:
+        usual = WORDS[sensor.name].width if sensor.name in WORDS else sensor.width
     if usual == sensor.width:
         return ""
-    return f"{sensor.name} in {sensor.width} columns, by the scan's own steps; where it is named, in {usual}"
+    note = f"{sensor.name} in {sensor.width} columns, by the scan's own steps"
+    return f"{note}; where it is named, in {usual}" if held else note

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import ChainMap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ import numpy as np
 from lidarsynth.lidar.small_file import read_json, read_toml
 
 MOST = 4096  # beams that an image may have
+CROWDED, TURNED = 0.06, np.pi / 2  # degrees from beam to beam, and at most, of numbers that look like radians
 METRES = ("min_range", "max_range", "mount")  # fields that are one number each
 
 
@@ -37,7 +39,7 @@ class Sensor:
                 a run whose first column is behind its last goes around the seam
     dimness     how much less signal each beam reports than others, or () where it is not known
 
-    Raises ValueError when a value makes no sense.
+    Raises ValueError when a value makes no sense; warns of elevations that look like radians.
     """
 
     name: str
@@ -58,6 +60,10 @@ class Sensor:
         if len(self.elevations) < 1 or not np.all(steps < 0) or not np.all(np.abs(self.elevations) <= 90):
             raise ValueError(f"sensor {self.name}: elevations must fall from top to bottom within +-90 degrees, "
                              f"got {list(self.elevations)[:4]}...")  # fmt: skip
+        if self.height > 3 and max(map(abs, self.elevations)) <= TURNED and -steps.mean() < CROWDED:
+            span = f"{self.elevations[0]:.3g} to {self.elevations[-1]:.3g}"  # or one that looks through a slit
+            warnings.warn(f"sensor {self.name}: expected elevations in degrees, found {self.height} of {span}: are they"
+                          " radians?", stacklevel=3)  # fmt: skip
         if self.width < 4:
             raise ValueError(f"sensor {self.name}: width must be at least 4 columns, got {self.width}")
         if not 0 <= self.min_range < self.max_range:

@@ -80,10 +80,10 @@ _EGO = (
 
 @lru_cache(maxsize=4)
 def own_car(sensor: Sensor) -> np.ndarray:
-    """(H, W) bool: which rays end on the vehicle itself. All False for other sensors than `hdl-64e-kitti`."""
+    """(H, W) bool: which rays end on the vehicle itself. All False for other sensors than `hdl-64e-kitti`, or rows."""
     width = sensor.width
     hidden = np.zeros((sensor.height, width), bool)
-    if sensor.name != NAME:
+    if sensor.name != NAME or sensor.height != len(RING_LOSS):
         return hidden
     columns = np.arange(width)
     scale = width / 1024

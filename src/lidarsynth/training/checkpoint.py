@@ -32,9 +32,15 @@ SCRATCH = ".saving-"
 
 
 def save_run(path: str | Path, run: Run) -> None:
-    """Write the run's state; the file is moved into place when complete, and survives a power cut from then on."""
+    """Write the run's state; the file is moved into place when complete, and survives a power cut from then on.
+
+    Raises OSError.
+    """
     with whole_file(path, durable=True) as scratch, scratch.open("wb") as file:
-        torch.save(run.state_dict(), file)
+        try:
+            torch.save(run.state_dict(), file)
+        except RuntimeError as error:  # torch's own, of the archive that a full disk cut
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
 
 
 def load_run(path: str | Path, run: Run) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -55,13 +56,15 @@ def fixed_randomness(*key: int) -> Iterator[None]:
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """A list that SIGTERM and the first Ctrl-C append to instead of ending the process; a second one ends it."""
+    """A list that SIGTERM and the first Ctrl-C append to instead of ending the process; a second Ctrl-C ends it, and a
+    second SIGTERM is none: timeout(1) sends two at once."""
     received: list[int] = []
     former = {}
 
     def note(number: int, frame: object) -> None:
         received.append(number)
-        signal.signal(number, former[number])
+        if number == signal.SIGINT:
+            signal.signal(number, former[number])
 
     for number in (signal.SIGTERM, signal.SIGINT):
         former[number] = signal.getsignal(number)
@@ -71,6 +74,22 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def silent_threads() -> Iterator[None]:
+    """An OSError that ends a thread is not printed with its traceback: TensorBoard's raises it in the caller, too."""
+    former = threading.excepthook
+
+    def say(failure: threading.ExceptHookArgs) -> None:
+        if not issubclass(failure.exc_type, OSError):
+            former(failure)
+
+    threading.excepthook = say
+    try:
+        yield
+    finally:
+        threading.excepthook = former
 
 
 def any_process(accelerator: Accelerator, flag: bool) -> bool:

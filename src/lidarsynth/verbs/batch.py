@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidarsynth.data.bags import Cloud
+from lidarsynth.data.bag_records import Cloud
 from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
@@ -23,7 +23,7 @@ from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
 from lidarsynth.pictures.portrait import portrait
@@ -278,7 +278,10 @@ def _made(
     if job.verb == "realise":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         filled = realise_scan(model, scan, sensor, job.how.seed + work.number)
-        return filled, f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
+        done = f"{sensor.name} would report {len(filled.points)} of {len(scan)} points"
+        usual = sensor if job.sensor is not None else WORDS.get(sensor.name, sensor)
+        note = columns_note(filled.image.sensor, usual.width)
+        return filled, f"{done}; {note}" if note else done
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         sensor = usual_at_most(sensor) if job.sensor is None else sensor
@@ -306,12 +309,12 @@ def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | N
 
 
 def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) -> tuple[str, ...]:
-    """Write the result, and return the endings of what is beside a .bin or .npy."""
+    """Write the result, the scan last: where it is, all is. Returns the endings of what is beside a .bin or .npy."""
     beside: tuple[str, ...] = ()
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
-        write(target, image)
+        content: RangeImage | Scan = image
     else:
         placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
         if target.suffix.lower() in BARE:
@@ -321,7 +324,8 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         if LABEL in beside:
             label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
-        write(target, without_places(placed))
+        content = without_places(placed)
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
+    write(target, content)
     return beside

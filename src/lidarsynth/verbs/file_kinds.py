@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bags import POINTS, SUFFIXES, Bag, Cloud, is_bag, open_bag
+from lidarsynth.data.bag_records import POINTS, Bag, Cloud
+from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.index import INDEX, read_index, report

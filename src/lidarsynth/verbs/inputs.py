@@ -11,7 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarsynth.data.bags import Message, cloud_of, is_bag, open_bag
+from lidarsynth.data.bag_records import Message, cloud_of
+from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.turns import capture_turns

@@ -31,7 +31,7 @@ from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_
 from lidarsynth.training.examples import OF_ANY, SYNTHETIC, Streets, TrainingImages, folders_of, open_images, words_of
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import DECAYS, Progress, Run, start, train
-from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, stop_signals
+from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, silent_threads, stop_signals
 from lidarsynth.training.monitor import Monitor
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training_start import Start, check_start, start_of, write_start
@@ -309,7 +309,8 @@ def _journal(
         yield None
         return
     parts = task_of(experiment).parts
-    with closing(
-        Journal(out, step, experiment.training.batch_size, options.log_every, options.wandb, parts)
-    ) as journal:
+    with (
+        silent_threads(),
+        closing(Journal(out, step, experiment.training.batch_size, options.log_every, options.wandb, parts)) as journal,
+    ):
         yield journal
