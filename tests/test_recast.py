@@ -57,6 +57,10 @@ def blob(image: RangeImage, of: int) -> RangeImage:
     return replace(image, range=metres)
 
 
+def points_of(image: RangeImage) -> np.ndarray:
+    return image.sensor.points(image.range).reshape(*image.shape, 3)
+
+
 def points(image: RangeImage, of: int) -> np.ndarray:
     return (image.sensor.points(image.range) @ turn(image.sensor).T)[(image.label == of) & image.mask]
 
@@ -97,8 +101,8 @@ def test_a_car_is_found_where_it_stands(x: float, y: float, yaw: float) -> None:
     canvas = module._canvas(image)
     (at,) = module._suggestions(canvas, module.KINDS[0])
     seen = canvas.points.reshape(-1, 3)[at]
-    view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount)
-    place = best_place(module.KINDS[0].shapes[0], 24, seen, view, -SENSOR.mount, None)
+    view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount, longer=1)
+    place = best_place(module.KINDS[0].shapes[0], 24, [seen], view, -SENSOR.mount, None)
     assert np.hypot(place.x - x, place.y - y) < 0.35
     assert abs((place.yaw - yaw + np.pi / 2) % np.pi - np.pi / 2) < 0.12
     assert place.share > 0.9
@@ -126,6 +130,25 @@ def test_a_blob_becomes_a_car_that_stands_on_the_road(tilt: tuple[float, float])
     far = np.abs(np.arctan2(rays[..., 1], rays[..., 0]) - np.arctan2(3.0, 9.0)) > 0.5
     assert (far & truth.mask).sum() > 5000
     np.testing.assert_array_equal(found.range[far], truth.range[far])
+
+
+def test_a_row_of_parked_cars_that_was_drawn_as_one_heap_becomes_cars() -> None:
+    row = [standing("car", number, x, 4.2, 0.02) for number, x in ((0, -5.0), (1, 0.5), (2, 6.0))]
+    truth = scene(SENSOR, *row)
+    mine = [(scene(SENSOR, one).label == CAR) & (truth.label == CAR) for one in row]
+    drawn = truth
+    for there in mine:
+        rough = np.random.default_rng(0).uniform(-0.4, 0.4, there.sum())
+        metres = drawn.range.copy()
+        metres[there] = np.median(np.sort(metres[there])[: there.sum() // 2]) + rough
+        drawn = replace(drawn, range=metres)
+    between = (np.abs(points_of(drawn)[..., 0]) < 6) & (np.abs(points_of(drawn)[..., 1] - 4.2) < 1.2)
+    drawn = replace(drawn, label=np.where(between, CAR, drawn.label))  # the road between them, too: one heap
+    assert sum(len(at) > 500 for at in module._suggestions(module._canvas(drawn), module.KINDS[0])) == 1
+    found = recast(drawn, np.random.default_rng(0))
+    for there in mine:
+        assert (found.label == CAR)[there].mean() > 0.35  # panes hardly return
+        assert np.median(np.abs(found.range - truth.range)[there & (found.label == CAR) & found.mask]) < 0.5
 
 
 def test_a_column_becomes_a_person() -> None:

@@ -51,6 +51,7 @@ from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, obse
 from lidarsynth.systems.cascade.recast import all_recast, as_cast
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
+from lidarsynth.systems.cascade.shading import shaded
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.cascade.unit import as_streets
 from lidarsynth.systems.description import Description
@@ -237,7 +238,7 @@ class CascadeModel(AnySensorModel):
         """Grids (B, R, C) as whole images. Of 16 beams, first these are filled, then all between: at once, most would
         know nothing above or below. Reflectances are the likeliest, then get the speckle of their class, by which
         ranges are rough: first of the classes that the fill draws, then of those that are seen in the result, by which
-        cars and people are cast anew."""
+        surfaces are shaded, and cars and people cast anew."""
         own = replace(self, sensor=written_out(self.sensor))
         told = metres.cpu().numpy(), reflectance.cpu().numpy()
         if len(rows) > ROWS:  # little is left to say
@@ -255,6 +256,7 @@ class CascadeModel(AnySensorModel):
             return self._named(recorded)
         told = self.network.classes, recorded, self.response, self.sensor, self.precision
         seen = named(*told, more=RARER | (GROWING if len(rows) > ROWS else {}), alone=True)  # calm between its beams
+        shades = np.stack([shaded(even, image) for even, image in zip(shades, seen, strict=True)])
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         cast = all_recast(recorded, rng)
         return as_cast(self._named(cast), cast)

@@ -48,12 +48,13 @@ class View(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A thing's middle and direction, metres and radians; what it costs, see `_costs`, and which share of its own rays
-    end about where it is."""
+    """A thing's middle and direction, metres and radians; of `_costs`: what it costs with all that it leaves, which
+    tells which is the best, what it costs by itself, and which share of its own rays end about where it is."""
 
     x: float
     y: float
     yaw: float
+    total: float
     cost: float
     share: float
 
@@ -64,24 +65,52 @@ OFF, HIDES, INSIDE, ANOTHER, ABOUT = 2.0, 0.35, 0.6, 0.5, 1.0
 GAP, BEHIND = 0.3, 0.15  # metres
 ENDS = (0.06, 0.94)  # quantiles of what is seen of a thing
 ASKEW = 0.15  # cost of standing at 45 degrees to everything around
+BESIDE = 1.0  # metres around a thing within which rays are its own
+# Metres: a heap that is longer may be several things; places are looked for around what returns within so many of each
+# corner of a grid of that step; at the most of these; the best places are looked at with all rays, after a first look
+# with each fourth one.
+LONG, WITHIN, STEP, PARTS, BEST, SOME = 6.0, 2.7, 1.5, 8, 40, 4
 STEPS = ((0.25, 0.07), (0.1, 0.028))  # metres and radians, of the best place
 NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3).astype(np.float32)
 
 
-def best_place(shape: Shape, turns: int, points: np.ndarray, view: View, level: float, axis: float | None) -> Place:
-    """The place of least cost of a thing that is suggested by points (n, 3).
+def length(points: np.ndarray) -> float:
+    """How long what returns at points (n, 3) is from above, metres, but for the outermost."""
+    flat = points[:, :2] - points[:, :2].mean(0)
+    ends = np.quantile(flat @ np.linalg.eigh(np.cov(flat.T))[1][:, 1], [0.03, 0.97])
+    return float(ends[1] - ends[0])
+
+
+def parts_of(points: np.ndarray, few: int) -> list[np.ndarray]:
+    """Points (n, 3) of a heap, or of what may be single things in a long one: the fullest first, `few` at least."""
+    if length(points) < LONG:
+        return [points]
+    corners = np.unique(np.round(points[:, :2] / STEP), axis=0) * STEP
+    parts = [points[np.square(points[:, :2] - corner).sum(1) < WITHIN**2] for corner in corners]
+    parts = sorted((part for part in parts if len(part) >= few), key=lambda part: -len(part))
+    return parts[:PARTS] or [points]
+
+
+def best_place(
+    shape: Shape, turns: int, parts: list[np.ndarray], view: View, level: float, axis: float | None
+) -> Place:
+    """The place of least total cost of a thing that is suggested by points (n, 3), or by one of several such parts.
 
     turns  directions that are tried in half a turn; level: height of the ground there, metres
     axis   direction in which most things stand, or at a right angle to it; None = who knows
     """
-    places = _corners(points[:, :2], shape.size, np.arange(turns, dtype=np.float32) * np.float32(np.pi / turns))
-    costs, share = _costs(places, shape, view, level, axis)
+    yaws = np.arange(turns, dtype=np.float32) * np.float32(np.pi / turns)
+    places = np.concatenate([_corners(points[:, :2], shape.size, yaws) for points in parts])
+    if len(places) > len(yaws) * 9:
+        some = View(*(part[::SOME] for part in view))
+        places = places[np.argsort(_costs(places, shape, some, level, axis)[0], kind="stable")[:BEST]]
+    costs = _costs(places, shape, view, level, axis)
     for metres, radians in STEPS:
         around = np.array([metres, metres, radians if turns > 1 else 0], np.float32)
-        places = places[costs.argmin()] + NEIGHBOURS * around
-        costs, share = _costs(places, shape, view, level, axis)
-    best = int(costs.argmin())
-    return Place(*(float(value) for value in (*places[best], costs[best], share[best])))
+        places = places[costs[0].argmin()] + NEIGHBOURS * around
+        costs = _costs(places, shape, view, level, axis)
+    best = int(costs[0].argmin())
+    return Place(*(float(value) for value in places[best]), *(float(cost[best]) for cost in costs))
 
 
 def _corners(seen: np.ndarray, size: np.ndarray, yaws: np.ndarray) -> np.ndarray:
@@ -103,20 +132,33 @@ def _corners(seen: np.ndarray, size: np.ndarray, yaws: np.ndarray) -> np.ndarray
 
 def _costs(
     places: np.ndarray, shape: Shape, view: View, level: float, axis: float | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Costs (P,) of things at places (P, 3), and shares (P,) of the thing's own rays that end within a metre of it."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of things at places (P, 3): (P,) costs with all that they leave, in rays; costs by themselves, in those of their
+    own rays that are not farther off than BESIDE; shares of these that end within a metre of the thing."""
     met, left = _through(places, shape.boxes, view.rays, level)
     hit, off = np.isfinite(met), np.abs(np.minimum(met, 1e4) - np.minimum(view.metres, 2e4))
-    cost = np.where(hit, np.minimum(off / OFF, 1), 1) * view.own
+    missed = np.where(hit, np.minimum(off / OFF, 1), 1) * view.own
     hides = hit & ~view.own & (view.metres > met + GAP)
     inside = hides & (view.metres < left - BEHIND) & ~view.ground
     another = hit & ~view.own & ~view.ground & (off <= GAP)
-    cost += HIDES * hides + INSIDE * inside + ANOTHER * another
-    own = view.weight * view.own
-    costs, share = cost @ view.weight / own.sum(), (hit & (off < ABOUT)) @ own / own.sum()
+    wrong = (HIDES * hides + INSIDE * inside + ANOTHER * another) @ view.weight
+    near = _near(places, shape, view)
+    own = np.maximum(near @ view.weight, 1)
+    cost, share = ((missed * near) @ view.weight + wrong) / own, (hit & near & (off < ABOUT)) @ view.weight / own
+    total = missed @ view.weight + wrong
     if axis is not None:
-        costs += ASKEW * np.abs((places[:, 2] - axis + np.pi / 4) % (np.pi / 2) - np.pi / 4) / (np.pi / 4)
-    return costs, share
+        askew = ASKEW * np.abs((places[:, 2] - axis + np.pi / 4) % (np.pi / 2) - np.pi / 4) / (np.pi / 4)
+        total, cost = total + askew * own, cost + askew
+    return total, cost, share
+
+
+def _near(places: np.ndarray, shape: Shape, view: View) -> np.ndarray:
+    """(P, N) bool: which rays of what suggests a thing end beside it, if it is at places (P, 3)."""
+    x, y = (view.rays[:, :2] * np.where(np.isfinite(view.metres), view.metres, 0)[:, None]).T
+    c, s = np.cos(places[:, 2:]), np.sin(places[:, 2:])
+    x, y = x - places[:, :1], y - places[:, 1:2]
+    length, width = shape.size / 2 + BESIDE
+    return (np.abs(c * x + s * y) < length) & (np.abs(c * y - s * x) < width) & view.own
 
 
 def _through(places: np.ndarray, boxes: np.ndarray, rays: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.streets.world import THING, THINGS, World
 from lidarsynth.systems.cascade.hanging import beside, one_surface
-from lidarsynth.systems.cascade.placing import Place, Shape, View, best_place, two_boxes
+from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes
 
 
 class Kind(NamedTuple):
@@ -62,7 +62,8 @@ ROAD = CLASS_NUMBER["road"]
 CELL, FEW = 0.4, 20  # metres, in which returns of one thing are within two cells of others; returns
 AROUND, LOW = 6.0, 0.2  # metres around a thing where the ground is looked for, and above it that are ground
 WIDER, TALLER = 2.5, 2.2  # metres beside and above a thing that are looked at
-OWN, OTHERS = 220, 340  # rays that are looked at, of a thing's and of the others
+OWN, OTHERS, MOST = 220, 340, 2.5  # rays that are looked at, of a thing's and of the others; how many times as many
+TIGHT = 0.4  # metres beside one of several things that are in a row, within which returns are of it
 SIZE = (0.97, 1.03)  # things are so much smaller or larger
 TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
 OCCLUDED = 0.3  # metres nearer than a thing that hide it
@@ -165,18 +166,20 @@ def _thing(
     if len(at) < FEW or (step * metres**2).sum() < kind.area or np.hypot(*middle[:2]) > kind.reach:
         return None
     level = _level(canvas, middle)
-    view, top = _view(canvas, at, middle, level), np.quantile(points[:, 2], 0.97) - level
+    parts = parts_of(points, FEW) if kind.turns > 1 else [points]
+    view = _view(canvas, at, middle, level, max(length(points) / LONG, 1) if len(parts) > 1 else 1)
+    top = np.quantile(points[:, 2], 0.97) - level
     shapes = [shape for shape in kind.shapes if top >= shape.tall]
-    places = [best_place(shape, kind.turns, points, view, level, axis if kind.turns > 1 else None) for shape in shapes]
-    place, shape = min(zip(places, shapes, strict=True), key=lambda both: both[0].cost)
+    places = [best_place(shape, kind.turns, parts, view, level, axis if kind.turns > 1 else None) for shape in shapes]
+    place, shape = min(zip(places, shapes, strict=True), key=lambda both: both[0].total)
     if place.cost > kind.most or place.share < kind.least:
         if not _a_wall(points):
             gone = _with_lost(canvas, at)
             _fill(canvas, gone, gone, level, rng)
         return None
-    shade = float(np.median(canvas.reflectance.flat[at]))
+    mine = at[_near(points, place, shape, kind.margin if len(parts) == 1 else TIGHT)]
+    shade = float(np.median(canvas.reflectance.flat[mine if len(mine) else at]))
     found, rays = _cast(canvas, _mesh(kind, shape, place, level, rng), _tint(kind, shade, rng), rng)
-    mine = at[_near(points, place, shape, kind.margin)]
     _put(canvas, found, rays, mine, level, rng)
     rest = at[~np.isin(at, mine)]
     return rest if len(rest) >= FEW and len(mine) else None
@@ -229,8 +232,8 @@ def _axis(canvas: _Canvas) -> float | None:
     return float(np.angle((length * np.exp(4j * np.arctan2(along[:, 1], along[:, 0]))).sum())) / 4
 
 
-def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> View:
-    """Some of the rays around what the pixels `at` suggest."""
+def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float, longer: float) -> View:
+    """Some of the rays around what the pixels `at` suggest, up to MOST times as many where that is `longer`."""
     points, away = canvas.points.reshape(-1, 3)[at], float(np.hypot(*middle[:2]))
     ahead = np.arctan2(middle[1], middle[0])
     low, high = _span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
@@ -239,7 +242,8 @@ def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> 
     bottom = min(np.arctan2(level, max(away - 3, 1)), seen.min())
     window = _window(canvas, ahead, (low - wider, high + wider), (bottom, top))
     own = np.isin(window, at)
-    groups = [(window[which], most) for which, most in ((own, OWN), (~own, OTHERS))]
+    more = min(longer, MOST)
+    groups = [(window[which], int(more * most)) for which, most in ((own, OWN), (~own, OTHERS))]
     chosen = [group[np.linspace(0, len(group) - 1, min(len(group), most)).astype(int)] for group, most in groups]
     weight = np.concatenate([
         np.full(len(some), len(group) / max(len(some), 1), np.float32)
