@@ -138,7 +138,7 @@ def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
 
 
 def _suggestions(canvas: _Canvas, kind: Kind) -> list[np.ndarray]:
-    """Places in the flattened image of the returns of each thing of a kind, the nearest first."""
+    """Places in the flattened image of the returns of each thing of a kind, FEW at least, the nearest first."""
     at = np.flatnonzero(canvas.label == CLASS_NUMBER[kind.name])
     if not len(at):
         return []
@@ -151,7 +151,7 @@ def _suggestions(canvas: _Canvas, kind: Kind) -> list[np.ndarray]:
         one.append(beside)
         other.append(there[beside])
     thing = connected(np.concatenate(one), np.concatenate(other), len(key))[cell.ravel()]
-    things = [at[thing == number] for number in np.unique(thing)]
+    things = [at[thing == number] for number in np.flatnonzero(np.bincount(thing) >= FEW)]
     return sorted(things, key=lambda each: float(np.median(canvas.metres.flat[each])))
 
 
@@ -163,7 +163,7 @@ def _thing(
     metres, sensor = canvas.metres.flat[at], canvas.sensor
     step = np.abs(np.gradient(np.radians(sensor.elevations)))[at // sensor.width] * (2 * np.pi / sensor.width)
     middle = np.median(points, 0)
-    if len(at) < FEW or (step * metres**2).sum() < kind.area or np.hypot(*middle[:2]) > kind.reach:
+    if (step * metres**2).sum() < kind.area or np.hypot(*middle[:2]) > kind.reach:
         return None
     level = _level(canvas, middle)
     parts = parts_of(points, FEW) if kind.turns > 1 else [points]
