@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, from_dict, get_sensor, read_sensor
+from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, UnlikelySensorWarning, from_dict, get_sensor, read_sensor
 
 
 def test_the_grid_of_r2dm_equals_the_reference(fixture_tensors):
@@ -119,7 +119,9 @@ def test_tables_and_sensors_are_inverses(name):
 def test_elevations_in_radians_are_warned_of(name, tmp_path):
     elevations = SENSORS[name].elevations
     assert Sensor("mine", elevations).elevations == elevations
-    with pytest.warns(UserWarning, match=r"sensor mine: expected elevations in degrees, found .*: are they radians\?"):
+    with pytest.warns(
+        UnlikelySensorWarning, match=r"sensor mine: expected elevations in degrees, found .*: are they radians\?"
+    ):
         Sensor("mine", tuple(np.radians(elevations)))
     path = tmp_path / "mine.toml"
     path.write_text(f"elevations = {np.radians(elevations).tolist()}\n")
@@ -132,6 +134,17 @@ def test_narrow_sensors_of_few_beams_and_parts_of_others_are_no_radians():
         assert Sensor("ahead", beams).height == len(beams)  # warnings are errors here
     for sensor in SENSORS.values():
         sensor.rows([row for row, beam in enumerate(sensor.elevations) if abs(beam) <= 1] or [0])
+
+
+def test_the_command_line_says_so_too_where_a_sensor_is_made_of_another(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("beams = 32\ntop = 0.26\nbottom = -0.44\nmax_range = 100.0\n")
+    words = [sys.executable, "-m", "lidarsynth", "streets", "-n", "1", "--sensor", path, "--out", tmp_path / "set"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    lines = [line.rsplit("\r", 1)[-1] for line in done.stderr.split("\n") if "radians" in line]
+    assert lines and all(line.startswith("lidarsynth: sensor") for line in lines)
+    assert "UserWarning" not in done.stderr and "dataclasses.py" not in done.stderr
 
 
 def test_the_command_line_says_a_warning_as_its_own_line(tmp_path):

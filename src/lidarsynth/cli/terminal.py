@@ -203,7 +203,7 @@ def _warned() -> Iterator[None]:
     former, package = warnings.formatwarning, Path(__file__).parents[1]
 
     def line(message: Warning | str, category: type[Warning], file: str, number: int, text: str | None = None) -> str:
-        own = Path(file).is_relative_to(package)
+        own = Path(file).is_relative_to(package) or category.__module__.startswith(package.name)
         return f"lidarsynth: {message}\n" if own else former(message, category, file, number, text)
 
     warnings.formatwarning = line

@@ -21,6 +21,10 @@ CROWDED, TURNED = 0.06, np.pi / 2  # degrees from beam to beam, and at most, of 
 METRES = ("min_range", "max_range", "mount")  # fields that are one number each
 
 
+class UnlikelySensorWarning(UserWarning):
+    """Of a sensor that may be what it says, but hardly is."""
+
+
 @dataclass(frozen=True)
 class Sensor:
     """A spinning LiDAR, one row per beam from the highest to the lowest, one column per azimuth step.
@@ -63,7 +67,7 @@ class Sensor:
         if self.height > 3 and max(map(abs, self.elevations)) <= TURNED and -steps.mean() < CROWDED:
             span = f"{self.elevations[0]:.3g} to {self.elevations[-1]:.3g}"  # or one that looks through a slit
             warnings.warn(f"sensor {self.name}: expected elevations in degrees, found {self.height} of {span}: are they"
-                          " radians?", stacklevel=3)  # fmt: skip
+                          " radians?", UnlikelySensorWarning, stacklevel=3)  # fmt: skip
         if self.width < 4:
             raise ValueError(f"sensor {self.name}: width must be at least 4 columns, got {self.width}")
         if not 0 <= self.min_range < self.max_range:
