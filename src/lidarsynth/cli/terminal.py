@@ -200,11 +200,15 @@ def answer(verb: Callable[[], object]) -> None:
 @contextmanager
 def _warned() -> Iterator[None]:
     """Warnings of the library's own are lines as `warn` says them, without the place in the program."""
-    former, package = warnings.formatwarning, Path(__file__).parents[1]
+    former, package, said = warnings.formatwarning, Path(__file__).parents[1], set[str]()
 
     def line(message: Warning | str, category: type[Warning], file: str, number: int, text: str | None = None) -> str:
         own = Path(file).is_relative_to(package) or category.__module__.startswith(package.name)
-        return f"lidarsynth: {message}\n" if own else former(message, category, file, number, text)
+        if not own:
+            return former(message, category, file, number, text)
+        first = str(message) not in said  # Python itself says it once for each place in the program
+        said.add(str(message))
+        return f"lidarsynth: {message}\n" if first else ""
 
     warnings.formatwarning = line
     try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarsynth.streets.hdl64e import Lasers, dipped
-from lidarsynth.streets.materials import MATERIALS, NUMBER, TABLE
+from lidarsynth.streets.materials import NUMBER, TABLE
 from lidarsynth.streets.raycast import AnyCaster
 from lidarsynth.streets.surfaces import Met, surfaces
 from lidarsynth.streets.world import World
@@ -211,11 +211,10 @@ def speckled(reflectance: np.ndarray, spread: np.ndarray, noise: np.ndarray) -> 
 
 
 def flat_ground(material: str, distance: np.ndarray, height: float, lasers: Lasers) -> np.ndarray:
-    """Reflectance (N,) on average that N lasers read of flat ground so many metres away (N,), seen from `height`."""
-    of, ones = MATERIALS[material], np.ones(len(distance), np.float32)
+    """Reflectance (N,) on average that N lasers read of flat ground, metres away (N,), seen from a height in metres."""
     cosine = np.minimum(height / np.maximum(distance, 1e-3), 1).astype(np.float32)
-    optics = [of.signal * ones, of.spread * ones, of.grain * ones, of.gloss * ones]
-    signal = _signal(optics, 0 * ones, cosine, distance, lasers, OPTICS.fade) - lasers.dip * dipped(distance)
+    optics, tint = list(TABLE[NUMBER[material], :4, None]), np.zeros(1, np.float32)
+    signal = _signal(optics, tint, cosine, distance, lasers, OPTICS.fade) - lasers.dip * dipped(distance)
     return np.interp(signal, *RESPONSE).astype(np.float32)
 
 

@@ -82,9 +82,7 @@ def length(points: np.ndarray) -> float:
 
 
 def parts_of(points: np.ndarray, few: int) -> list[np.ndarray]:
-    """Points (n, 3) of a heap, or of what may be single things in a long one: the fullest first, `few` at least."""
-    if length(points) < LONG:
-        return [points]
+    """What may be single things among the points (n, 3) of a long heap: the fullest first, `few` points at least."""
     corners = np.unique(np.round(points[:, :2] / STEP), axis=0) * STEP
     parts = [points[np.square(points[:, :2] - corner).sum(1) < WITHIN**2] for corner in corners]
     parts = sorted((part for part in parts if len(part) >= few), key=lambda part: -len(part))
@@ -101,7 +99,7 @@ def best_place(
     """
     yaws = np.arange(turns, dtype=np.float32) * np.float32(np.pi / turns)
     places = np.concatenate([_corners(points[:, :2], shape.size, yaws) for points in parts])
-    if len(places) > len(yaws) * 9:
+    if len(parts) > 1:
         some = View(*(part[::SOME] for part in view))
         places = places[np.argsort(_costs(places, shape, some, level, axis)[0], kind="stable")[:BEST]]
     costs = _costs(places, shape, view, level, axis)
@@ -142,7 +140,8 @@ def _costs(
     inside = hides & (view.metres < left - BEHIND) & ~view.ground
     another = hit & ~view.own & ~view.ground & (off <= GAP)
     wrong = (HIDES * hides + INSIDE * inside + ANOTHER * another) @ view.weight
-    near = _near(places, shape, view)
+    ends = view.rays * np.where(np.isfinite(view.metres), view.metres, 0)[:, None]
+    near = within(ends, places, shape, BESIDE) & view.own
     own = np.maximum(near @ view.weight, 1)
     cost, share = ((missed * near) @ view.weight + wrong) / own, (hit & near & (off < ABOUT)) @ view.weight / own
     total = missed @ view.weight + wrong
@@ -152,13 +151,12 @@ def _costs(
     return total, cost, share
 
 
-def _near(places: np.ndarray, shape: Shape, view: View) -> np.ndarray:
-    """(P, N) bool: which rays of what suggests a thing end beside it, if it is at places (P, 3)."""
-    x, y = (view.rays[:, :2] * np.where(np.isfinite(view.metres), view.metres, 0)[:, None]).T
+def within(points: np.ndarray, places: np.ndarray, shape: Shape, margin: float) -> np.ndarray:
+    """(P, n) bool: which points (n, 3) are of a thing at places (P, 3), or within so many metres of it, from above."""
     c, s = np.cos(places[:, 2:]), np.sin(places[:, 2:])
-    x, y = x - places[:, :1], y - places[:, 1:2]
-    length, width = shape.size / 2 + BESIDE
-    return (np.abs(c * x + s * y) < length) & (np.abs(c * y - s * x) < width) & view.own
+    x, y = points[:, 0] - places[:, :1], points[:, 1] - places[:, 1:2]
+    length, width = shape.size / 2 + margin
+    return (np.abs(c * x + s * y) < length) & (np.abs(c * y - s * x) < width)
 
 
 def _through(places: np.ndarray, boxes: np.ndarray, rays: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.streets.world import THING, THINGS, World
 from lidarsynth.systems.cascade.hanging import beside, one_surface
-from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes
+from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes, within
 
 
 class Kind(NamedTuple):
@@ -166,8 +166,9 @@ def _thing(
     if (step * metres**2).sum() < kind.area or np.hypot(*middle[:2]) > kind.reach:
         return None
     level = _level(canvas, middle)
-    parts = parts_of(points, FEW) if kind.turns > 1 else [points]
-    view = _view(canvas, at, middle, level, max(length(points) / LONG, 1) if len(parts) > 1 else 1)
+    long = length(points) / LONG if kind.turns > 1 else 0
+    parts = parts_of(points, FEW) if long >= 1 else [points]
+    view = _view(canvas, at, middle, level, long if len(parts) > 1 else 1)
     top = np.quantile(points[:, 2], 0.97) - level
     shapes = [shape for shape in kind.shapes if top >= shape.tall]
     places = [best_place(shape, kind.turns, parts, view, level, axis if kind.turns > 1 else None) for shape in shapes]
@@ -177,7 +178,8 @@ def _thing(
             gone = _with_lost(canvas, at)
             _fill(canvas, gone, gone, level, rng)
         return None
-    mine = at[_near(points, place, shape, kind.margin if len(parts) == 1 else TIGHT)]
+    there = np.array([[place.x, place.y, place.yaw]])
+    mine = at[within(points, there, shape, kind.margin if len(parts) == 1 else TIGHT)[0]]
     shade = float(np.median(canvas.reflectance.flat[mine if len(mine) else at]))
     found, rays = _cast(canvas, _mesh(kind, shape, place, level, rng), _tint(kind, shade, rng), rng)
     _put(canvas, found, rays, mine, level, rng)
@@ -310,14 +312,6 @@ def _world(mesh: Mesh, tint: float) -> World:
     nowhere, alone = np.zeros((0, 12), np.float32), np.zeros(1, THINGS)
     told = mesh.corners, kinds, mesh.material, mesh.label, tints, none, nowhere
     return World(*told, ground=Ground(()), poses=np.zeros((1, 6)), thing=thing, things=alone)
-
-
-def _near(points: np.ndarray, place: Place, shape: Shape, margin: float) -> np.ndarray:
-    """(n,) bool: which points (n, 3) are of a thing, or beside it."""
-    x, y = (points[:, :2] - (place.x, place.y)).T
-    c, s = np.cos(place.yaw), np.sin(place.yaw)
-    length, width = shape.size / 2 + margin
-    return (np.abs(c * x + s * y) < length) & (np.abs(c * y - s * x) < width)
 
 
 def _put(

@@ -34,7 +34,7 @@ def shaded(even: np.ndarray, image: RangeImage) -> np.ndarray:
     expected = _expected(label, image)
     ground = expected > 0
     if not ground.any():
-        return even.clip(0, 1)
+        return even.clip(0, 1).astype(np.float32)
     off = even - expected
     off = off - (usual := np.median(off[ground]))
     here = [(label == CLASS_NUMBER[name]) & ground for name in GROUND]
