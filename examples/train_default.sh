@@ -19,4 +19,5 @@ while true; do
   grep -q "stopped after step" "$out/last.log" || break
 done
 python "$(dirname "$0")/../benchmarks/learn_judge.py" "$out" "$out-judged"   # chooses among drawn layouts
-lidarsynth info "$out-judged"
+python "$(dirname "$0")/../benchmarks/learn_drawn.py" "$out-judged" "$out-done"   # names what is drawn, before it is cast
+lidarsynth info "$out-done"

@@ -27,7 +27,7 @@ from lidarsynth.networks.rays import decode_range, encode_range, level_sines, pa
 from lidarsynth.streets.hdl64e import dimness, hidden, written_out
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade import model as cascade_model
-from lidarsynth.systems.cascade.images import noisy
+from lidarsynth.systems.cascade.images import grid_of, noisy
 from lidarsynth.systems.cascade.layout import DRAFT, draft, one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.naming import FAIR, weights
@@ -486,6 +486,35 @@ def test_classes_come_with_generated_and_completed_scans(learned: CascadeModel):
     assert filled.label is not None and filled.label.min() >= 1
     own = learned.into(SMALL).with_labels().complete(perfect(SMALL)[::3]).to_scan()
     assert own.label is not None and np.all(own.label[own.extra["new"] == 0] == 9)
+
+
+def test_scans_in_the_making_are_named_by_a_network_of_their_own(learned: CascadeModel):
+    """Whose classes generated scans keep; recorded ones have those of the other."""
+    road, building = (CLASS_NUMBER[word] for word in ("road", "building"))
+    networks = {}
+    for name, number in (("classes", road), ("drawn", building)):
+        networks[name] = ClassUNet(8).eval()
+        torch.nn.init.zeros_(networks[name].classes.weight)
+        networks[name].classes.bias.data = 40.0 * torch.nn.functional.one_hot(torch.tensor(number), 20)
+    network = Cascade(learned.network.coarse, learned.network.fill, **networks)
+    model = replace(learned, network=network)
+    (drawn,), (plain,) = (one.generate(1, steps=2) for one in (model.with_labels(), model))
+    assert drawn.label is not None and (drawn.label[drawn.mask] == building).all() and plain.label is None
+    np.testing.assert_array_equal(drawn.range, plain.range)
+    filled = model.into(SMALL).with_labels().complete(replace(perfect(SMALL)[::3], label=None)).to_scan()
+    assert filled.label is not None and (filled.label == road).all()
+
+
+def test_a_street_is_sketched_as_generation_would_after_its_layout(learned: CascadeModel):
+    metres = np.full((SMALL.height, SMALL.width), 9, np.float32)
+    street = RangeImage(metres, metres / 30, metres > 0, SMALL)
+    model = learned.into(SMALL)
+    (first, other), (again, _) = (model.sketched([street, street], seed=3) for _ in range(2))
+    assert first.shape == street.shape and not np.array_equal(first.range, other.range)
+    np.testing.assert_array_equal(first.range, again.range)
+    told = np.ix_(*grid_of(SMALL))
+    assert first.mask[told].all()
+    np.testing.assert_allclose(np.median(first.range[told]), 9, rtol=0.01)
 
 
 def test_what_is_rarer_in_layouts_is_named_less_often_in_generated_scans_alone(learned: CascadeModel):

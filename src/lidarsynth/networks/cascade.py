@@ -33,6 +33,7 @@ class Cascade(nn.Module):
     observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
     classes    says of each return what it is of
     inside     the same of scans that were taken inside a building, and which are
+    drawn      the same of scans in the making, whose surfaces are smoother than any recorded one's
     judge      says which of several drawn grids is most like a street's
     """
 
@@ -49,11 +50,12 @@ class Cascade(nn.Module):
         classes: ClassUNet | None = None,
         judge: GridJudge | None = None,
         inside: ClassUNet | None = None,
+        drawn: ClassUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
         self.beams, self.likeliest, self.observer, self.classes = beams, likeliest, observer, classes
-        self.judge, self.inside = judge, inside
+        self.judge, self.inside, self.drawn = judge, inside, drawn
 
     @property
     def surest(self) -> FillUNet:

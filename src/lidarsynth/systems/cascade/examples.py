@@ -353,11 +353,16 @@ def _grid(
     image: RangeImage, rows: np.ndarray, columns: np.ndarray, told: tuple[Tensor, Tensor], rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`grid` of these rows and columns, with what is told of their rays."""
-    (rays, standing), at = told, np.ix_(rows, columns)
-    metres = torch.from_numpy(np.where(image.range[at] < FARTHEST, image.range[at], 0).astype(np.float32))
-    even = (image.reflectance[at] + unevenness(image.sensor)[rows]) * (image.range[at] > 0)
-    reflectance = torch.from_numpy(even.astype(np.float32))
+    (rays, standing), (metres, reflectance) = told, read_at(image, rows, columns)
     if rng.random() < 0.5:
         metres, reflectance, rays, standing = (part.flip(-1) for part in (metres, reflectance, rays, standing))
         rays[4] *= -1  # the sine of the azimuth
     return metres, reflectance, rays, standing
+
+
+def read_at(image: RangeImage, rows: np.ndarray, columns: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Metres (R, C), 0 for no return, and reflectance of these rows and columns, as even beams would read it."""
+    at = np.ix_(rows, columns)
+    metres = torch.from_numpy(np.where(image.range[at] < FARTHEST, image.range[at], 0).astype(np.float32))
+    even = (image.reflectance[at] + unevenness(image.sensor)[rows]) * (image.range[at] > 0)
+    return metres, torch.from_numpy(even.astype(np.float32))

@@ -51,7 +51,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     classes = ClassUNet(model.class_channels, classes=model.classes) if model.classes else None
     judge = GridJudge(model.judge_channels) if model.judge_channels else None
     inside = ClassUNet(model.inside_channels) if model.classes and model.inside_channels else None
-    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside)
+    drawn = ClassUNet(model.drawn_channels, classes=model.classes) if model.classes and model.drawn_channels else None
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside, drawn)
 
 
 def _widths(first: int) -> tuple[int, int, int, int]:
@@ -76,7 +77,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     that is as wide.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside"):
+    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside", "drawn"):
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample
 from lidarsynth.diffusion.schedule import Schedule, flow
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_beams import draw_beams, interleaved, with_between
 from lidarsynth.networks.between_columns import draw_between, joined
@@ -23,6 +24,7 @@ from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.drafts import BOUND, drafted
 from lidarsynth.networks.rays import decode_range, encode_range
 from lidarsynth.streets.hdl64e import unevenness
+from lidarsynth.systems.cascade.examples import read_at
 from lidarsynth.systems.cascade.facades import with_facades
 from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
@@ -162,6 +164,12 @@ def _chosen(
 def _offspring(rng: torch.Generator, count: int) -> list[torch.Generator]:
     """Generators of their own for each of the draws among which a scan's is chosen."""
     return [torch.Generator().manual_seed(int(torch.randint(1 << 31, (), generator=rng))) for _ in range(count)]
+
+
+def told_of(images: Sequence[RangeImage], rows: np.ndarray, columns: np.ndarray) -> Grid:
+    """Grids (B, 16, 128) of images, as if they had been drawn."""
+    metres, reflectance = map(torch.stack, zip(*(read_at(image, rows, columns) for image in images), strict=True))
+    return known_grid(metres, reflectance.clamp(-0.1, 1.1))
 
 
 def detailed(

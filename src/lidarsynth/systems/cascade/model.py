@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -22,10 +22,11 @@ from lidarsynth.networks.coarse_unet import ROWS, grid_rays
 from lidarsynth.networks.device import each_usually
 from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
 from lidarsynth.networks.rays import Rays, decode_range, padded
-from lidarsynth.streets.hdl64e import hidden, written_out
+from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
 from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
+from lidarsynth.systems.cascade.edges import with_edges
 from lidarsynth.systems.cascade.floating import settled
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
 from lidarsynth.systems.cascade.holes import Told, with_holes_drawn
@@ -45,8 +46,8 @@ from lidarsynth.systems.cascade.images import (
     with_doubts,
 )
 from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered
-from lidarsynth.systems.cascade.layout import CHOICE, block, grids, sampling, times
-from lidarsynth.systems.cascade.naming import GROWING, RARER, class_of_points, named
+from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, one_thread, sampling, times, told_of
+from lidarsynth.systems.cascade.naming import GROWING, RARER, SKETCHED, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast
 from lidarsynth.systems.cascade.request import calls, resolved
@@ -235,31 +236,50 @@ class CascadeModel(AnySensorModel):
     def _filled_grids(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
-        """Grids (B, R, C) as whole images. Of 16 beams, first these are filled, then all between: at once, most would
-        know nothing above or below. Reflectances are the likeliest, then get the speckle of their class, by which
-        ranges are rough: first of the classes that the fill draws, then of those that are seen in the result, by which
-        surfaces are shaded, and cars and people cast anew."""
-        own = replace(self, sensor=written_out(self.sensor))
-        told = metres.cpu().numpy(), reflectance.cpu().numpy()
-        if len(rows) > ROWS:  # little is left to say
-            drawn = calm = own._between(*told, rows, columns, None, rng)
-        else:
-            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
-            drawn, calm = (beams._between(*told, np.arange(ROWS), columns, noise, rng) for noise in (rng, None))
-            drawn = agreed(drawn, calm, told[0], columns)
-        if len(rows) == ROWS < self.sensor.height:
-            told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
-            drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
-        drawn, shades = [replace(a, sensor=self.sensor, confidence=None) for a in drawn], shades_of(drawn, calm)
+        """Grids (B, R, C) as whole images, with the texture of the classes that the fill draws, then of those that are
+        seen in the result, by which surfaces are shaded, too, and cars and people cast anew."""
+        drawn, shades = self._whole(metres, reflectance, rows, columns, rng)
         recorded = textured(drawn, shades, rng)
         if self.network.classes is None:
             return self._named(recorded)
-        told = self.network.classes, recorded, self.response, self.sensor, self.precision
-        seen = named(*told, more=RARER | (GROWING if len(rows) > ROWS else {}), alone=True)  # calm between its beams
+        network, more = self.network.drawn, SKETCHED
+        if network is None:  # one that has seen recorded scans alone: calm between the beams of the grid
+            network, more = self.network.classes, RARER | (GROWING if len(rows) > ROWS else {})
+        seen = named(network, recorded, self.response, self.sensor, self.precision, more=more, alone=True)
         shades = np.stack([shaded(even, image) for even, image in zip(shades, seen, strict=True)])
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         cast = all_recast(recorded, rng)
-        return as_cast(self._named(cast), cast)
+        if self.network.drawn is None:
+            return as_cast(self._named(cast), cast)
+        return cast if self.labelled else [replace(image, label=None) for image in cast]
+
+    def _whole(
+        self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
+    ) -> tuple[list[RangeImage], np.ndarray]:
+        """Grids (B, R, C) as whole images, with the labels of `answered`, and reflectances (B, H, W), the likeliest. Of
+        16 beams, first these are filled, then all between: at once, most would know nothing above or below."""
+        own = replace(self, sensor=written_out(self.sensor))
+        told = metres.cpu().numpy(), reflectance.cpu().numpy()
+        if len(rows) > ROWS:  # little is left to say
+            drawn = calm = with_edges(own._between(*told, rows, columns, None, rng), columns, rng)
+        else:
+            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
+            drawn, calm = (beams._between(*told, np.arange(ROWS), columns, noise, rng) for noise in (rng, None))
+            drawn = with_edges(agreed(drawn, calm, told[0], columns), columns, rng)
+        if len(rows) == ROWS < self.sensor.height:
+            told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
+            drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
+        return [replace(a, sensor=self.sensor, confidence=None) for a in drawn], shades_of(drawn, calm)
+
+    def sketched(self, images: Sequence[RangeImage], seed: int = 0) -> list[RangeImage]:
+        """What generation would draw if the layouts of these images, of the model's sensor, had been drawn: scans in
+        the making, before anybody has looked at them, for `network.drawn` to learn from."""
+        (rows, columns), rng = grid_of(self.sensor), generators(checked_seed(seed), len(images))
+        rays_of = partial(self._grid_rays, count=len(images))
+        with one_thread():
+            parts = told_of(images, rows, columns), (rows, columns), rays_of, self.sensor, unevenness(self.sensor), rng
+            grid = detailed(self.network, *parts)
+        return textured(*self._whole(*grid, rng), rng)
 
     def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for; of

@@ -45,6 +45,10 @@ ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn has less of grass
 # than streets have, and as much of leaves. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": -0.1, "terrain": 1.6}
+# Logits that these get from a network that has learned from scans in the making: layouts that are drawn suggest more
+# people, lorries and parking, and less grass, than streets' own. By the shares that classes have in streets.
+SKETCHED = {"person": -1.0, "truck": -1.6, "parking": -0.4, "terrain": 0.6, "fence": 0.4, "building": 0.2,
+            "pole": 0.2, "trunk": 0.15}  # fmt: skip
 # Logits that these get in generated scans, being so much rarer in the streets that layouts have learned than in those
 # of the network of classes (docs/training-default.md).
 RARER = {"bicycle": -1.0, "motorcycle": -4.0, "truck": -1.5, "other-vehicle": -0.9, "person": -1.1,
@@ -120,7 +124,7 @@ def named(
     rays, device, labels = response.told(rays_told(sensor)), next(network.parameters()).device, []
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
         for image in images:
-            told = _told(image, response.even(image.reflectance), rays, device)
+            told = class_inputs_of(image, response.even(image.reflectance), rays, device)
             chances = None if inside is None else _inside(inside, network, told, image)
             chances = _outside(network, told, image, off, alone) if chances is None else chances
             labels.append(_likeliest(chances, least) * image.mask)
@@ -205,7 +209,7 @@ def of_pieces(chances: Tensor, streets: Tensor, metres: Tensor) -> Tensor:
     return whole
 
 
-def _told(image: RangeImage, even: np.ndarray, rays: Rays, device: torch.device) -> Tensor:
+def class_inputs_of(image: RangeImage, even: np.ndarray, rays: Rays, device: torch.device) -> Tensor:
     """(1, C, H', W') `class_inputs` of every ray, told reflectances (H, W) as the streets' sensor would report them."""
     size = rays.elevation.shape[2], rays.elevation.shape[3]
     known = known_of(image.range[None], even[None], image.mask[None], True, size)

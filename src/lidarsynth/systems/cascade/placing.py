@@ -67,9 +67,9 @@ ENDS = (0.06, 0.94)  # quantiles of what is seen of a thing
 ASKEW = 0.15  # cost of standing at 45 degrees to everything around
 BESIDE = 1.0  # metres around a thing within which rays are its own
 # Metres: a heap that is longer may be several things; places are looked for around what returns within so many of each
-# corner of a grid of that step; at the most of these; the best places are looked at with all rays, after a first look
-# with each fourth one.
-LONG, WITHIN, STEP, PARTS, BEST, SOME = 6.0, 2.7, 1.5, 8, 40, 4
+# corner of a grid of that step; at the most of these, by about so many of the points of each; the best places are
+# looked at with all rays, after a first look with about so many.
+LONG, WITHIN, STEP, PARTS, SEEN, BEST, SOME = 6.0, 2.7, 1.5, 8, 200, 40, 100
 STEPS = ((0.25, 0.07), (0.1, 0.028))  # metres and radians, of the best place
 NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3).astype(np.float32)
 
@@ -98,9 +98,10 @@ def best_place(
     axis   direction in which most things stand, or at a right angle to it; None = who knows
     """
     yaws = np.arange(turns, dtype=np.float32) * np.float32(np.pi / turns)
-    places = np.concatenate([_corners(points[:, :2], shape.size, yaws) for points in parts])
-    if len(parts) > 1:
-        some = View(*(part[::SOME] for part in view))
+    few = [points[:: max(len(points) // SEEN, 1), :2] for points in parts]
+    places = np.concatenate([_corners(seen, shape.size, yaws) for seen in few])
+    if len(places) > BEST:
+        some = View(*(part[:: max(len(view.rays) // SOME, 1)] for part in view))
         places = places[np.argsort(_costs(places, shape, some, level, axis)[0], kind="stable")[:BEST]]
     costs = _costs(places, shape, view, level, axis)
     for metres, radians in STEPS:

@@ -215,7 +215,8 @@ def _between(there: np.ndarray, axis: int) -> np.ndarray:
 
 def _level(canvas: _Canvas, middle: np.ndarray) -> float:
     """Height of the ground around a thing, metres above the sensor's origin."""
-    near = np.square(canvas.points[..., :2] - middle[:2]).sum(-1) < AROUND**2
+    x, y = (canvas.points[..., axis] - middle[axis] for axis in (0, 1))
+    near = x * x + y * y < AROUND**2
     ground = canvas.points[..., 2][near & GROUND[canvas.label] & (canvas.metres > 0)]
     return float(np.median(ground)) if len(ground) >= FEW else -canvas.sensor.mount
 
