@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from learn_judge import follow
 from torch import Tensor
 
 from lidarsynth.experiment.record import with_fields
@@ -95,7 +97,7 @@ def crops(some: Sketches, rng: np.random.Generator, seed: int) -> SimpleNamespac
     return SimpleNamespace(lessons=Lessons(torch.stack(inputs), torch.stack(classes), (seed,)))
 
 
-def learned(start: ClassUNet, scans: list[Sketches], steps: int, report) -> ClassUNet:
+def learned(start: ClassUNet, scans: list[Sketches], steps: int, report: Callable[[str], None]) -> ClassUNet:
     """The network, gone on for so many steps of four crops: the running mean of its weights."""
     network, rng = deepcopy(start).train(), np.random.default_rng(0)
     mean, objective = deepcopy(start), NamingObjective(network)
@@ -108,10 +110,7 @@ def learned(start: ClassUNet, scans: list[Sketches], steps: int, report) -> Clas
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
-        with torch.no_grad():
-            share = 1 - min(AVERAGE, (1 + step) / (10 + step))
-            for slow, fast in zip(mean.parameters(), network.parameters(), strict=True):
-                slow.lerp_(fast, share)
+        follow(mean, network, step, AVERAGE)
         if (step + 1) % OFTEN == 0:
             report(f"step {step + 1} of {steps}: {loss.item():.3f}")
     return mean.eval()

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from told_apart import area, both, taken
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.experiment.record import with_fields
@@ -54,11 +54,16 @@ def learned(true: Grid, drawn: Grid, rays: Tensor, steps: int, width: int) -> Gr
         F.binary_cross_entropy_with_logits(odds, truth).backward()
         torch.nn.utils.clip_grad_norm_(judge.parameters(), 1.0)
         optimizer.step()
-        with torch.no_grad():
-            share = 1 - min(AVERAGE, (1 + step) / (10 + step))
-            for slow, fast in zip(mean.parameters(), judge.parameters(), strict=True):
-                slow.lerp_(fast, share)
+        follow(mean, judge, step, AVERAGE)
     return mean.eval()
+
+
+@torch.no_grad()
+def follow(mean: nn.Module, network: nn.Module, step: int, average: float) -> None:
+    """The running mean of a network's weights after one more step; `average` of it stays, less at first."""
+    share = 1 - min(average, (1 + step) / (10 + step))
+    for slow, fast in zip(mean.parameters(), network.parameters(), strict=True):
+        slow.lerp_(fast, share)
 
 
 @torch.inference_mode()
