@@ -86,7 +86,7 @@ def agreeing(drawn: RangeImage, street: RangeImage) -> Tensor:
 
 
 def crops(some: Sketches, rng: np.random.Generator, seed: int) -> SimpleNamespace:
-    """A batch of a part of each."""
+    """A batch of a part of each: inputs (4, C, 64, 256), or as high as the sensor, and classes (4, 64, 256)."""
     height, width = some.classes.shape[1:]
     inputs, classes = [], []
     for told_of_one, classes_of_one in zip(*some, strict=True):
@@ -145,12 +145,12 @@ def main() -> None:
     if not isinstance(model, CascadeModel) or model.network.classes is None or model.network.columns is None:
         parser.error(f"expected a cascade that draws columns and names classes, found {args.model}")
     held = max(args.scans // 16, 16) // TOGETHER
+    if args.scans <= held * TOGETHER:
+        parser.error(f"expected more than {held * TOGETHER} scans, which are held out, found {args.scans}")
     scans = []
     for first in range(0, args.scans, TOGETHER):
         scans.append(sketches(model, args.seed, first))
         print(f"{first + TOGETHER} of {args.scans} drawn", end="\r", flush=True)
-    if len(scans) <= held:
-        parser.error(f"expected more than {held * TOGETHER} scans, which are held out, found {args.scans}")
     before = right(model.network.classes, scans[:held])
     model.network.drawn = learned(model.network.classes, scans[held:], args.steps, lambda line: print(line, flush=True))
     record = with_fields(model.experiment, {"model.drawn_channels": model.experiment.model.class_channels})

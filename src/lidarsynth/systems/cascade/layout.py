@@ -167,7 +167,7 @@ def _offspring(rng: torch.Generator, count: int) -> list[torch.Generator]:
 
 
 def told_of(images: Sequence[RangeImage], rows: np.ndarray, columns: np.ndarray) -> Grid:
-    """Grids (B, 16, 128) of images, as if they had been drawn."""
+    """Grids (B, 16, 128) of images (H, W), in metres, at these rows (16,) and columns (128,), as if they were drawn."""
     metres, reflectance = map(torch.stack, zip(*(read_at(image, rows, columns) for image in images), strict=True))
     return known_grid(metres, reflectance.clamp(-0.1, 1.1))
 

@@ -272,8 +272,12 @@ class CascadeModel(AnySensorModel):
         return [replace(a, sensor=self.sensor, confidence=None) for a in drawn], shades_of(drawn, calm)
 
     def sketched(self, images: Sequence[RangeImage], seed: int = 0) -> list[RangeImage]:
-        """What generation would draw if the layouts of these images, of the model's sensor, had been drawn: scans in
-        the making, before anybody has looked at them, for `network.drawn` to learn from."""
+        """What generation would draw if the layouts of these images (H, W), in metres, of the model's sensor, had been
+        drawn: scans in the making, before anybody has looked at them, for `network.drawn` to learn from; with the
+        fill's likeliest classes.
+
+        Raises ValueError for a sensor smaller than the grid.
+        """
         (rows, columns), rng = grid_of(self.sensor), generators(checked_seed(seed), len(images))
         rays_of = partial(self._grid_rays, count=len(images))
         with one_thread():

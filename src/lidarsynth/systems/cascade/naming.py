@@ -46,7 +46,7 @@ ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no
 # than streets have, and as much of leaves. Chosen by street-2 (docs/training-default.md).
 GROWING = {"vegetation": -0.1, "terrain": 1.6}
 # Logits that these get from a network that has learned from scans in the making: layouts that are drawn suggest more
-# people, lorries and parking, and less grass, than streets' own. By the shares that classes have in streets.
+# people, lorries and parking, and less grass, than streets' own (docs/training-default.md).
 SKETCHED = {"person": -1.0, "truck": -1.6, "parking": -0.4, "terrain": 0.6, "fence": 0.4, "building": 0.2,
             "pole": 0.2, "trunk": 0.15}  # fmt: skip
 # Logits that these get in generated scans, being so much rarer in the streets that layouts have learned than in those
