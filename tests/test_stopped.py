@@ -18,6 +18,7 @@ from lidarsynth.cli.terminal import answer
 from lidarsynth.data.cache import write_cache
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.verbs.training import _named
 
 STREETS = ["data", "synthetic", "cache", "-n", "6000", "--sensor", "vlp-16", "--width", "128", "--workers", "2"]
 
@@ -158,6 +159,21 @@ def test_a_process_that_is_killed_ends_a_training_in_a_line(training: Path):
         code, errors = ended(process)
     assert code == 2 and "Traceback" not in errors
     assert "expected the processes that read ahead to stay, found one gone" in errors
+
+
+@pytest.mark.parametrize("error", [ConnectionResetError(104, "Connection reset by peer"), EOFError(),
+                                   RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed.")])  # fmt: skip
+def test_a_process_that_is_gone_is_said_however_that_is_noticed(error: Exception, tmp_path: Path):
+    """Between two batches, or while it hands one over."""
+
+    def steps():
+        yield "first"
+        raise error
+
+    named = _named(steps(), tmp_path)
+    assert next(named) == "first"
+    with pytest.raises(OSError, match="expected the processes that read ahead to stay, found one gone"):
+        next(named)
 
 
 @pytest.mark.timeout(300)

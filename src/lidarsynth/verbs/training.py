@@ -287,17 +287,23 @@ def _named(steps: Iterator[Progress], out: Path) -> Iterator[Progress]:
     ahead raised, and OSError where one is gone."""
     try:
         yield from steps
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, EOFError) as error:
         if "in DataLoader worker process" not in str(error):
+            if isinstance(error, ConnectionError | EOFError):  # it went while it handed a batch over
+                raise _one_gone() from None
             raise
         raise type(error)(str(error).strip().splitlines()[-1].partition(": ")[2]) from None  # without its traceback
     except RuntimeError as error:
         if not str(error).startswith("DataLoader worker"):
             raise
-        raise OSError("expected the processes that read ahead to stay, found one gone (out of memory?); the same "
-                      "command goes on, and --workers 0 needs the least") from None  # fmt: skip
+        raise _one_gone() from None
     except FloatingPointError as error:
         raise FloatingPointError(f"{error}; last good checkpoint: {(checkpoints(out) or ['none'])[-1]}") from None
+
+
+def _one_gone() -> OSError:
+    return OSError("expected the processes that read ahead to stay, found one gone (out of memory?); the same command "
+                   "goes on, and --workers 0 needs the least")  # fmt: skip
 
 
 @contextmanager
