@@ -19,7 +19,7 @@ from lidarsynth.networks.rays import encode_range
 AROUND, STRIDES = 2, (0, 4, 2, 1)  # known columns to either side; those drawn before, of each phase
 HYPOTHESES, SHADES = 11, 5  # of range, of reflectance
 # Of draws, as in `column_transformer.draw`; the heat of whether rays return: chosen by street-2
-# (docs/training-default.md).
+# (docs/generation.md).
 SHARP, HEAT, LOST = 0.3, 0.85, 0.4
 FEATURES = 3 * (4 * (2 * AROUND + 1) + 6) + RAY_CHANNELS + 3 * HYPOTHESES + len(STRIDES)
 

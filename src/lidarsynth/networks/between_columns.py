@@ -27,7 +27,7 @@ from lidarsynth.networks.rays import encode_range
 SIDES, AROUND = (0, -1, 1, -2), 2  # known columns: left, right, and the next to them; rows up and down in them
 HYPOTHESES, SHADES = 10, 4  # of range, of reflectance
 FEATURES = 3 * (len(SIDES) * (2 * AROUND + 1) + ROWS - 1) + RAY_CHANNELS + 3 * HYPOTHESES + ROWS + 1
-SHARP, HEAT = 0.55, 1.0  # of draws, as in `column_transformer.draw`: by street-2 (docs/training-default.md)
+SHARP, HEAT = 0.55, 1.0  # of draws, as in `column_transformer.draw`: by street-2 (docs/generation.md)
 
 
 class BetweenColumns(PixelDrawer):

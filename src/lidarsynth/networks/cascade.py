@@ -18,7 +18,7 @@ from lidarsynth.networks.grid_judge import GridJudge
 # How much further from the guide's velocity, and between which log-SNR: at more noise it would make streets alike, at
 # less it would sharpen nothing (Kynkäänniemi et al. 2024).
 GUIDANCE, GUIDED = 1.5, (-3.0, 3.0)
-REST = 0.05  # of noise that samplers leave: chosen by street-2 (docs/training-default.md)
+REST = 0.05  # of noise that samplers leave: chosen by street-2 (docs/generation.md)
 
 
 class Cascade(nn.Module):

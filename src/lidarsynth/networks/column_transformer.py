@@ -30,7 +30,7 @@ from lidarsynth.networks.drafts import READ, DraftReader
 from lidarsynth.networks.pixel_mixture import CODES, TONES, PixelDrawer, picked
 from lidarsynth.networks.wall_lines import WallMemory
 
-SHARP, HEAT = 0.85, 0.9  # of draws: so that steps are as in streets (docs/training-default.md)
+SHARP, HEAT = 0.85, 0.9  # of draws: so that steps are as in streets (docs/generation.md)
 
 
 class ColumnTransformer(PixelDrawer):
@@ -43,7 +43,7 @@ class ColumnTransformer(PixelDrawer):
     hypotheses (flat ground; the wall, the plane or the slope that its neighbours to the left and below are of) and of
     free choice among 64 bins; its reflectance likewise. So surfaces come out flat and their edges sharp, which
     diffusion learns only after many more samples, while it is diffusion that agrees with itself all around the turn
-    (docs/training-default.md). cf. van den Oord et al. 2016 (PixelCNN), Salimans et al. 2017 (mixtures of logistics).
+    (docs/generation.md). cf. van den Oord et al. 2016 (PixelCNN), Salimans et al. 2017 (mixtures of logistics).
     """
 
     def __init__(self, width: int = 256, layers: int = 5, pixel: int = 192, blocks: int = 3):

@@ -20,7 +20,7 @@ REACHES = (1, 2, 4)  # columns to either side, of the layers that read it
 def drafted(coarse: CoarseUNet, x_t: Tensor, t: Tensor, rays: Tensor, standing: Tensor) -> Tensor:
     """(B, 7, 16, 128) what is told of x_t (B, 3, 16, 128) at times t (B,), by the coarse stage.
 
-    Of range and returning, not of reflectance, which columns draw better alone (docs/training-default.md): x_t; its
+    Of range and returning, not of reflectance, which columns draw better alone (docs/generation.md): x_t; its
     x_0_hat, the mean of all grids that it may become; what this says of the range code, from flat ground's on, and how
     far codes of such rays spread; log_snr. rays (B, 8, 16, 128), standing (B, 16, 128) radians.
     """

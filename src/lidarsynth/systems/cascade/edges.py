@@ -1,7 +1,7 @@
 """Edges between the columns of a drawn grid: which surface a ray between two drawn ones meets, and where.
 
 Where both are of the same chance, the fill takes what is to the left, as far as it is: every edge then stood on the
-same side of a drawn column, and what ended there ended level. Measured in docs/training-default.md.
+same side of a drawn column, and what ended there ended level. Measured in docs/generation.md.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from lidarsynth.systems.cascade.surfaces import GROUND, NEAR, upright
 
 # Columns of a wall at most. A return that strays from its wall by the share STRAY of its nearness costs 1, one more
 # wall costs WALL. Returns of a wall at least, and the share by which any of them may stray.
-LONGEST, STRAY, WALL, LEAST, MOST = 40, 0.035, 16.0, 4, 0.12  # by docs/training-default.md
+LONGEST, STRAY, WALL, LEAST, MOST = 40, 0.035, 16.0, 4, 0.12  # by docs/generation.md
 
 
 def with_facades(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Points that float: what was filled in between two surfaces goes onto one of them.
 
 At an edge the range of least error may lie between what is before and what is behind, where nothing is. Chosen on
-training scans and synthetic streets (docs/training-default.md).
+training scans and synthetic streets (docs/completion.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Surfaces in gaps: where nothing is known for a few pixels around, what was filled in is put straight.
 
 The fill chooses among hypotheses pixel by pixel, and each is a little off where what it is of is far away: rings on a
-road jump by a few per cent. Chosen on training scans and synthetic streets (docs/training-default.md).
+road jump by a few per cent. Chosen on training scans and synthetic streets (docs/completion.md).
 """
 
 from __future__ import annotations

@@ -32,14 +32,14 @@ class Grain(NamedTuple):
     ground: float | None = None
 
 
-# Generation's, chosen by street-2 (docs/training-default.md); a completed sample's, which errs less by speckle alone;
+# Generation's, chosen by street-2 (docs/generation.md); a completed sample's, which errs less by speckle alone;
 # `realise`'s; an observer's, less on the ground than it learned, with which streets are read better; that of one which
 # learned from scans of the sensor, all of it.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 OBSERVED, TUNED = Grain((1.0, 1.0, 1.0), ground=0.6), Grain((1.0, 1.0, 1.0), ground=1.0)
 # Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
 # before or behind it: of shares of the rays; of a few more, as a crown is deep. Chosen by street-2
-# (docs/training-default.md); streets have 0.08, 0.035 and 0.02 for all of them.
+# (docs/generation.md); streets have 0.08, 0.035 and 0.02 for all of them.
 STRAYING = {"vegetation": ((0.955, 0.08), (0.045, 0.45)), "terrain": ((1.0, 0.035),), "trunk": ((1.0, 0.02),)}
 ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about are drawn alike: things are whole
 # The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it

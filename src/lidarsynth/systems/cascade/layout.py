@@ -35,7 +35,7 @@ DRAFT, DRAFT_STEPS = 0.53, 8
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion
-CHOICE = 3  # grids of which one is kept, where the network has a judge: docs/training-default.md
+CHOICE = 3  # grids of which one is kept, where the network has a judge: docs/generation.md
 # Rows, columns -> what is told of their rays (B, 8, R, C), and their standing elevations (B, R, C).
 RaysOf = Callable[[np.ndarray, np.ndarray], tuple[Tensor, Tensor]]
 

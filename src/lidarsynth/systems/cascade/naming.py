@@ -30,12 +30,12 @@ THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 2
 
 
 # How much of the logarithm of its weight in learning is taken off a class's logit: so rare ones are named less often
-# than learned, and right more often (docs/training-default.md).
+# than learned, and right more often (docs/classes.md).
 FAIR = 0.5
 # Of a network of the insides of buildings, what these weigh in learning; furniture is unlabeled.
 INSIDE = {"unlabeled": 1.5, "car": 2.0, "person": 12.0, "other-ground": 1.2, "building": 1.2}
 # What is only inside, floors and furniture, and only outside; share of the former in both, and of both in all returns,
-# from which on a scan is of the inside of a building (docs/training-default.md).
+# from which on a scan is of the inside of a building (docs/classes.md).
 INDOORS = ("unlabeled", "other-ground")
 OUTDOORS = ("road", "parking", "sidewalk", "fence", "vegetation", "trunk", "terrain", "pole", "traffic-sign")
 MOSTLY, SOME = 0.7, 0.02
@@ -43,18 +43,18 @@ MOSTLY, SOME = 0.7, 0.02
 # network of streets says, and as much more as brings their IoU to most in held-out insides.
 ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no longer counts
 # Logits that what grows gets where classes are named for the texture that they give: what is drawn has less of grass
-# than streets have, and as much of leaves. Chosen by street-2 (docs/training-default.md).
+# than streets have, and as much of leaves. Chosen by street-2 (docs/generation.md).
 GROWING = {"vegetation": -0.1, "terrain": 1.6}
 # Logits that these get from a network that has learned from scans in the making: layouts that are drawn suggest more
-# people, lorries and parking, and less grass, than streets' own (docs/training-default.md).
+# people, lorries and parking, and less grass, than streets' own (docs/generation.md).
 SKETCHED = {"person": -1.0, "truck": -1.6, "parking": -0.4, "terrain": 0.6, "fence": 0.4, "building": 0.2,
             "pole": 0.2, "trunk": 0.15}  # fmt: skip
 # Logits that these get in generated scans, being so much rarer in the streets that layouts have learned than in those
-# of the network of classes (docs/training-default.md).
+# of the network of classes (docs/generation.md).
 RARER = {"bicycle": -1.0, "motorcycle": -4.0, "truck": -1.5, "other-vehicle": -0.9, "person": -1.1,
          "bicyclist": -1.9, "motorcyclist": -2.2}  # fmt: skip
 # Rows and columns on either side whose chances count as much as a pixel's own, where they are as far to this share of
-# the range: single pixels are of no class of their own (docs/training-default.md).
+# the range: single pixels are of no class of their own (docs/classes.md).
 BESIDE, AS_FAR = (1, 2), 0.02
 
 

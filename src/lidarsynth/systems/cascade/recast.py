@@ -3,7 +3,7 @@
 What is drawn of a car is often a heap and hardly ever has the outline of one: the columns of
 a layout are 2.8 degrees apart. So where the classes say car or person, one of the streets' own shapes is put where it
 explains most (`placing.py`), its rays are cast and read as streets' are, and what else was drawn of it becomes what is
-beside it, as does all of it where no place is good enough, but for walls. Measured in docs/training-default.md.
+beside it, as does all of it where no place is good enough, but for walls. Measured in docs/generation.md.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Kind(NamedTuple):
     margin: float
 
 
-# Chosen on 96 generated scans (docs/training-default.md).
+# Chosen on 96 generated scans (docs/generation.md).
 KINDS = (
     Kind("car", (two_boxes("car", 4.3, 1.74, 0.9, 1.46, (-1.93, 0.95, 0.15), 0.0),
                  two_boxes("van", 4.9, 1.94, 0.95, 2.0, (-2.45, 1.76, 0.05), 1.6)),

@@ -2,7 +2,7 @@
 
 Virtual sensors of training report scale * reflectance ** gamma, and some beams less than others (`streets.Optics`). Of
 a recorded scan both are estimated from its known pixels, so that a network sees it as the streets it has learned, and
-what it answers is said in the sensor's own terms. Measured in docs/training-default.md.
+what it answers is said in the sensor's own terms. Measured in docs/completion.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SECTORS, FEW = 12, 12  # of a turn, in which beams are compared; returns of both
 SHARES = tuple(k / 10 for k in range(11))  # of the mean of what is known around
 PARTS, WIDTH, SEAM = 8, 64, 16  # parts of the turn in which they are tried, columns of each, and of its ends not judged
 # Where nothing can be tried, or beams are measured: less errs by 1 % less there, but classes are read worse
-# (docs/training-default.md).
+# (docs/completion.md).
 USUAL = 0.5
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 

@@ -1,7 +1,7 @@
 """How bright the surfaces of a generated scan read, by their classes, before they get the speckle of these.
 
 Reflectances of a drawn grid are single readings, 2.8 degrees and four beams apart: one that is dark by its speckle
-makes a dark patch, and a sidewalk reads like a road here and there. Measured in docs/training-default.md.
+makes a dark patch, and a sidewalk reads like a road here and there. Measured in docs/generation.md.
 """
 
 from __future__ import annotations

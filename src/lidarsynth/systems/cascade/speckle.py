@@ -13,7 +13,7 @@ from lidarsynth.networks.fill_unet import ring
 
 # Columns to either side, the natural logarithm of ranges that differ as on one surface, and how far of the way to the
 # median, for a sensor whose beams are measured and for others: chosen on streets of other sensors and real training
-# scans. More errs less, but classes are read worse from it (docs/training-default.md).
+# scans. More errs less, but classes are read worse from it (docs/completion.md).
 REACH, ALIKE, SHARE, ELSEWHERE = 4, 0.2, 0.35, 0.7
 
 

@@ -11,7 +11,7 @@ from lidarsynth.networks.column_neighbours import Grid
 
 # Rounds; the share of the range within which a return is of its neighbours' surface, between what was drawn between
 # columns that are straight already, and from beam to beam, where the foot of a wall is no slope; all chosen by street-2
-# (docs/training-default.md). A step between beams that is less than GROUND of flat ground's is none of the ground.
+# (docs/generation.md). A step between beams that is less than GROUND of flat ground's is none of the ground.
 ROUNDS, NEAR, FINE, CORNER, GROUND = 4, 0.04, 0.0035, 0.03, 0.3
 # A return at an edge is farther from one neighbour than this share of its nearness, and a third as far from the other.
 EDGE, ONE_SIDED = 0.03, 1 / 3
