@@ -17,6 +17,7 @@ from lidarsynth.lidar.recognition import elevations_of, recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import INVERTED, SENSORS, get_sensor
 from lidarsynth.lidar.view import misfit
+from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.verbs.placement import read_transform
 
 MOVES = {
@@ -104,6 +105,16 @@ def test_a_sensor_that_hangs_upside_down_has_no_fault_in_a_frame_whose_z_is_up(n
     shifted = check_frame(moved(scan, parse_transform("1.4:0:1.5:0:0:0")))
     np.testing.assert_allclose(shifted.transform[:3, :3], np.eye(3))
     assert shifted.faults == ("with the sensor 1.40 m ahead of and 1.50 m above the origin",)
+
+
+@pytest.mark.parametrize("name", INVERTED)
+def test_of_beams_that_hang_at_times_the_ground_tells_the_side(name: str):
+    """Streets in which so little ground is seen that the beams used to decide, which are those of an upright sensor."""
+    hanging, upright = (SyntheticStreets(4711, 64, get_sensor(n)) for n in (name, name.removesuffix("-inverted")))
+    for k in range(0, 64, 16):
+        assert check_frame(hanging.image(k).to_scan()).faults == ()
+        over = moved(upright.image(k).to_scan(), parse_transform("0:0:0:180:0:0"))
+        assert check_frame(over).faults == ("upside down",)
 
 
 @pytest.mark.parametrize("name", INVERTED)

@@ -123,7 +123,8 @@ def _upright(scan: Scan) -> tuple[str, Turned]:
 
 def _side(scan: Scan, axis: str, points: Turned) -> str:
     """+axis or -axis: where the ground is below the sensor, wherever the origin; where both sides look alike, where the
-    beams are a known sensor's; and of beams that are so either way, as an OS1's, from where they turn to the right.
+    beams are a known sensor's, unless one of that kind hangs at times: then where there is more of the ground; and of
+    beams that are so either way, as an OS1's, from where they turn to the right.
 
     points  of the scan, turned so that +axis is up
     """
@@ -133,8 +134,10 @@ def _side(scan: Scan, axis: str, points: Turned) -> str:
     upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > GROUND and upper > UPSIDE * lower:
         return "+" + axis
-    up, down = (any(_known(seen, sign + axis, lift) for lift in ORIGINS) for sign in "+-")
-    if up != down:
+    up, down = (_known(seen, sign + axis) for sign in "+-")
+    if down and not up and f"{down}-inverted" in INVERTED:  # its own beams, or those of one that hangs
+        return ("+" if upper > lower else "-") + axis
+    if bool(up) != bool(down):
         return ("+" if up else "-") + axis
     if lower > UPSIDE * upper and lower > 1 / 3:
         return "-" + axis
@@ -156,11 +159,15 @@ def turns_left(xyz: np.ndarray, time: np.ndarray | None) -> bool:
     return bool((step > 0).mean() > 0.9 and step.sum() > np.pi)
 
 
-def _known(scan: Scan, up: str, lift: float) -> bool:
-    """Whether the beams are a known sensor's, were `up` the upper side and they left its origin `lift` metres above."""
-    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T + np.array([0, 0, lift], np.float32)
-    ring = rings_of(scan, xyz)
-    return recognise(Scan(xyz, scan.reflectance, ring=ring), among=SENSORS)[0] is not None
+def _known(scan: Scan, up: str) -> str:
+    """The known sensor whose beams these are, were `up` the upper side, at one of its origins; "" = none."""
+    xyz = scan.xyz @ np.array(AXES[up][0], np.float32).T
+    for lift in ORIGINS:
+        raised = xyz + np.array([0, 0, lift], np.float32)
+        name, _ = recognise(Scan(raised, scan.reflectance, ring=rings_of(scan, raised)), among=SENSORS)
+        if name is not None:
+            return name
+    return ""
 
 
 def _hangs(scan: Scan) -> bool:
