@@ -709,8 +709,31 @@ def test_batches_in_one_file_are_images_like_others(tmp_path: Path, real: Path):
     assert report.values == expected.values and report.hashes["samples"] == expected.hashes["samples"]
     assert image_set(tmp_path / "batches").names[4].endswith("b.npz[0]")
     np.savez(tmp_path / "batches/b.npz", sensor=sensor, **{**arrays, "mask": arrays["mask"][:1]})
-    with pytest.raises(ValueError, match=r"b.npz.*expected a batch of arrays \(B, ...\)"):
+    with pytest.raises(ValueError, match=r"b.npz.*expected a batch of arrays \(B, ...\)") as caught:
         ls.evaluate(tmp_path / "batches", real)
+    assert str(caught.value).count("b.npz") == 1, "the file is named once"
+
+
+def test_a_range_image_may_name_its_sensor(tmp_path: Path, real: Path):
+    image = street(0, SENSORS["hdl-64e"])
+    for name, word in (("by_word", "hdl-64e"), ("by_table", json.dumps(image.sensor.to_dict()))):
+        np.savez(
+            tmp_path / f"{name}.npz", range=image.range, reflectance=image.reflectance, mask=image.mask, sensor=word
+        )
+    assert ls.read(tmp_path / "by_word.npz").xyz.tobytes() == ls.read(tmp_path / "by_table.npz").xyz.tobytes()
+    np.savez(tmp_path / "no.npz", range=image.range, reflectance=image.reflectance, mask=image.mask, sensor="hdl-65e")
+    with pytest.raises(ValueError, match="expected a sensor's fields as JSON, or its word, found 'hdl-65e'"):
+        ls.read(tmp_path / "no.npz")
+
+
+def test_statistics_of_two_sensors_say_which_files_and_what_differs(tmp_path: Path, real: Path):
+    wide = replace(SENSOR, max_range=SENSOR.max_range + 10)
+    files = [tmp_path / "a.safetensors", tmp_path / "b.safetensors"]
+    for file, sensor, images in zip(files, (SENSOR, wide), (STREETS[:2], STREETS[2:]), strict=True):
+        evaluation.gather_part([replace(image, sensor=sensor) for image in images], "1/1", file, "bev-1")
+    found = r"expected statistics of one sensor, found .* of max_range [\d.]+ and .* of max_range [\d.]+"
+    with pytest.raises(ValueError, match=rf"a.safetensors and .*b.safetensors: {found}"):
+        ls.evaluate(files, real)
 
 
 def test_a_scan_counts_once_and_hidden_files_not_at_all(tmp_path: Path, real: Path):
@@ -800,6 +823,7 @@ def test_the_verb_gathers_parts_and_refuses_in_one_line(tmp_path: Path, real: Pa
         ((samples, "--reference", real, "--out", tmp_path), "found "),
         (("--reference", real), "expected SAMPLES to judge"),
         ((tmp_path / "no", "--reference", real), "found no such file or folder"),
+        ((samples, real, "--reference", real), "expected one folder or file of images, or several of statistics"),
         ((tmp_path / "no", "--reference", tmp_path / "nor"), f"{tmp_path / 'no'}: expected a cache, or samples"),
     ):
         code, _, error = run("evaluate", *words)

@@ -128,6 +128,10 @@ def test_two_writers_never_hold_one_folder_and_no_locks_is_no_obstacle(tmp_path,
     with only_writer(tmp_path, "work"):
         pass
 
+    with only_writer(tmp_path / "refused", "work"), pytest.raises(ValueError, match="x"):
+        raise ValueError("x")
+    assert not (tmp_path / "refused").exists(), "a folder that got nothing goes again"
+
     with only_writer(tmp_path, "work", shared=True) as one:
         with only_writer(tmp_path, "work", shared=True) as two:
             assert one and two

@@ -211,6 +211,8 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ("elevations = [1]\nmin_range = -1", r"expected 0 <= min_range < max_range, got -1 and 100.0"),
         ("elevations = [1]\nmax_range = nan", r"expected 0 <= min_range < max_range, got 1.0 and nan"),
         ("elevations = [2, 1]\noffsets = [1]", r"offsets must have one height per beam \(2\), got 1"),
+        ("elevations = [1]\nmax_range = inf", r"mine.toml: expected a max_range in metres, found inf"),
+        ("elevations = [1]\nmount = -3", r"mine.toml: expected a mount above the road, found -3 m"),
         ("elevations = [1", r"mine.toml: expected TOML, found"),
     ],
 )

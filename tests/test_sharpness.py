@@ -8,6 +8,7 @@ import pytest
 
 from lidarsynth.evaluation.measures import MEASURES
 from lidarsynth.evaluation.protocols import STREET_2
+from lidarsynth.evaluation.report import warnings_of
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
@@ -68,6 +69,18 @@ def test_rows_rise_with_the_noise_and_a_file_keeps_them(tmp_path: Path):
     again = load_statistics(tmp_path / "s.safetensors", PROTOCOL)[0]
     for row in rows:
         assert MEASURES[row.measure](row, again, real, 0) == MEASURES[row.measure](row, sides[0.2], real, 0)
+
+
+def test_measured_points_on_one_side_alone_are_told():
+    image = street()
+    measured = replace(image, xyz=image.points())
+    told = []
+    for one, other in ((image, image), (measured, image), (measured, measured)):
+        sides = [Statistics(PROTOCOL, SENSOR, role) for role in ("samples", "real")]
+        for side, given in zip(sides, (one, other), strict=True):
+            side.update([given], [True], [True])
+        told.append([line for line in warnings_of(*sides) if "measured points" in line])
+    assert told[0] == told[2] == [] and "1 of the samples and 0 of the reference hold measured points" in told[1][0]
 
 
 def test_an_image_without_returns_has_no_number():

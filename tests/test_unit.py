@@ -8,7 +8,7 @@ import pytest
 
 import lidarsynth as ls
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets import hdl64e
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.response import AS_STREETS, Response
@@ -91,6 +91,19 @@ def test_real_scans_of_kitti_show_it(shared: Path, tmp_path: Path):
     for path in paths:
         image = ls.load("nearest").into(KITTI).image_of(ls.read(path))
         assert unit_of(image, every(image, 4)).share > 0.5, path.name
+
+
+def test_a_sensor_of_that_name_and_other_beams_is_another_one():
+    few = Sensor(KITTI.name, tuple(np.linspace(10, -30, 32)), 256)
+    many = replace(KITTI, elevations=tuple(np.linspace(15, -15, 64)))
+    for sensor in (few, many):
+        assert not hdl64e.hidden(sensor).any() and hdl64e.dimness(sensor) == () and hdl64e.written_out(sensor) == sensor
+        assert hdl64e.shifts(sensor).shape == (sensor.height, 1) and len(hdl64e.lasers(sensor).loss)
+    moved = replace(KITTI, elevations=tuple(0.1 + 1.02 * v for v in KITTI.elevations))
+    assert hdl64e.hidden(moved).any(), "as of another day"
+    image = SyntheticStreets(61, 16, few).image(0)
+    known = every(image, 2)
+    assert ls.load("default").into(few).complete(image.keep(known), known).mask[~known].any()
 
 
 def test_the_tables_have_a_number_for_each_laser():

@@ -40,14 +40,14 @@ Sampler = Annotated[
     str | None,
     arg(
         metavar="SAMPLER",
-        help="such as ddpm, ddim, dpmpp-2m, heun, or columns, default's; a wrong word lists all; default the model's.",
+        help="such as ddpm, ddim, dpmpp-2m, heun, or columns, default's best; a wrong word lists all.",
     ),
 ]
 GenerationSteps = Annotated[
     int | None,
     arg(
         metavar="INT",
-        help="of a diffusion's sampler, per scan; default 32, 1161 of langevin, 16 of default's where not by columns.",
+        help="of a diffusion's sampler, per scan; default 32, 1161 of langevin; default then draws by dpmpp-2m.",
     ),
 ]
 Steps = Annotated[

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, SensorWord, Source, arg
-from lidarsynth.cli.terminal import at_least, load_with_bar, say, scan_bar, step_bar
+from lidarsynth.cli.terminal import at_least, load_with_bar, say, scan_bar, step_bar, warn
 from lidarsynth.lidar.plural import plural
 
 
@@ -49,6 +49,8 @@ def generate(
     settings |= {} if layouts is None else {"layouts": layouts}
     with only_writer(out, "generation"):
         claim(out, settings, loaded.sampler_used(steps))
+        if sampler is None and used != loaded.sampler_used():
+            warn(f"with steps scans are drawn by {used}, not by {loaded.sampler_used()}, whose are nearer to streets")
         runs, size = missing(out, count, endings), loaded.at_once(batch_size)
         workers = processes(loaded, runs, workers)
         make = partial(generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from lidarsynth.cli.arguments import arg
 from lidarsynth.cli.terminal import counted, say
+from lidarsynth.lidar.plural import plural
 
 if TYPE_CHECKING:
     from lidarsynth.streets.frame import LabelledStreets
@@ -71,7 +72,7 @@ def streets(
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
     deque(counted((done, len(made)) for done in written), maxlen=0)
     kept = f", more than -n {count} asks for" if made.count > count else ""
-    say(f"{out}/ has {len(made)} labelled scans of {made.sensor.name} in the layout of {format}{kept}")
+    say(f"{out}/ has {plural(len(made), 'labelled scan')} of {made.sensor.name} in the layout of {format}{kept}")
     if picture:
         _picture(made, out / "overview.png")
 

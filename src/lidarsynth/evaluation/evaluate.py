@@ -334,8 +334,11 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
     if len({n for _, n in parts}) > 1:  # a whole beside parts, too: the images of these may be in it
         raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in parts)}")
     total, _ = loaded[0]
-    for other, _ in loaded[1:]:
-        total.merge(other)
+    for file, (other, _) in zip(files[1:], loaded[1:], strict=True):
+        try:
+            total.merge(other)
+        except ValueError as error:
+            raise ValueError(f"{files[0]} and {file}: {error}") from None
     if shared and len(shared) < (n := shared[0][1]):
         lacking = [f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared]
         more = f" and {len(lacking) - NAMED} more" if len(lacking) > NAMED else ""
@@ -357,6 +360,9 @@ def _statistics_files(source: Samples) -> list[Path]:
     sources = [source] if isinstance(source, str | Path) else source if isinstance(source, list | tuple) else []
     paths = [Path(item) for item in sources if isinstance(item, str | Path)]
     if not [path for path in paths if path.suffix == ENDING]:
+        if len(paths) > 1 and len(paths) == len(sources):
+            raise ValueError(f"expected one folder or file of images, or several of statistics ({ENDING}), found "
+                             f"{', '.join(map(str, paths[:3]))}")  # fmt: skip
         return []
     if len(paths) != len(sources) or not all(path.suffix == ENDING for path in paths):
         raise ValueError(f"expected only files of statistics ({ENDING}), or none, found {', '.join(map(str, sources))}")

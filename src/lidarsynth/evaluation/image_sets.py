@@ -106,8 +106,9 @@ class ImageSet:
             raise self._named(i, error) from None
 
     def _named(self, i: int, error: ValueError) -> ValueError:
-        text = str(error)
-        return ValueError(text if text.startswith(self.names[i]) else f"{self.names[i]}: {text}")
+        name, text = self.names[i], str(error)
+        file = name.rpartition("[")[0] or name  # of one of a batch, the batch's
+        return ValueError(f"{name}: {text.removeprefix(f'{name}: ').removeprefix(f'{file}: ')}")
 
 
 def image_set(source: str | Path | Numbered, intensity: str = "auto") -> ImageSet:

@@ -127,6 +127,9 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     if protocol.measured and real.measured < real.count:
         told.append(f"{real.count - real.measured:,} of the reference hold no measured points (a cache keeps none): x, "
                     "y, z are those of the pixels' rays, in the official program the points' own")  # fmt: skip
+    if samples.sharpness and real.sharpness and samples.measured * real.count != real.measured * samples.count:
+        told.append(f"{samples.measured:,} of the samples and {real.measured:,} of the reference hold measured points, "
+                    "others lie on their pixels' rays: the rows of thickness see the difference")  # fmt: skip
     for statistics, name in ((samples, "samples"), (real, "reference")):
         total = max(statistics.count, statistics.bev.count if statistics.bev else 0)
         if statistics.others:

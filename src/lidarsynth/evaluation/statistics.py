@@ -189,7 +189,8 @@ class Statistics:
         if own != its:
             wrong = next(i for i, (a, b) in enumerate(zip(own, its, strict=True)) if a != b)
             name = ("protocol", "sensor", "role", "weights", "networks")[wrong]
-            raise ValueError(f"expected statistics of one {name}, found {own[wrong]!s:.100} and {its[wrong]!s:.100}")
+            found = _apart(own[wrong], its[wrong])
+            raise ValueError(f"expected statistics of one {name}, found {found[0]:.100} and {found[1]:.100}")
         self.count, self.lit, self.measured = (
             self.count + other.count, self.lit + other.lit, self.measured + other.measured
         )  # fmt: skip
@@ -252,6 +253,16 @@ class Statistics:
     def __getstate__(self) -> dict[str, Any]:
         """For another process: all but the networks."""
         return {**vars(self), "networks": {}}
+
+
+def _apart(own: object, its: object) -> tuple[str, str]:
+    """Two different things of one kind in words: of sensors, the first field that differs."""
+    if isinstance(own, EvaluationProtocol) and isinstance(its, EvaluationProtocol):
+        return own.title, its.title
+    if isinstance(own, Sensor) and isinstance(its, Sensor):
+        name = next(name for name, value in vars(own).items() if value != getattr(its, name))
+        return tuple(f"{sensor.name} of {name} {getattr(sensor, name)}" for sensor in (own, its))  # type: ignore[return-value]
+    return str(own), str(its)
 
 
 def hash_of(image: RangeImage) -> int:

@@ -9,7 +9,7 @@ import struct
 import zipfile
 import zlib
 from io import BufferedIOBase, BytesIO
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from lidarsynth.files.fields import (
     written_names,
 )
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import from_dict
+from lidarsynth.lidar.sensor import WORDS, from_dict
 
 COLUMNS: tuple[str, ...] = ("x", "y", "z", "intensity", "ring")
 MAX_HEADER = 1 << 16
@@ -233,7 +233,7 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
     mask = _checked("mask", mask, np.ones(mask.shape, bool)).astype(bool)
     arrays = {name: _checked(name, array, mask) if name in IMAGE else array for name, array in arrays.items()}
     try:
-        values = json.loads(str(arrays["sensor"]))
+        values = _sensor_table(str(arrays["sensor"]))
         if not isinstance(values, dict) or "elevations" not in values:
             raise FileError("expected a sensor with elevations in the range image, found another JSON text")
         label = arrays["label"].astype(np.int32) if "label" in arrays else None
@@ -245,6 +245,16 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
         raise
     except (ValueError, TypeError, RecursionError) as error:
         raise FileError(f"expected a range image that fits its sensor, found: {_first_line(error)}") from None
+
+
+def _sensor_table(text: str) -> Any:
+    """A sensor's fields from JSON, or of the known one whose word the text is."""
+    if text in WORDS:
+        return WORDS[text].to_dict()
+    try:
+        return json.loads(text)
+    except ValueError:
+        raise FileError(f"expected a sensor's fields as JSON, or its word, found {text!r:.60}") from None
 
 
 def _checked(name: str, array: np.ndarray, returned: np.ndarray) -> np.ndarray:

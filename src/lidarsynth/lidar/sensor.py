@@ -252,6 +252,9 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     for key in METRES:
         if not isinstance(values.get(key, 1), Real):
             raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values[key]!r:.60} as {key}")
+    if (far := values.get("max_range", 1)) == np.inf or (low := values.get("mount", 1)) < 0:
+        told = f"a max_range in metres, found {far}" if far == np.inf else f"a mount above the road, found {low:g} m"
+        raise ValueError(f"{source}: expected {told}")
     beams = {key: _numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
     order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
     for key, numbers in beams.items():  # each number goes with its beam

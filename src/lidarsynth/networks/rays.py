@@ -14,6 +14,7 @@ from lidarsynth.lidar.sensor import Sensor
 
 HORIZON = 120.0  # metres: flat ground beyond it, and rays that look above it, count as this far
 ROWS, COLUMNS = 32, 16  # images are padded to multiples of these
+FEWEST = 2  # such multiples of columns: a kernel of three goes around two of the smallest map's
 PADDING_STEP = math.radians(0.4)  # between rows of padding, which lie below the lowest beam
 
 
@@ -62,7 +63,7 @@ def level_sines(sensor: Sensor, elevation: np.ndarray, azimuth: np.ndarray) -> n
 
 def padded(sensor: Sensor) -> tuple[int, int]:
     """Rows and columns of the images in which a network sees the sensor's."""
-    return ROWS * math.ceil(sensor.height / ROWS), COLUMNS * math.ceil(sensor.width / COLUMNS)
+    return ROWS * math.ceil(sensor.height / ROWS), COLUMNS * max(FEWEST, math.ceil(sensor.width / COLUMNS))
 
 
 def rays_of(

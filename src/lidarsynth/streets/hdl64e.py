@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 
 NAME = "hdl-64e-kitti"
+ANOTHER = 1.0  # degrees: a sensor of this name whose beams stand so much otherwise is somebody else's
 
 # fmt: off
 # How much less signal each laser reports than the brightest ones, top beam first.
@@ -79,11 +80,20 @@ _EGO = (
 
 
 @lru_cache(maxsize=4)
+def is_kittis(sensor: Sensor) -> bool:
+    """Whether it is `hdl-64e-kitti`, on whatever day; not a sensor of other beams that somebody named so."""
+    own = SENSORS[NAME].elevations
+    if sensor.name != NAME or sensor.height != len(own):
+        return False
+    return bool(np.median(np.abs(np.subtract(sensor.elevations, own))) < ANOTHER)
+
+
+@lru_cache(maxsize=4)
 def own_car(sensor: Sensor) -> np.ndarray:
     """(H, W) bool: which rays end on the vehicle itself. All False for other sensors than `hdl-64e-kitti`, or rows."""
     width = sensor.width
     hidden = np.zeros((sensor.height, width), bool)
-    if sensor.name != NAME or sensor.height != len(RING_LOSS):
+    if not is_kittis(sensor):
         return hidden
     columns = np.arange(width)
     scale = width / 1024
@@ -117,7 +127,7 @@ def lasers(sensor: Sensor, loss: Table = (), dip: Table = (), shift: Table = ())
     loss, dip, shift  one number per beam; those of `hdl-64e-kitti` where nothing is given for it
     """
     seen = ~hidden(sensor).reshape(-1)
-    tables = (RING_LOSS, RING_DIP, RING_SHIFT) if sensor.name == NAME and not loss else (loss, dip, shift)
+    tables = (RING_LOSS, RING_DIP, RING_SHIFT) if is_kittis(sensor) and not loss else (loss, dip, shift)
     spread = [np.repeat(np.asarray(table or [0.0] * sensor.height, np.float32), sensor.width)[seen] for table in tables]
     return Lasers(*spread, number=np.repeat(np.arange(sensor.height, dtype=np.uint32), sensor.width)[seen])
 
@@ -133,7 +143,7 @@ def hidden(sensor: Sensor) -> np.ndarray:
 @lru_cache(maxsize=4)
 def written_out(sensor: Sensor) -> Sensor:
     """The sensor with what is known by its name in its own fields, so that its parts and denser ones keep it."""
-    if sensor.name != NAME:
+    if not is_kittis(sensor):
         return sensor
     edges = np.diff(np.pad(hidden(sensor), ((0, 0), (1, 1))).astype(int), axis=1)
     first, last = np.argwhere(edges > 0), np.argwhere(edges < 0)
@@ -143,7 +153,7 @@ def written_out(sensor: Sensor) -> Sensor:
 
 def shifts(sensor: Sensor) -> np.ndarray:
     """(H, 1) float32 metres that each beam reads too far, 0 where nobody has measured it."""
-    return np.asarray(RING_SHIFT if sensor.name == NAME else [0.0] * sensor.height, np.float32)[:, None]
+    return np.asarray(RING_SHIFT if is_kittis(sensor) else [0.0] * sensor.height, np.float32)[:, None]
 
 
 def misread(metres: np.ndarray, rows: Rows = ALL) -> np.ndarray:
@@ -166,7 +176,7 @@ def dipped(metres: np.ndarray) -> np.ndarray:
 
 def dimness(sensor: Sensor) -> Table:
     """How much less signal each beam reports, () where nobody has measured it."""
-    return RING_LOSS if sensor.name == NAME else sensor.dimness
+    return RING_LOSS if is_kittis(sensor) else sensor.dimness
 
 
 def unevenness(sensor: Sensor) -> np.ndarray:

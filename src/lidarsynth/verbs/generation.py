@@ -27,6 +27,7 @@ from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL
 
 RECORD = "generate.json"
+TOLD = {"steps": "steps of all networks"}  # those of the sampler, and the fill
 NAMED = frozenset({"model", "sensor"})  # in words what `weights` says in digits, by which alone folders are compared
 MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
 
@@ -52,8 +53,7 @@ def claim(folder: Path, settings: dict[str, Any], sampler: str | None = None) ->
         found = _recorded(record)
         found |= {"sampler": sampler} if found.get("sampler") is None else {}
         if other := _differing(settings, found):
-            asked, was = ({key: of.get(key) for key in other if key in of or key not in NAMED}
-                          for of in (settings, found))  # fmt: skip
+            asked, was = ({TOLD.get(key, key): of.get(key) for key in other if key in of} for of in (settings, found))
             raise ValueError(f"{folder}: expected a folder of scans made with {asked}, found {was}; use another --out")
         return
     if taken := sorted(folder.glob("[0-9]" * 6 + ".*")):

@@ -58,7 +58,7 @@ def unit_of(image: RangeImage, known: np.ndarray) -> Unit:
     Where a laser and its known neighbours above and below meet one surface, it differs from their mean as it would on
     KITTI's unit, or does not: the share is that of least squares, beside what its dimness and its near dip do.
     """
-    if image.sensor.name != hdl64e.NAME or image.shape[0] != len(hdl64e.RING_OFFSET) or not image.reflectance.any():
+    if not hdl64e.is_kittis(image.sensor) or not image.reflectance.any():
         return Unit()
     lit = known & image.mask & (image.reflectance > 0)
     rows = np.flatnonzero(lit.any(1))
