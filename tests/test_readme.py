@@ -113,7 +113,7 @@ def test_the_numbers_are_those_of_the_models_and_their_cards():
             assert f"bilinear {', '.join(line)}" in said, name
     (score,) = re.findall(r"an FRD\s+of ([\d.]+)", text)
     assert f"FRD {score}," in results["default"]
-    shares = re.search(r"its range errs (\d+) to (\d+) % less", text)
+    shares = re.search(r"against the best interpolation .* \| (\d+) to (\d+) % less", text)
     assert shares and f"range {shares[1]} to {shares[2]} % below" in results["default"]
     with torch.device("meta"):
         count = sum(p.numel() for p in build_network(preset("r2dm-h")).parameters())
