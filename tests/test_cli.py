@@ -565,6 +565,18 @@ def test_a_folder_in_the_way_is_refused_before_the_work(run: Run, scan: Path, tm
     refused(run("upsample", scan, "--out", tmp_path / "d.npz"), "found a folder")
 
 
+@pytest.mark.parametrize("words", [("complete", "a.bin", "--out", ""), ("complete", "", "--out", "x.ply"),
+                                   ("view", ""), ("generate", "--out="), ("info", "a.ply", "")])  # fmt: skip
+def test_an_empty_word_is_not_the_current_folder(
+    run: Run, words: tuple[str, ...], scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "cwd").mkdir()
+    (tmp_path / "cwd" / "a.bin").write_bytes(scan.read_bytes())
+    monkeypatch.chdir(tmp_path / "cwd")
+    refused(run(*words), "found an empty one")
+    assert [path.name for path in Path().iterdir()] == ["a.bin"]
+
+
 def test_a_fault_of_our_own_is_not_hidden(monkeypatch: pytest.MonkeyPatch):
     def fail(what: str) -> None:
         raise RuntimeError("a fault") if what == "fault" else RuntimeError("not enough memory: 8 bytes\nmore")
