@@ -311,6 +311,16 @@ def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, endin
     assert not is_bag(path) and len(list(inputs_of([path], Reading()).stream())) == 3
 
 
+@pytest.mark.parametrize("kind", [".bag", ".mcap", "SQLITE3", "MCAP", "alone"])
+def test_messages_of_one_stamp_have_no_rate(kind: str, tmp_path: Path):
+    if kind.startswith("."):
+        path = clouds_at(tmp_path / f"drive{kind}", [100, 100, 100])
+    else:
+        path = ros2(tmp_path, kind, 0) if kind.isupper() else next(ros2(tmp_path, "SQLITE3", 0).glob("*.db3"))
+    lines = file_lines(path, Reading())
+    assert lines is not None and "3 messages (" in lines["/points"]
+
+
 def test_a_full_disk_is_no_broken_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

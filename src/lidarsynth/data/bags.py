@@ -69,7 +69,8 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
             for connection, time, data in heapq.merge(*each, key=lambda message: message[1]):
                 yield Message(topics[connection.id], time, bytes(data))
 
-        duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
+        # rosbags counts to the nanosecond after the last message
+        duration = max(reader.duration - 1, 0) / 1e9 if reader.message_count else 0.0
         yield Bag(path, _by_name(topics.values()), duration, messages, cut)
 
 
