@@ -81,6 +81,9 @@ def test_a_named_file_may_begin_with_lost_points(tmp_path):
         (b"1 2 3\n1 2 b\n", "expected numbers, found"),
         (b"\xff\xfe\x00", "as text"),
         (b"# nothing\n", "found none"),
+        (b"3\n1 2 3\n1 2 3\n", "expected 3 points, the number before them, found 2"),
+        (b"1\nx y z\n1 2 3\n1 2 3\n", "expected 1 point, the number before them, found 2"),
+        (b"3\nx y z\n", "found none"),
     ],
 )
 def test_what_is_no_text_of_points_is_one_line(data: bytes, words: str):

@@ -13,17 +13,19 @@ from lidarsynth.lidar.plural import plural
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
 HEADER_LINES = 64
+DIGITS = 18  # of a count of points, at most
 
 
 def read_text(data: bytes) -> Fields:
     """Columns under their own names where a line names them, else x y z, then what the numbers can be.
 
     The line with names may be a comment, as CloudCompare and numpy write it; a lone count of points before them (.pts)
-    is passed over. Of unnamed columns the fourth is the intensity, and a fifth of whole numbers 0-255 the ring; three
+    must be theirs. Of unnamed columns the fourth is the intensity, and a fifth of whole numbers 0-255 the ring; three
     whole columns of 0-255 after x y z are colours, which are left out. Raises FileError for anything else.
     """
     lines, start = _lines(data), 0
     names: list[str] | None = None
+    counts: list[int] = []
     separator: str | None = None
     for start, line in enumerate(lines):
         separator = _separator(line)
@@ -33,13 +35,19 @@ def read_text(data: bytes) -> Fields:
             break
         if _names(words):
             names = [_without_unit(word) or word for word in words]
-        elif not (line.startswith(COMMENT) or (len(words) == 1 and words[0].isdecimal())) or start >= HEADER_LINES:
+        elif line.startswith(COMMENT) and start < HEADER_LINES:
+            continue
+        elif len(words) == 1 and words[0].isdecimal() and len(words[0]) <= DIGITS and start < HEADER_LINES:
+            counts.append(int(words[0]))
+        else:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
     else:
-        if names is not None:  # and nothing else: a scan of no point
+        if names is not None and not any(counts):  # and nothing else: a scan of no point
             return {name: np.zeros(0) for name in names}
         raise FileError(f"expected lines of x y z and more numbers, found none in {plural(len(lines), 'line')}")
     table, words = _table(lines[start:], separator)
+    if len(counts) == 1 and counts[0] != len(table):
+        raise FileError(f"expected {plural(counts[0], 'point')}, the number before them, found {len(table)}")
     if names is not None and len(names) != table.shape[1]:
         raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")
     if names is None:
