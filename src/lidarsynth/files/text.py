@@ -13,6 +13,7 @@ from lidarsynth.lidar.plural import plural
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
 HEADER_LINES = 64
+TRUTHS = {"true": "1", "false": "0"}
 DIGITS = 18  # of a count of points, at most
 
 
@@ -31,7 +32,8 @@ def read_text(data: bytes) -> Fields:
         separator = _separator(line)
         words = _words(line.lstrip("#/% "), separator)
         empty = names is not None and not any(words)  # of a point without a return
-        if (_numeric(words) or empty) and len(words) >= 3 and not line.startswith(COMMENT):
+        told = words if names is None else _with_truths(words)
+        if (_numeric(told) or empty) and len(words) >= 3 and not line.startswith(COMMENT):
             break
         if _names(words):
             names = [_without_unit(word) or word for word in words]
@@ -39,13 +41,15 @@ def read_text(data: bytes) -> Fields:
             continue
         elif len(words) == 1 and words[0].isdecimal() and len(words[0]) <= DIGITS and start < HEADER_LINES:
             counts.append(int(words[0]))
+        elif names is not None and len(told) == len(names) and not _numeric(told):
+            raise FileError(_no_number(told, names))
         else:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
     else:
         if names is not None and not any(counts):  # and nothing else: a scan of no point
             return {name: np.zeros(0) for name in names}
         raise FileError(f"expected lines of x y z and more numbers, found none in {plural(len(lines), 'line')}")
-    table, words = _table(lines[start:], separator)
+    table, words = _table(lines[start:], separator, names)
     if len(counts) == 1 and counts[0] != len(table):
         raise FileError(f"expected {plural(counts[0], 'point')}, the number before them, found {len(table)}")
     if names is not None and len(names) != table.shape[1]:
@@ -124,7 +128,19 @@ def _numeric(words: list[str]) -> bool:
         return False
 
 
-def _table(lines: list[str], separator: str | None) -> tuple[np.ndarray, list[list[str]]]:
+def _with_truths(words: list[str]) -> list[str]:
+    """The words, 1 for True and 0 for False, as pandas writes them."""
+    return [TRUTHS.get(word.lower(), word) for word in words]
+
+
+def _no_number(words: list[str], names: list[str] | None) -> str:
+    """What is to be said of a line with a word that is no number: the word, and the name of its column."""
+    column, word = next((i, word) for i, word in enumerate(words) if not _numeric([word, "0"]))
+    where = f" in column {names[column][:40]}" if names is not None and column < len(names) else ""
+    return f"expected numbers{where}, found {word[:40]!r}"
+
+
+def _table(lines: list[str], separator: str | None, names: list[str] | None) -> tuple[np.ndarray, list[list[str]]]:
     """(N, columns) float64, and the words that it was read from; an empty cell is NaN."""
     width = len(_words(lines[0], separator))
     rows = [line.split(separator) for line in lines if not line.startswith(COMMENT)]
@@ -133,5 +149,8 @@ def _table(lines: list[str], separator: str | None) -> tuple[np.ndarray, list[li
     words = [[word.strip("\"' ") or "nan" for word in row] for row in rows]
     try:
         return np.array(words, dtype=np.float64), words
-    except ValueError as error:
-        raise FileError(f"expected numbers, found {str(error).rpartition(':')[2].strip()[:40]}") from None
+    except ValueError:
+        words = words if names is None else [_with_truths(row) for row in words]
+        if lost := next((row for row in words if not _numeric(row)), None):
+            raise FileError(_no_number(lost, names)) from None
+        return np.array(words, dtype=np.float64), words
