@@ -19,6 +19,7 @@ import pytest
 from broken import BROKEN
 from forked import Forked
 from networks import trained
+from PIL import Image
 
 from lidarsynth.cli import parsing
 from lidarsynth.cli.main import VERBS, main
@@ -128,6 +129,17 @@ def test_scans_are_the_same_bytes_whatever_the_batch_and_the_count(run: Run, tin
     assert a == b
     assert {name: a[name] for name in c} == c
     assert len(set(a.values())) == 5 + 1
+
+
+def test_generate_replaces_no_picture_of_the_users(run: Run, tiny: Path, tmp_path: Path):
+    words = ("generate", "--out", tmp_path, "--model", tiny, "--steps", 2, "-n")
+    run(*words, 1)
+    (tmp_path / "000000.ply").unlink()
+    Image.new("RGB", (8, 8)).save(tmp_path / "000001.png")
+    before = (tmp_path / "000001.png").read_bytes()
+    refused(run(*words, 2), "000001.png: expected a picture of lidarsynth to replace, found another; use another --out")
+    assert (tmp_path / "000001.png").read_bytes() == before and run(*words, 1).code == 0  # whose picture was ours
+    assert run(*words, 2, "--no-picture").code == 0 and (tmp_path / "000001.png").read_bytes() == before
 
 
 def test_processes_generate_what_one_does(run: Run, tiny: Path, tmp_path: Path):

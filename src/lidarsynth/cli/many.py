@@ -143,7 +143,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
         (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:
         raise ValueError(named_failure(result))
-    tell(result, job.picture)
+    tell(result)
     return [result]
 
 
@@ -216,7 +216,7 @@ def _done(
                 _begin(report, settings, many.skip_existing)
             results.append(result)
             on_scan()
-            tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
+            tell_of_many(result, (count or PICTURES + 1) <= PICTURES, len(results))
     return results
 
 
@@ -312,7 +312,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
                 writer.write_cloud(topic, result.cloud)
             results.append(replace(result, cloud=None))
             on_scan()
-            tell_of_many(result, False, False, len(results))
+            tell_of_many(result, False, len(results))
         if results and all(result.error is not None for result in results):
             refuse_all(results)  # before the bag is in its place
     say_summary(results, 0, time.perf_counter() - begun, out)
