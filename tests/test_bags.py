@@ -14,6 +14,7 @@ from lidarsynth.data.bag_writer import FORMATS, message_of, points_topic, write_
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.files.fields import PLACE, FileError, find, scan_from_fields
 from lidarsynth.verbs.batch import Job, Work, run
+from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading, inputs_of
 from lidarsynth.verbs.output_files import works
 from lidarsynth.viewer.series import series_of
@@ -65,7 +66,7 @@ def ros1(folder: Path) -> Path:
     return folder / "drive.bag"
 
 
-def ros2(folder: Path, plugin: str) -> Path:
+def ros2(folder: Path, plugin: str, step: int = 10**9) -> Path:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     store = typestore("cdr")
@@ -74,8 +75,9 @@ def ros2(folder: Path, plugin: str) -> Path:
         note = writer.add_connection("/note", STRING, typestore=store)
         for i in range(3):
             data = store.serialize_cdr(message(store, table(i, False), i, False, False), POINTS)
-            writer.write(points, (100 + i) * 10**9, data)
-            writer.write(note, (100 + i) * 10**9 + 1, store.serialize_cdr(store.types[STRING](f"n{i}"), STRING))
+            time = 100 * 10**9 + i * step
+            writer.write(points, time, data)
+            writer.write(note, time + min(step, 1), store.serialize_cdr(store.types[STRING](f"n{i}"), STRING))
     return folder / plugin
 
 
@@ -297,6 +299,26 @@ def test_parts_without_metadata_are_read_by_their_numbers(tmp_path: Path):
         clouds_at(tmp_path / f"drive_{number}.mcap", [100 + number])
     for paths in ([tmp_path], [tmp_path / "drive_*.mcap"]):
         assert [item.name for item in inputs_of(paths).stream()] == [f"drive_{n}/000000" for n in (1, 2, 10)]
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".db3", ".bag"])
+@pytest.mark.parametrize("kind", ["mcap folder", "sqlite3"])
+def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, ending: str, tmp_path: Path):
+    path = KINDS[kind](tmp_path).rename(tmp_path / f"drive{ending}")
+    assert is_bag(path) and file_lines(path, Reading()) is not None
+    assert [item.name for item in inputs_of([path], Reading()).stream()] == [f"drive/{n:06d}" for n in range(3)]
+    (path / "metadata.yaml").unlink()  # as of a recording that was killed
+    assert not is_bag(path) and len(list(inputs_of([path], Reading()).stream())) == 3
+
+
+@pytest.mark.parametrize("kind", [".bag", ".mcap", "SQLITE3", "MCAP", "alone"])
+def test_messages_of_one_stamp_have_no_rate(kind: str, tmp_path: Path):
+    if kind.startswith("."):
+        path = clouds_at(tmp_path / f"drive{kind}", [100, 100, 100])
+    else:
+        path = ros2(tmp_path, kind, 0) if kind.isupper() else next(ros2(tmp_path, "SQLITE3", 0).glob("*.db3"))
+    lines = file_lines(path, Reading())
+    assert lines is not None and "3 messages (" in lines["/points"]
 
 
 def test_a_full_disk_is_no_broken_bag(

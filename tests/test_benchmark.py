@@ -511,6 +511,13 @@ def test_scores_are_drawn_over_the_numbers_of_steps(generation: Path, tiny: Path
         assert len(np.unique(picture(tmp_path / "out" / name))) > 100, name
 
 
+def test_pictures_of_the_users_are_not_replaced(generation: Path, tmp_path: Path):
+    (tmp_path / "figure.png").write_bytes(b"of theirs")
+    with pytest.raises(ValueError, match=r"figure\.png: expected a picture of lidarsynth to replace, found another"):
+        benchmark("generation", generation, tmp_path, lambda word: pytest.fail("worked"))
+    assert [path.name for path in tmp_path.glob("*.[jp][sn]*")] == ["figure.png"]
+
+
 def test_range_only_models_have_no_feature_distance(generation: Path, tiny: Path, tmp_path: Path):
     config = written(
         generation, generation.read_text().replace("count = 3", 'count = 3\nprotocol = ["bev-1", "r2dm-2024"]')

@@ -19,6 +19,7 @@ import pytest
 from broken import BROKEN
 from forked import Forked
 from networks import trained
+from PIL import Image
 
 from lidarsynth.cli import parsing
 from lidarsynth.cli.main import VERBS, main
@@ -128,6 +129,17 @@ def test_scans_are_the_same_bytes_whatever_the_batch_and_the_count(run: Run, tin
     assert a == b
     assert {name: a[name] for name in c} == c
     assert len(set(a.values())) == 5 + 1
+
+
+def test_generate_replaces_no_picture_of_the_users(run: Run, tiny: Path, tmp_path: Path):
+    words = ("generate", "--out", tmp_path, "--model", tiny, "--steps", 2, "-n")
+    run(*words, 1)
+    (tmp_path / "000000.ply").unlink()
+    Image.new("RGB", (8, 8)).save(tmp_path / "000001.png")
+    before = (tmp_path / "000001.png").read_bytes()
+    refused(run(*words, 2), "000001.png: expected a picture of lidarsynth to replace, found another; use another --out")
+    assert (tmp_path / "000001.png").read_bytes() == before and run(*words, 1).code == 0  # whose picture was ours
+    assert run(*words, 2, "--no-picture").code == 0 and (tmp_path / "000001.png").read_bytes() == before
 
 
 def test_processes_generate_what_one_does(run: Run, tiny: Path, tmp_path: Path):
@@ -563,6 +575,18 @@ def test_a_folder_in_the_way_is_refused_before_the_work(run: Run, scan: Path, tm
     (tmp_path / "d.npz").mkdir()
     refused(run("project", scan, "--out", tmp_path / "d.npz"), "found a folder")
     refused(run("upsample", scan, "--out", tmp_path / "d.npz"), "found a folder")
+
+
+@pytest.mark.parametrize("words", [("complete", "a.bin", "--out", ""), ("complete", "", "--out", "x.ply"),
+                                   ("view", ""), ("generate", "--out="), ("info", "a.ply", "")])  # fmt: skip
+def test_an_empty_word_is_not_the_current_folder(
+    run: Run, words: tuple[str, ...], scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "cwd").mkdir()
+    (tmp_path / "cwd" / "a.bin").write_bytes(scan.read_bytes())
+    monkeypatch.chdir(tmp_path / "cwd")
+    refused(run(*words), "found an empty one")
+    assert [path.name for path in Path().iterdir()] == ["a.bin"]
 
 
 def test_a_fault_of_our_own_is_not_hidden(monkeypatch: pytest.MonkeyPatch):

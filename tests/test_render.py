@@ -260,6 +260,8 @@ def test_save_png_round_trips_and_is_whole_or_not_at_all(tmp_path, monkeypatch: 
     picture = range_strip(small_image())
     path = save_png(tmp_path / "strip.png", picture)
     np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
+    with Image.open(path) as opened:
+        assert opened.info == {"Software": "lidarsynth"}
     before = path.read_bytes()
 
     def full_disk(*args: object, **options: object):

@@ -70,9 +70,21 @@ def test_a_named_file_may_begin_with_lost_points(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "p.csv").xyz, [[1, 2, 3]])
 
 
+def test_true_and_false_in_a_named_column_are_1_and_0():
+    """As pandas writes them, from the first point on or later."""
+    for rows in ("1,2,3,True\n4,5,6,False\n", "1,2,3,0\n4,5,6,true\n"):
+        moving = read_text(f"x,y,z,moving\n{rows}".encode())["moving"]
+        np.testing.assert_array_equal(moving, [1, 0] if "True" in rows else [0, 1])
+
+
 @pytest.mark.parametrize(
     ("data", "words"),
     [
+        (b"x,y,z,day\n1,2,3,2026-11-27\n", "expected numbers in column day, found '2026-11-27'"),
+        (b"x,y,z,id\n-0.434,2,3,0x1f\n", "expected numbers in column id, found '0x1f'"),
+        (b"x,y,z,day\n1,2,3,\n1,2,3,never\n", "expected numbers in column day, found 'never'"),
+        (b"x,y,z,moving\n1,2,3,True\n1,2,maybe,True\n", "expected numbers in column z, found 'maybe'"),
+        (b"1,2,3,True\n", "names them, found '1,2,3,True'"),
         (b"hello", "names them, found 'hello'"),
         (b"a,b,c\n1,2,3", "names them"),
         (b"1 2 3\n1 2", "3 numbers a line, found 2"),
@@ -81,6 +93,9 @@ def test_a_named_file_may_begin_with_lost_points(tmp_path):
         (b"1 2 3\n1 2 b\n", "expected numbers, found"),
         (b"\xff\xfe\x00", "as text"),
         (b"# nothing\n", "found none"),
+        (b"3\n1 2 3\n1 2 3\n", "expected 3 points, the number before them, found 2"),
+        (b"1\nx y z\n1 2 3\n1 2 3\n", "expected 1 point, the number before them, found 2"),
+        (b"3\nx y z\n", "found none"),
     ],
 )
 def test_what_is_no_text_of_points_is_one_line(data: bytes, words: str):

@@ -17,6 +17,7 @@ from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.pictures.figure import GAP, Picture, class_legend, colour_bar, panel
 from lidarsynth.pictures.perspective import Camera, perspective
 from lidarsynth.pictures.portrait import STRIP, strips
+from lidarsynth.pictures.render import MARK
 
 VIEW = Camera(azimuth=205.0, elevation=24.0, distance=30.0, target=(7.0, 0.0, -1.0))  # nearer than a portrait's
 COLUMNS = 3  # views beside each other
@@ -85,7 +86,7 @@ def save_scores(path: Path, rows: Sequence[Row], protocols: Sequence[str], title
         if number == 1:
             axes.legend(fontsize="small")
     with whole_file(path) as scratch:
-        figure.savefig(scratch, format="png", dpi=120)
+        figure.savefig(scratch, format="png", dpi=120, metadata={"Software": MARK})
 
 
 def plotter():

@@ -27,6 +27,7 @@ from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.networks.device import check_device
+from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.render import save_png
 
 RESULTS, TABLE, FIGURE, SCORES = "results.json", "table.md", "figure.png", "scores.png"
@@ -78,6 +79,9 @@ def benchmark(
     settings, out = read_config(kind, config, data, seed), Path(out)
     replaced = [name for name, given in ((KINDS[kind][2], data), ("seed", seed)) if given is not None]
     check_same(out / RESULTS, kind, settings, replaced)
+    for name in () if (out / RESULTS).exists() else (FIGURE, SCORES):
+        if other := in_the_way(out / name):
+            raise ValueError(f"{other}; use another --out")
     several = any(isinstance(method.steps, tuple) and len(method.steps) > 1 for method in settings.method)
     draws_scores = kind == "generation" and several
     if draws_scores:

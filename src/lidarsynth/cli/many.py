@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from lidarsynth.cli.arguments import Rings, arg
 from lidarsynth.cli.outcomes import NAMED, check_any, named_failure, refuse_all, say_summary, tell, tell_of_many
 from lidarsynth.cli.terminal import load_with_bar, say, scan_bar, step_bar, warn
-from lidarsynth.lidar.plural import was
+from lidarsynth.lidar.plural import plural, was
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -75,12 +75,18 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
         raise ValueError(f"expected --workers of at least 0, found {many.workers}")
     transform = read_transform(many.transform, many.mount, many.axes)
     rings = parse_rings(many.rings)
-    inputs = inputs_of(paths, Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings))
+    reading = Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings)
+    inputs = inputs_of(paths, reading, out)
     if inputs.passed:
         named = ", ".join(path.name for path in inputs.passed[:NAMED])
         count = len(inputs.passed)
         what = "bag or capture" if count == 1 else "bags or captures"
         warn(f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them")
+    if inputs.below:
+        names = ", ".join(path.name for path in inputs.below[:NAMED]) + (", ..." if inputs.below[NAMED:] else "")
+        count = len(inputs.below)
+        warn(f"{plural(count, 'scan')} below {out}, where results go, {was(count)} passed over: {names}; name them to "
+             "read them")  # fmt: skip
     for line in inputs.cut:
         warn(line)
     job = replace(job, transform=transform, strict=many.strict)
@@ -137,7 +143,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
         (result,) = run(job, work, model=model, on_step=on_step)
     if result.error is not None:
         raise ValueError(named_failure(result))
-    tell(result, job.picture)
+    tell(result)
     return [result]
 
 
@@ -210,7 +216,7 @@ def _done(
                 _begin(report, settings, many.skip_existing)
             results.append(result)
             on_scan()
-            tell_of_many(result, job.picture, (count or PICTURES + 1) <= PICTURES, len(results))
+            tell_of_many(result, (count or PICTURES + 1) <= PICTURES, len(results))
     return results
 
 
@@ -306,7 +312,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
                 writer.write_cloud(topic, result.cloud)
             results.append(replace(result, cloud=None))
             on_scan()
-            tell_of_many(result, False, False, len(results))
+            tell_of_many(result, False, len(results))
         if results and all(result.error is not None for result in results):
             refuse_all(results)  # before the bag is in its place
     say_summary(results, 0, time.perf_counter() - begun, out)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 NAMED = 5  # failures, and files, that are named one by one
 
 
-def tell(result: Result, picture: bool) -> None:
+def tell(result: Result) -> None:
     """What became of a scan that did not fail, in a line for each thing to be said."""
     from lidarsynth.files.fields import dropped_points
 
@@ -26,16 +26,16 @@ def tell(result: Result, picture: bool) -> None:
         say(f"{result.source}: {result.note}")
     if result.target is not None:
         beside = f", with {', '.join(result.beside)} beside it" if result.beside else ""
-        say(f"wrote {result.target}" + (f" and {result.target.with_suffix('.png')}" if picture else "") + beside)
+        say(f"wrote {result.target}" + (f" and {result.picture}" if result.picture else "") + beside)
 
 
-def tell_of_many(result: Result, picture: bool, each: bool, number: int) -> None:
+def tell_of_many(result: Result, each: bool, number: int) -> None:
     """A line per scan where they are few; of many only warnings and failures, and of those the first few."""
     if result.error is not None:
         if number > 1:  # the first is kept until it is known whether all fail
             warn(named_failure(result))
     elif each:
-        tell(result, picture)
+        tell(result)
     elif result.warning and number <= NAMED:
         warn(result.warning)
 

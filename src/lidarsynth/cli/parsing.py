@@ -30,6 +30,7 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
     """
     word = argv[0] if argv else "--help"
     if word in verbs:
+        _no_empty_word(argv[1:])
         _one_recipe(argv[1:])
         with _refusals(verbs[word]):
             return tyro.cli(_later(verbs[word]), prog=f"lidarsynth {word}", args=argv[1:])
@@ -44,6 +45,18 @@ def parsed(verbs: Mapping[str, Callable[..., None]], argv: list[str]) -> Callabl
             description="Generate, complete and judge LiDAR scans.",
             args=argv or ["--help"],
         )
+
+
+def _no_empty_word(words: list[str]) -> None:
+    """Raises ValueError for an empty word, as "$OUT" is in a script that does not set it: the path of that name is the
+    current folder."""
+    before = ""
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not word or (name.startswith("--") and equals and not value):
+            of = name or (before if before.startswith("-") else "")
+            raise ValueError(f"expected {f'a value of {of}' if of else 'a word'}, found an empty one")
+        before = word
 
 
 def _one_recipe(words: list[str]) -> None:

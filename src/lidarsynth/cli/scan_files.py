@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidarsynth.cli.terminal import say
+from lidarsynth.cli.terminal import say, warn
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from lidarsynth.lidar.scan import RangeImage, Scan
 
 
@@ -24,11 +22,19 @@ def read_scan(path: Path, intensity: str) -> Scan:
     return scan
 
 
-def write_and_say(path: Path, scan: Scan | RangeImage, figure: np.ndarray | None = None) -> None:
-    """Write a file, and its picture beside it, and say so."""
+def write_and_say(path: Path, scan: Scan | RangeImage) -> None:
+    """Write a file and say so."""
     from lidarsynth.files.formats import write
-    from lidarsynth.pictures.render import save_png
 
     path.parent.mkdir(parents=True, exist_ok=True)
     write(path, scan)
-    say(f"wrote {path}" if figure is None else f"wrote {path} and {save_png(path.with_suffix('.png'), figure)}")
+    say(f"wrote {path}")
+
+
+def may_draw(path: Path) -> bool:
+    """Whether a picture may go to a path that the user did not name; says so where another one lies there."""
+    from lidarsynth.pictures.figure import in_the_way
+
+    if other := in_the_way(path):
+        warn(f"{other}; it stays: use another --out, or --no-picture")
+    return other is None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lidarsynth.cli.arguments import Intensity, NoSeed, Picture, Positional, Rings, arg
+from lidarsynth.cli.scan_files import may_draw
 from lidarsynth.cli.terminal import say, warn
 from lidarsynth.lidar.plural import plural, was
 
@@ -58,4 +59,5 @@ def sensor(
     say(summary(learned))
     for line in doubts(learned):
         warn(line)
-    say(f"wrote {out}" + (f" and {save_png(out.with_suffix('.png'), learned_figure(learned))}" if picture else ""))
+    drawn = picture and may_draw(out.with_suffix(".png"))
+    say(f"wrote {out}" + (f" and {save_png(out.with_suffix('.png'), learned_figure(learned))}" if drawn else ""))

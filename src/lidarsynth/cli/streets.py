@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from lidarsynth.cli.arguments import arg
+from lidarsynth.cli.scan_files import may_draw
 from lidarsynth.cli.terminal import counted, say
 from lidarsynth.lidar.plural import plural
 
@@ -73,7 +74,7 @@ def streets(
     deque(counted((done, len(made)) for done in written), maxlen=0)
     kept = f", more than -n {count} asks for" if made.count > count else ""
     say(f"{out}/ has {plural(len(made), 'labelled scan')} of {made.sensor.name} in the layout of {format}{kept}")
-    if picture:
+    if picture and may_draw(out / "overview.png"):
         _picture(made, out / "overview.png")
 
 

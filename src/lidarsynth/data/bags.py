@@ -26,9 +26,9 @@ SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `ro
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a path is a bag by its name, or a folder that holds a ROS 2 bag."""
+    """Whether a path is a bag by its name, or a folder, of any name, that holds a ROS 2 bag."""
     path = Path(path)
-    return path.name.lower().endswith(SUFFIXES) or (path / "metadata.yaml").is_file()
+    return (path / "metadata.yaml").is_file() if path.is_dir() else path.name.lower().endswith(SUFFIXES)
 
 
 @contextmanager
@@ -44,7 +44,7 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
             check_regular(file)
         except ValueError as error:
             raise FileError(str(error)) from None
-    bare = [path] if path.suffix.lower() == ".mcap" else inside
+    bare = [path] if path.suffix.lower() == ".mcap" and not path.is_dir() else inside
     opened = _mcap(path, bare) if bare else _rosbags(path)
     with naming(path):
         bag = next(opened)
@@ -69,7 +69,8 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
             for connection, time, data in heapq.merge(*each, key=lambda message: message[1]):
                 yield Message(topics[connection.id], time, bytes(data))
 
-        duration = max(reader.duration, 0) / 1e9 if reader.message_count else 0.0
+        # rosbags counts to the nanosecond after the last message
+        duration = max(reader.duration - 1, 0) / 1e9 if reader.message_count else 0.0
         yield Bag(path, _by_name(topics.values()), duration, messages, cut)
 
 

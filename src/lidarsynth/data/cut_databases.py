@@ -32,8 +32,8 @@ class CutDatabase:
 
     @property
     def duration(self) -> int:
-        """Nanoseconds from the first to the last of them."""
-        return self.rows[-1][0] - self.rows[0][0] if self.rows else 0
+        """Nanoseconds from the first to the one after the last of them, as rosbags counts."""
+        return self.rows[-1][0] + 1 - self.rows[0][0] if self.rows else 0
 
     def messages(self, connections: Iterable[Any], start: int | None = None) -> Iterator[tuple[Any, int, bytes]]:
         """(connection, time, bytes) of the messages of these, by time, from `start` (nanoseconds) on."""

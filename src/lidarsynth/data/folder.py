@@ -48,6 +48,12 @@ def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
     return sorted(path for path in named if not _beside(path.relative_to(root)) and path.is_file())
 
 
+def stem(path: Path) -> str:
+    """The name without the ending that tells the kind of file: a.b.pcd.bin -> a.b."""
+    endings = [suffix for suffix in READERS if path.name.lower().endswith(suffix)]
+    return path.name[: -max(map(len, endings))] if endings else path.stem
+
+
 def by_number(path: Path) -> tuple[str | int, ...]:
     """What paths are sorted by where the numbers in their names count: part_2 before part_10."""
     return tuple(int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", str(path)))

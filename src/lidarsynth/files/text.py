@@ -13,33 +13,45 @@ from lidarsynth.lidar.plural import plural
 SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
 HEADER_LINES = 64
+TRUTHS = {"true": "1", "false": "0"}
+DIGITS = 18  # of a count of points, at most
 
 
 def read_text(data: bytes) -> Fields:
     """Columns under their own names where a line names them, else x y z, then what the numbers can be.
 
     The line with names may be a comment, as CloudCompare and numpy write it; a lone count of points before them (.pts)
-    is passed over. Of unnamed columns the fourth is the intensity, and a fifth of whole numbers 0-255 the ring; three
+    must be theirs. Of unnamed columns the fourth is the intensity, and a fifth of whole numbers 0-255 the ring; three
     whole columns of 0-255 after x y z are colours, which are left out. Raises FileError for anything else.
     """
     lines, start = _lines(data), 0
     names: list[str] | None = None
+    counts: list[int] = []
     separator: str | None = None
     for start, line in enumerate(lines):
         separator = _separator(line)
         words = _words(line.lstrip("#/% "), separator)
         empty = names is not None and not any(words)  # of a point without a return
-        if (_numeric(words) or empty) and len(words) >= 3 and not line.startswith(COMMENT):
+        told = words if names is None else _with_truths(words)
+        if (_numeric(told) or empty) and len(words) >= 3 and not line.startswith(COMMENT):
             break
         if _names(words):
             names = [_without_unit(word) or word for word in words]
-        elif not (line.startswith(COMMENT) or (len(words) == 1 and words[0].isdecimal())) or start >= HEADER_LINES:
+        elif line.startswith(COMMENT) and start < HEADER_LINES:
+            continue
+        elif len(words) == 1 and words[0].isdecimal() and len(words[0]) <= DIGITS and start < HEADER_LINES:
+            counts.append(int(words[0]))
+        elif names is not None and len(told) == len(names) and not _numeric(told):
+            raise FileError(_no_number(told, names))
+        else:
             raise FileError(f"expected lines of x y z and more numbers, or a line that names them, found {line[:40]!r}")
     else:
-        if names is not None:  # and nothing else: a scan of no point
+        if names is not None and not any(counts):  # and nothing else: a scan of no point
             return {name: np.zeros(0) for name in names}
         raise FileError(f"expected lines of x y z and more numbers, found none in {plural(len(lines), 'line')}")
-    table, words = _table(lines[start:], separator)
+    table, words = _table(lines[start:], separator, names)
+    if len(counts) == 1 and counts[0] != len(table):
+        raise FileError(f"expected {plural(counts[0], 'point')}, the number before them, found {len(table)}")
     if names is not None and len(names) != table.shape[1]:
         raise FileError(f"expected a number for each of {', '.join(names)[:80]}, found {table.shape[1]} a line")
     if names is None:
@@ -116,7 +128,19 @@ def _numeric(words: list[str]) -> bool:
         return False
 
 
-def _table(lines: list[str], separator: str | None) -> tuple[np.ndarray, list[list[str]]]:
+def _with_truths(words: list[str]) -> list[str]:
+    """The words, 1 for True and 0 for False, as pandas writes them."""
+    return [TRUTHS.get(word.lower(), word) for word in words]
+
+
+def _no_number(words: list[str], names: list[str] | None) -> str:
+    """What is to be said of a line with a word that is no number: the word, and the name of its column."""
+    column, word = next((i, word) for i, word in enumerate(words) if not _numeric([word, "0"]))
+    where = f" in column {names[column][:40]}" if names is not None and column < len(names) else ""
+    return f"expected numbers{where}, found {word[:40]!r}"
+
+
+def _table(lines: list[str], separator: str | None, names: list[str] | None) -> tuple[np.ndarray, list[list[str]]]:
     """(N, columns) float64, and the words that it was read from; an empty cell is NaN."""
     width = len(_words(lines[0], separator))
     rows = [line.split(separator) for line in lines if not line.startswith(COMMENT)]
@@ -125,5 +149,8 @@ def _table(lines: list[str], separator: str | None) -> tuple[np.ndarray, list[li
     words = [[word.strip("\"' ") or "nan" for word in row] for row in rows]
     try:
         return np.array(words, dtype=np.float64), words
-    except ValueError as error:
-        raise FileError(f"expected numbers, found {str(error).rpartition(':')[2].strip()[:40]}") from None
+    except ValueError:
+        words = words if names is None else [_with_truths(row) for row in words]
+        if lost := next((row for row in words if not _numeric(row)), None):
+            raise FileError(_no_number(lost, names)) from None
+        return np.array(words, dtype=np.float64), words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -10,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_COLOURS, CLASSES
 from lidarsynth.pictures.colours import range_colours, reflectance_colours
-from lidarsynth.pictures.render import range_strip, reflectance_strip
+from lidarsynth.pictures.render import MARK, range_strip, reflectance_strip
 
 Picture = tuple[str, np.ndarray]  # caption, (H, W, 3) uint8
 PAPER, INK, FAINT = (255, 255, 255), (25, 28, 34), (105, 110, 120)
@@ -40,6 +41,29 @@ def panel(rows: Sequence[Sequence[Picture]], title: str = "", width: int | None 
         figure[top : top + len(block), MARGIN : MARGIN + width] = block
         top += len(block) + GAP
     return figure
+
+
+def in_the_way(path: Path) -> str | None:
+    """What is to be said, in one line, of a file where a picture would go that is none of ours; None where there is
+    none, or one of ours: with the mark, or, of before there was one (2026-11-27), a figure of `panel`."""
+    if not path.exists():
+        return None
+    try:
+        with Image.open(path, formats=["PNG"]) as picture:
+            ours = picture.info.get("Software") == MARK
+            former = picture.mode == "RGB" and not picture.info and _is_panel(np.asarray(picture))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        ours = former = False
+    return None if ours or former else f"{path}: expected a picture of lidarsynth to replace, found another"
+
+
+def _is_panel(rgb: np.ndarray) -> bool:
+    """Whether a picture (H, W, 3) has a margin as `panel` makes it, and no wider one at its sides."""
+    inner = rgb[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    outer = rgb.copy()
+    outer[MARGIN:-MARGIN, MARGIN:-MARGIN] = PAPER
+    sides = inner.size and all((inner[:, side] != PAPER).any() for side in (0, -1))
+    return bool(sides) and bool((outer == PAPER).all())
 
 
 def _row(row: list[Picture], width: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
 
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.whole_file import whole_file
@@ -14,6 +14,7 @@ from lidarsynth.pictures.colours import label_colours, point_colours, range_colo
 BACKGROUNDS: dict[str, tuple[int, int, int]] = {"dark": (16, 18, 24), "white": (255, 255, 255)}
 EMPTY = (16, 18, 24)  # colour of pixels without a return: dark, so that no colour of a return is close to it
 KNOWN, UNKNOWN = (235, 235, 235), (52, 56, 66)
+MARK = "lidarsynth"  # Software of our pictures, a text chunk of PNG
 ROW_SCALE = 3  # picture rows per beam: beams are a few times farther apart than columns
 
 
@@ -123,9 +124,12 @@ def _ego_marker(rgb: np.ndarray, size: int, background: str) -> np.ndarray:
 
 
 def save_png(path: str | Path, rgb: np.ndarray) -> Path:
-    """Writes (H, W, 3) uint8 as a PNG, whole or not at all; returns the path. Raises ValueError for other arrays."""
+    """Writes (H, W, 3) uint8 as a PNG with our mark, whole or not at all; returns the path. Raises ValueError for other
+    arrays."""
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
         raise ValueError(f"rgb must be (H, W, 3) uint8 with pixels, got {rgb.shape} {rgb.dtype}")
-    with whole_file(path) as scratch:
-        Image.fromarray(rgb).save(scratch, format="PNG", compress_level=3)  # as small as 6, in half the time
+    told = PngImagePlugin.PngInfo()
+    told.add_text("Software", MARK)
+    with whole_file(path) as scratch:  # level 3 is as small as 6, in half the time
+        Image.fromarray(rgb).save(scratch, format="PNG", pnginfo=told, compress_level=3)
     return Path(path)

@@ -26,6 +26,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import misfit
+from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.filling import Filling
@@ -131,6 +132,7 @@ class Result:
     errors    of hidden pixels by method, where a corruption was asked for
     cloud     for a bag
     beside    endings of what was written beside the target
+    picture   that was written, or None
     """
 
     name: str
@@ -145,6 +147,7 @@ class Result:
     errors: Mapping[str, Errors] = field(default_factory=dict)
     cloud: Cloud | None = None
     beside: tuple[str, ...] = ()
+    picture: Path | None = None
 
 
 def run(job: Job, works: Iterable[Work], workers: int = 1, model: ScanModel | None = None,
@@ -183,14 +186,18 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         warning = warning or _viewpoint_warning(job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
         warning = warning or _caution(loaded.scan, job, work)  # of what was made: not said where nothing is
-        cloud, beside = None, ()
+        cloud, beside, picture, other = None, (), None, None
         if work.target is None:
             points = _points(done, loaded, job.transform)
             fields = FIELDS.get(job.verb, message_fields)(points, loaded)
             told = loaded.published, loaded.sequence
             cloud = Cloud(loaded.stamp, loaded.frame_id, loaded.time, fields, *told)
         else:
+            if job.picture and (other := in_the_way(work.target.with_suffix(".png"))):
+                job = replace(job, picture=False)
+                other += "; it stays: use another --out, or --no-picture"
             beside = _store(work.target, work.item.path, done, loaded, job)
+            picture = work.target.with_suffix(".png") if job.picture else None
     except (ValueError, FloatingPointError) as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT):
             raise  # that is no fault of the scan, and the next ones would not fit either
@@ -201,8 +208,10 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, text)
     count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
+    warning = "; ".join(filter(None, (warning, other))) or None
     whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
-    return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud, beside)
+    return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud, beside,
+                  picture)  # fmt: skip
 
 
 def _of_any_sensor(model: ScanModel | None) -> bool:

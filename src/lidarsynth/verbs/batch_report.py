@@ -13,6 +13,7 @@ from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.verbs.batch import MEANT, Result
+from lidarsynth.verbs.earlier_results import read_report
 
 REPORT = "report.json"
 Shard = tuple[int, int]  # this part, counted from 1, and all parts
@@ -36,7 +37,7 @@ def report_path(out: Path, shard: Shard) -> Path:
 def check_same(out: Path, recipe: Mapping[str, Any]) -> None:
     """Raises ValueError where a report in the folder tells of results of another recipe: they are not to go on with."""
     for path in sorted(out.glob("report*.json")):
-        if (report := _read(path)) is None:
+        if (report := read_report(path)) is None:
             continue  # something else of the user's
         other = ", ".join(f"{name} {now} for {was}" for name, (now, was) in _unlike(report, recipe).items())
         other = other or ("scans of two settings" if "mixed" in report else "")
@@ -50,7 +51,7 @@ def same(path: Path, recipe: Mapping[str, Any], told: bool = True) -> bool:
 
     told  whether it has to say of each word what it meant; those of before 2026-11-26 do not
     """
-    report = _read(path) if path.is_file() else None
+    report = read_report(path) if path.is_file() else None
     if report is None or "recipe" not in report["settings"] or "mixed" in report or _unlike(report, recipe):
         return False
     return not told or all((name in recipe) == (name in report["settings"]["recipe"]) for name in MEANT.values())
@@ -58,37 +59,28 @@ def same(path: Path, recipe: Mapping[str, Any], told: bool = True) -> bool:
 
 def is_mixed(path: Path) -> bool:
     """Whether a report is of scans of several recipes."""
-    return "mixed" in (_read(path) or {})
+    return "mixed" in (read_report(path) or {})
 
 
 def shard_reports(out: Path) -> list[Path]:
     """Reports of the shards of a folder."""
-    return [path for path in sorted(out.glob("report-*-of-*.json")) if _read(path) is not None]
+    return [path for path in sorted(out.glob("report-*-of-*.json")) if read_report(path) is not None]
 
 
 def shards_at_work(out: Path) -> list[Path]:
     """Reports of those shards of a folder that are not done: at work, or killed."""
-    return [path for path in shard_reports(out) if "unfinished" in (_read(path) or {})]
+    return [path for path in shard_reports(out) if "unfinished" in (read_report(path) or {})]
 
 
 def check_no_other_whole(out: Path, recipe: Mapping[str, Any]) -> None:
     """Raises ValueError where a folder has the scans of a whole run of another recipe, among which a shard would put
     its own. Those of other shards are told when they are merged."""
     path = out / REPORT
-    report = _read(path) if path.is_file() else None
+    report = read_report(path) if path.is_file() else None
     if report is not None and "shards" not in report["settings"] and not same(path, recipe, told=False):
         unlike = ", ".join(f"{name} {now} for {was}" for name, (now, was) in _unlike(report, recipe).items())
         raise ValueError(f"{path}: expected no scans beside those of shards, or such as are asked for now, found those "
                          f"of a whole run of other settings: {unlike or 'several'}; name another --out")  # fmt: skip
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    """A report of many scans, or None."""
-    try:
-        report = read_json(path, LARGEST_INDEX)
-        return report if {"verb", "model"} <= report["settings"].keys() else None
-    except (ValueError, LookupError, TypeError, AttributeError):
-        return None
 
 
 def _unlike(report: Mapping[str, Any], recipe: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
@@ -112,7 +104,7 @@ def rows_before(paths: Sequence[Path], skipped: Sequence[Path]) -> list[dict[str
     that were made of them."""
     there, rows = set(map(str, skipped)), {}
     for path in paths:
-        found = ((_read(path) if path.is_file() else None) or {}).get("scans", [])
+        found = ((read_report(path) if path.is_file() else None) or {}).get("scans", [])
         rows |= {row["target"]: row for row in found if row.get("target") in there and "error" not in row}
     return list(rows.values())
 

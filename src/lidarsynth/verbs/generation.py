@@ -20,6 +20,7 @@ from lidarsynth.files.formats import WRITERS, write, write_labels
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep, write_whole
+from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.cascade.model import CascadeModel
@@ -83,12 +84,15 @@ def missing(folder: Path, count: int, endings: tuple[str, ...]) -> list[range]:
     """The scans of 0 .. count - 1 that lack a file, as runs of numbers in a row.
 
     endings  of a finished scan's files, such as (".ply", ".png")
+    Raises ValueError where a picture of theirs would replace one that is none of ours.
     """
     there = {path.name for path in folder.iterdir()}
     runs: list[range] = []
     for i in range(count):
         if all(f"{i:06d}{ending}" in there for ending in endings):
             continue
+        if ".png" in endings and (other := in_the_way(folder / f"{i:06d}.png")):
+            raise ValueError(f"{other}; use another --out, or --no-picture")
         if runs and runs[-1].stop == i:
             runs[-1] = range(runs[-1].start, i + 1)
         else:

@@ -6,6 +6,7 @@ import glob
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Protocol
 
@@ -14,7 +15,7 @@ import numpy as np
 from lidarsynth.data.bag_records import Message, cloud_of
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import by_number, scan_files
+from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
 from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
 from lidarsynth.files.formats import READERS, read_with_report, sensor_in
@@ -22,8 +23,10 @@ from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.verbs.earlier_results import EarlierResults, earlier_results
 
 NAMED = 3  # files of a pattern that are no scans
+MAGIC = "*?["  # of patterns
 
 
 @dataclass(frozen=True)
@@ -165,6 +168,7 @@ class Inputs:
     stream   gives them; from the start each time
     streams  whether bags or captures are among them
     passed   bags and captures that lie in a folder beside its scan files, which alone are read
+    below    scans below the output folder that are not read, though no report there tells of them
     cut      what is to be said, a line each, of bags that end early
     """
 
@@ -174,15 +178,18 @@ class Inputs:
     streams: bool
     passed: tuple[Path, ...] = ()
     cut: tuple[str, ...] = ()
+    below: tuple[Path, ...] = ()
 
 
-def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
-    """The scans of files, folders, globs, bags and captures. Raises ValueError where there is nothing to read, or
-    nothing that a topic or metadata could be of."""
+def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path | None = None) -> Inputs:
+    """The scans of files, folders, globs, bags and captures, without the results that lie in an output folder `out`.
+    Raises ValueError where there is nothing to read, or nothing that a topic or metadata could be of."""
     reading = reading or Reading()
     if not paths:
         raise ValueError("expected one scan or more, found none")
-    expanded = [found for path in paths for found in _expanded(path)]
+    expanded, below = _all_expanded(paths, earlier_results(out))
+    if not expanded:
+        raise ValueError(f"{out}: expected scans to read, found only what lies in this output folder; name another")
     streams = [path for path in expanded if is_stream(path)]
     if reading.topic is not None and not streams:
         raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
@@ -211,7 +218,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None) -> Inputs:
 
     folders_given = [path for path in paths if path.is_dir() and not is_bag(path) and not _is_scan(path)]
     inside = [p for folder in folders_given for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams]
-    return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)))
+    return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below)
 
 
 def is_stream(path: Path) -> bool:
@@ -219,21 +226,38 @@ def is_stream(path: Path) -> bool:
     return is_bag(path) or is_capture(path)
 
 
-def _expanded(path: Path) -> list[Path]:
-    """The path, the files of a folder, or those that a glob finds; bags in a folder come too."""
-    if not path.exists() and any(c in str(path) for c in "*?["):
+def _all_expanded(paths: Sequence[Path], earlier: EarlierResults | None) -> tuple[list[Path], tuple[Path, ...]]:
+    """What the paths stand for, without results of earlier runs, and scans as `Inputs.below`."""
+    parts = [_expanded(path, earlier) for path in paths]
+    found, below = ([path for part in parts for path in part[side]] for side in (0, 1))
+    if earlier is not None:
+        streams = {path for path in found if is_stream(path)}
+        scans, _ = earlier.parted([path for path in found if path not in streams], list(streams), None)
+        kept = streams.union(scans)
+        found = [path for path in found if path in kept]
+    return found, tuple(below)
+
+
+def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], list[Path]]:
+    """The path, the files of a folder, or those that a glob finds; bags in a folder come too. Beside them, scans as
+    `Inputs.below`."""
+    if not path.exists() and any(c in str(path) for c in MAGIC):
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        read = [p for p in found if _is_scan(p)] + sorted(filter(is_stream, found), key=by_number)
-        if not read:
+        scans, streams = [p for p in found if _is_scan(p)], sorted(filter(is_stream, found), key=by_number)
+        if not (scans or streams):
             others = ", ".join(p.name for p in found[:NAMED]) + (", ..." if found[NAMED:] else "")
             raise ValueError(f"{path}: expected scans, bags or captures of this pattern, found {others or 'none'}")
-        return read
+        fixed = Path(*takewhile(lambda part: not any(c in part for c in MAGIC), path.parts))
+        scans, below = earlier.parted(scans, streams, fixed) if earlier else (scans, [])
+        return scans + streams, below
     if path.is_dir() and not is_bag(path) and not _is_scan(path):
-        bags = sorted(filter(is_stream, path.iterdir()), key=by_number)
-        return bags if bags and not has_scans(path) else scan_files(path)
+        streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
+        scans = scans_below(path) if streams else scan_files(path)
+        scans, below = earlier.parted(scans, streams, path) if earlier else (scans, [])
+        return scans or streams, below
     if not (path.exists() or _is_scan(path) or is_stream(path)):
         raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
-    return [path]
+    return [path], []
 
 
 def _is_scan(path: Path) -> bool:
@@ -265,12 +289,6 @@ def _unlike(stems: list[str], files: list[Path]) -> list[str]:
         one, other = [path for name, path in zip(names, files, strict=True) if name == twice[0]][:2]
         raise ValueError(f"expected scans of different names, found two named {twice[0]}: {one} and {other}")
     return names
-
-
-def stem(path: Path) -> str:
-    """The name without the ending that tells the kind of file: a.b.pcd.bin -> a.b."""
-    endings = [suffix for suffix in READERS if path.name.lower().endswith(suffix)]
-    return path.name[: -max(map(len, endings))] if endings else path.stem
 
 
 def _stream_count(path: Path, reading: Reading, cut: list[str]) -> int | None:
