@@ -1,5 +1,6 @@
 """Files as users have them: other axes with rings, bags of one name, fields named like ours, times in odd units."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -104,6 +105,42 @@ def test_a_files_own_confidence_stays(scan: Scan, tmp_path: Path):
     filled = read(tmp_path / "b.pcd")
     old = filled.extra["new"] == 0
     assert sorted(filled.extra["file_confidence"][old]) == sorted(own) and (filled.extra["confidence"][old] == 1).all()
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".bag"])
+def test_fields_that_are_called_as_our_marks_and_are_none_stay(suffix: str, scan: Scan, tmp_path: Path):
+    own = {
+        "new": (np.arange(len(scan)) % 5).astype(np.float32),
+        "confidence": np.linspace(-4, 7, len(scan), dtype="f4"),
+    }
+    source, out = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    fields = dict(zip("xyz", scan.xyz.T, strict=True)) | {"intensity": scan.reflectance} | own
+    if suffix == ".bag":
+        with write_bag(source) as writer:
+            writer.write_cloud("/points", Cloud(0, "lidar", 0, fields))
+    else:
+        write(source, replace(scan, extra=own))
+    main(["complete", str(source), "--out", str(out), "--sensor", "hdl-32e", "--no-picture"])
+    if suffix == ".bag":
+        with open_bag(out) as opened:
+            (message,) = opened.messages(frozenset(["/points"]))
+            found = cloud_of(message).fields
+    else:
+        found = read(out).extra
+    old = found["new"] == 0
+    assert old.sum() == len(scan) and set(found["new"]) == {0, 1} and (found["confidence"][old] == 1).all()
+    for name, values in own.items():
+        np.testing.assert_array_equal(np.sort(found[f"file_{name}"][old]), np.sort(values))
+
+
+def test_each_scan_of_many_is_said_to_hold_points_that_were_filled_in(scan: Scan, tmp_path: Path):
+    (tmp_path / "in").mkdir()
+    for number in range(4):
+        write(tmp_path / "in" / f"{number}.pcd", replace(scan, extra={"new": (np.arange(len(scan)) < 7).astype("u1")}))
+    main(["complete", str(tmp_path / "in"), "--out", str(tmp_path / "o"), "--sensor", "hdl-32e", "--no-picture",
+          "--model", "nearest"])  # fmt: skip
+    rows = json.loads((tmp_path / "o" / "report.json").read_text())["scans"]
+    assert [row["warning"].count(f"found 7 of {len(scan)} that were filled in before") for row in rows] == [1] * 4
 
 
 def test_arrays_beside_a_table_are_its_points_too(scan: Scan, tmp_path: Path):

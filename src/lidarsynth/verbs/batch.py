@@ -24,7 +24,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution
+from lidarsynth.lidar.unseen import caution, filled_before
 from lidarsynth.lidar.view import misfit
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
@@ -182,7 +182,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         warning = warning or _viewpoint_warning(job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
-        warning = warning or _caution(loaded.scan, job, work)  # of what was made: not said where nothing is
+        warning = _cautioned(warning, loaded.scan, job, work)  # of what was made: not said where nothing is
         cloud, beside = None, ()
         if work.target is None:
             points = _points(done, loaded, job.transform)
@@ -252,12 +252,18 @@ def _viewpoint_warning(job: Job, work: Work) -> str | None:
     return text and f"{work.item.path}: {text}"
 
 
-def _caution(scan: Scan, job: Job, work: Work) -> str | None:
-    """What must be said of the points that are to be completed, in one line."""
-    if not work.check or job.verb not in ("complete", "upsample"):
-        return None
-    text = caution(scan, None if job.sensor is None else get_sensor(job.sensor))
-    return text and f"{work.item.path}: {text}"
+def _cautioned(warning: str | None, scan: Scan, job: Job, work: Work) -> str | None:
+    """The warning, and what must be said of the points that are to be completed, in one line: of each scan, how many
+    were filled in before; of those that are looked at and have no other warning, all that there is to say."""
+    if job.verb not in ("complete", "upsample"):
+        return warning
+    if work.check and warning is None:
+        text = caution(scan, None if job.sensor is None else get_sensor(job.sensor))
+    else:
+        text = filled_before(scan)
+    if text is None:
+        return warning
+    return f"{work.item.path if warning is None else warning}{': ' if warning is None else '; '}{text}"
 
 
 def _made(

@@ -20,6 +20,7 @@ from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, 
 from lidarsynth.files.formats import READERS, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
+from lidarsynth.lidar.marks import MARKS
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
@@ -355,6 +356,9 @@ def message_fields(filled: Scan, loaded: Loaded) -> Fields:
         order = np.flatnonzero(old)[np.argsort(azimuth[old])]
         nearest = np.searchsorted(azimuth[order], azimuth[new]).clip(0, len(order) - 1)
         fields[name][new] = fields[name][order[nearest]]
+    for word in sorted(filled.extra.keys() - fields.keys() - {*MARKS}):
+        if (name := word.replace("file_", "")) in MARKS:  # which are none of ours
+            fields[word] = fields.pop(name)
     more = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
     if filled.label is not None and "label" not in fields:
         more["label"] = filled.label.astype(np.uint8)
