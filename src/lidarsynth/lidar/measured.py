@@ -47,7 +47,8 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
         extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)])
                for name, values in _kept(scan, own).items()}
         | {"new": np.concatenate([were_new(scan), np.ones(len(new), np.uint8)])}
-        | {name: np.concatenate([confidences(scan), values]) for name, values in new.extra.items()},
+        | {name: np.concatenate([confidences(scan), values])
+           for name, values in new.extra.items() if name == "confidence"},
     )  # fmt: skip
     return both[order]
 
