@@ -30,7 +30,7 @@ from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.notes import IN_PYTHON
-from lidarsynth.verbs.companions import LABEL, check_companions
+from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
@@ -325,11 +325,13 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
         if target.suffix.lower() in BARE:
             beside = tuple(f".{name}" for name in BESIDE if name in placed.extra)
-            beside += (LABEL,) if job.labels or "raw_label" in placed.extra else ()
-        check_companions(target, source, beside)  # again: only the points tell of raw labels in a .ply
+            beside += (LABEL,) if placed.label is not None or "raw_label" in placed.extra else ()
+        check_companions(target, source, beside)  # again: only the points tell of labels in a .ply
         if LABEL in beside:
             label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
+        else:
+            check_labels(target)
         content = without_places(placed)
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
