@@ -143,6 +143,29 @@ def test_each_scan_of_many_is_said_to_hold_points_that_were_filled_in(scan: Scan
     assert [row["warning"].count(f"found 7 of {len(scan)} that were filled in before") for row in rows] == [1] * 4
 
 
+def test_marks_that_do_not_fit_are_said_by_every_verb(scan: Scan, tmp_path: Path, capsys: Capture):
+    source, count = tmp_path / "in" / "a.bin", len(scan)
+    source.parent.mkdir()
+    marks = {"new": np.ones(count, np.uint8), "confidence": np.full(count, 0.5, np.float32)}
+    write(source, replace(scan, extra=marks))
+    for name, size in (("new", 1), ("confidence", 4)):
+        beside = source.with_suffix(f".{name}")
+        beside.write_bytes(beside.read_bytes()[:-1])
+        assert beside.stat().st_size == size * count - 1
+    said = (
+        f"a.new left out: expected {count} bytes for {count} points, found {count - 1} bytes; a.confidence left out: "
+    )
+    said += f"expected {4 * count} bytes for {count} points, found {4 * count - 1} bytes"
+    main(["info", str(source)])
+    assert f"beside       {said}\n" in capsys.readouterr().out
+    for verb, words in (("complete", ["--model", "nearest"]), ("project", []), ("label", []), ("realise", [])):
+        main([verb, str(source), "--out", str(tmp_path / "o.npz"), "--sensor", "hdl-32e", "--no-picture", *words])
+        assert f"lidarsynth: {source}: {said}\n" in capsys.readouterr().err
+    main(["complete", str(source.parent), "--out", str(tmp_path / "o"), "--model", "nearest", "--no-picture"])
+    (row,) = json.loads((tmp_path / "o" / "report.json").read_text())["scans"]
+    assert row["warning"] == f"{source}: {said}"
+
+
 def test_arrays_beside_a_table_are_its_points_too(scan: Scan, tmp_path: Path):
     ring = np.asarray(ringed(scan).ring, np.uint8)
     np.savez(tmp_path / "a.npz", points=scan.xyz, intensity=scan.reflectance, ring=ring, beam_id=ring * 2)

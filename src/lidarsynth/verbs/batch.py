@@ -182,7 +182,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         warning = warning or _viewpoint_warning(job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
-        warning = _cautioned(warning, loaded.scan, job, work)  # of what was made: not said where nothing is
+        more = loaded.left_out, _caution(loaded.scan, job, work, alone=warning is None)
+        warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside = None, ()
         if work.target is None:
             points = _points(done, loaded, job.transform)
@@ -252,18 +253,22 @@ def _viewpoint_warning(job: Job, work: Work) -> str | None:
     return text and f"{work.item.path}: {text}"
 
 
-def _cautioned(warning: str | None, scan: Scan, job: Job, work: Work) -> str | None:
-    """The warning, and what must be said of the points that are to be completed, in one line: of each scan, how many
-    were filled in before; of those that are looked at and have no other warning, all that there is to say."""
+def _caution(scan: Scan, job: Job, work: Work, alone: bool) -> str | None:
+    """What must be said of the points that are to be completed: of each scan, how many were filled in before; of those
+    that are looked at, and of which nothing else is said (`alone`), all that there is to say."""
     if job.verb not in ("complete", "upsample"):
-        return warning
-    if work.check and warning is None:
-        text = caution(scan, None if job.sensor is None else get_sensor(job.sensor))
-    else:
-        text = filled_before(scan)
-    if text is None:
-        return warning
-    return f"{work.item.path if warning is None else warning}{': ' if warning is None else '; '}{text}"
+        return None
+    if not (work.check and alone):
+        return filled_before(scan)
+    return caution(scan, None if job.sensor is None else get_sensor(job.sensor))
+
+
+def _in_one_line(path: Path, warning: str | None, *more: str | None) -> str | None:
+    """A warning that begins with the path of its scan, and what else is to be said of that."""
+    text = "; ".join(text for text in more if text is not None)
+    if warning is None:
+        return f"{path}: {text}" if text else None
+    return f"{warning}; {text}" if text else warning
 
 
 def _made(

@@ -17,7 +17,7 @@ from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
-from lidarsynth.files.formats import READERS, read_with_report, sensor_in
+from lidarsynth.files.formats import READERS, marks_left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
@@ -63,6 +63,7 @@ class Loaded:
     scale    what a reflectance of 1 is in the intensities of a message
     stamp, frame_id, time, published, sequence  of a message, as of a `Cloud`
     sensor   of a range image, whose points were not moved and are on all of its beams; else None
+    left_out  what is to be said of files beside it that do not fit, or None
     """
 
     scan: Scan
@@ -75,6 +76,7 @@ class Loaded:
     published: int | None = None
     sequence: int = 0
     sensor: Sensor | None = None
+    left_out: str | None = None
 
 
 class Input(Protocol):
@@ -100,7 +102,8 @@ class FileInput:
         words = label_path(self.path) if self.reading.labels else None
         words = words if words is not None and words.is_file() else None
         read = read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings)
-        return replace(_loaded(*read, self.reading), sensor=None if self.reading.moves else sensor_in(self.path))
+        sensor, left_out = None if self.reading.moves else sensor_in(self.path), marks_left_out(self.path, *read)
+        return replace(_loaded(*read, self.reading), sensor=sensor, left_out="; ".join(left_out) or None)
 
 
 @dataclass(frozen=True)
