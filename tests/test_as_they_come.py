@@ -1,5 +1,6 @@
 """Files as users have them: other axes with rings, bags of one name, fields named like ours, times in odd units."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -104,6 +105,65 @@ def test_a_files_own_confidence_stays(scan: Scan, tmp_path: Path):
     filled = read(tmp_path / "b.pcd")
     old = filled.extra["new"] == 0
     assert sorted(filled.extra["file_confidence"][old]) == sorted(own) and (filled.extra["confidence"][old] == 1).all()
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".bag"])
+def test_fields_that_are_called_as_our_marks_and_are_none_stay(suffix: str, scan: Scan, tmp_path: Path):
+    own = {
+        "new": (np.arange(len(scan)) % 5).astype(np.float32),
+        "confidence": np.linspace(-4, 7, len(scan), dtype="f4"),
+    }
+    source, out = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    fields = dict(zip("xyz", scan.xyz.T, strict=True)) | {"intensity": scan.reflectance} | own
+    if suffix == ".bag":
+        with write_bag(source) as writer:
+            writer.write_cloud("/points", Cloud(0, "lidar", 0, fields))
+    else:
+        write(source, replace(scan, extra=own))
+    main(["complete", str(source), "--out", str(out), "--sensor", "hdl-32e", "--no-picture"])
+    if suffix == ".bag":
+        with open_bag(out) as opened:
+            (message,) = opened.messages(frozenset(["/points"]))
+            found = cloud_of(message).fields
+    else:
+        found = read(out).extra
+    old = found["new"] == 0
+    assert old.sum() == len(scan) and set(found["new"]) == {0, 1} and (found["confidence"][old] == 1).all()
+    for name, values in own.items():
+        np.testing.assert_array_equal(np.sort(found[f"file_{name}"][old]), np.sort(values))
+
+
+def test_each_scan_of_many_is_said_to_hold_points_that_were_filled_in(scan: Scan, tmp_path: Path):
+    (tmp_path / "in").mkdir()
+    for number in range(4):
+        write(tmp_path / "in" / f"{number}.pcd", replace(scan, extra={"new": (np.arange(len(scan)) < 7).astype("u1")}))
+    main(["complete", str(tmp_path / "in"), "--out", str(tmp_path / "o"), "--sensor", "hdl-32e", "--no-picture",
+          "--model", "nearest"])  # fmt: skip
+    rows = json.loads((tmp_path / "o" / "report.json").read_text())["scans"]
+    assert [row["warning"].count(f"found 7 of {len(scan)} that were filled in before") for row in rows] == [1] * 4
+
+
+def test_marks_that_do_not_fit_are_said_by_every_verb(scan: Scan, tmp_path: Path, capsys: Capture):
+    source, count = tmp_path / "in" / "a.bin", len(scan)
+    source.parent.mkdir()
+    marks = {"new": np.ones(count, np.uint8), "confidence": np.full(count, 0.5, np.float32)}
+    write(source, replace(scan, extra=marks))
+    for name, size in (("new", 1), ("confidence", 4)):
+        beside = source.with_suffix(f".{name}")
+        beside.write_bytes(beside.read_bytes()[:-1])
+        assert beside.stat().st_size == size * count - 1
+    said = (
+        f"a.new left out: expected {count} bytes for {count} points, found {count - 1} bytes; a.confidence left out: "
+    )
+    said += f"expected {4 * count} bytes for {count} points, found {4 * count - 1} bytes"
+    main(["info", str(source)])
+    assert f"beside       {said}\n" in capsys.readouterr().out
+    for verb, words in (("complete", ["--model", "nearest"]), ("project", []), ("label", []), ("realise", [])):
+        main([verb, str(source), "--out", str(tmp_path / "o.npz"), "--sensor", "hdl-32e", "--no-picture", *words])
+        assert f"lidarsynth: {source}: {said}\n" in capsys.readouterr().err
+    main(["complete", str(source.parent), "--out", str(tmp_path / "o"), "--model", "nearest", "--no-picture"])
+    (row,) = json.loads((tmp_path / "o" / "report.json").read_text())["scans"]
+    assert row["warning"] == f"{source}: {said}"
 
 
 def test_arrays_beside_a_table_are_its_points_too(scan: Scan, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import pytest
 
 import lidarsynth as ls
 from lidarsynth.cli.outcomes import named_failure
+from lidarsynth.files.arrays import IMAGE
 from lidarsynth.files.fields import PLACE, FileError, written_names
-from lidarsynth.files.formats import read, write
+from lidarsynth.files.formats import read, read_image, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.unseen import caution, widest_gap
 from lidarsynth.streets.reader import SyntheticStreets
@@ -74,6 +76,35 @@ def test_points_that_were_filled_in_stay_so(street: Scan):
     doubted = (once.extra["new"] == 1) & (once.extra["confidence"] < 0.8)
     gone = {point.tobytes() for point in once.xyz[doubted]}
     assert gone and not gone & {point.tobytes() for point in kept.xyz}
+
+
+@pytest.mark.parametrize("word", ["default", "nearest"])
+def test_points_that_were_filled_in_stay_so_in_the_file_of_an_image(word: str, street: Scan, tmp_path: Path):
+    """Also in one of before, which has no `new`."""
+    image = ls.load(word).complete(replace(street[::3], extra={}))
+    write(tmp_path / "a.npz", image)
+    whole = read_image(tmp_path / "a.npz")
+    said = {name: getattr(whole, name) for name in IMAGE if name != "new"}
+    said = {name: part for name, part in said.items() if part is not None}
+    np.savez(tmp_path / "b.npz", sensor=json.dumps(whole.sensor.to_dict()), **said)
+    filled, sure = image.mask & ~image.xyz.any(axis=-1), image.confidence
+    assert (ls.load(word).complete(whole).new >= filled).all()
+    for path in (tmp_path / "a.npz", tmp_path / "b.npz"):
+        once = read(path)
+        np.testing.assert_array_equal(once.extra["new"], filled[image.mask])
+        if sure is not None:
+            np.testing.assert_array_equal(once.extra["confidence"], sure[image.mask])
+        with pytest.warns(UserWarning, match=f"found {filled.sum()} of {len(once)} that were filled in before"):
+            twice, up = ls.load(word).complete(once), ls.load(word).upsample(once, times=2)
+        write(tmp_path / "c.npz", twice)
+        for again in (twice.to_scan(), up.to_scan(), read(tmp_path / "c.npz")):
+            marks = dict(zip(map(bytes, again.xyz), again.extra["new"], strict=True))
+            assert all(marks[bytes(point)] == new for point, new in zip(once.xyz, once.extra["new"], strict=True))
+
+
+def test_an_image_without_filled_pixels_has_no_marks(street: Scan, tmp_path: Path):
+    write(tmp_path / "a.npz", ls.project(replace(street, extra={}), "vlp-16"))
+    assert read_image(tmp_path / "a.npz").new is None and "new" not in read(tmp_path / "a.npz").extra
 
 
 def test_names_that_files_can_hold():

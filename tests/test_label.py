@@ -92,6 +92,38 @@ def test_labels_of_the_source_are_never_replaced(place: Path, capsys: pytest.Cap
     assert sorted(Path("d").iterdir()) == sorted([source, Path("d/odo.label")])
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["complete d/odo.bin --out o/a.npy", "complete d/odo.ply --out o/a.bin", "upsample d --out o --format bin",
+     "complete d/odo.bin --out d/odo.npy"],
+)  # fmt: skip
+def test_labels_of_other_points_are_not_taken_for_those_of_new_files(
+    words: str, place: Path, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("d", "o"):
+        Path(name).mkdir()
+    write("d/odo.ply" if "ply" in words else "d/odo.bin", replace(perfect(SMALL), ring=None, label=None))
+    labels = Path("d/odo.label" if "d/odo.npy" in words else "o/a.label" if "/a." in words else "o/odo.label")
+    labels.write_bytes(b"mine")
+    before = sorted(Path().rglob("*"))
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), *(word.replace("--sensor", "--from") if "upsample" in words else word for word in WORDS)])
+    line = capsys.readouterr().err.split("\r")[-1]
+    assert f"expected a name without the labels of other points beside it, found {labels}\n" in line
+    assert end.value.code == 2 and line.count("\n") == 1
+    assert labels.read_bytes() == b"mine" and sorted(Path().rglob("*")) == before
+
+
+def test_classes_of_a_file_are_labels_beside_its_new_one(place: Path, capsys: pytest.CaptureFixture[str]):
+    write("a.ply", replace(perfect(SMALL), ring=None))
+    main(["complete", "a.ply", "--out", "b.npy", *WORDS])
+    assert "wrote b.npy, with .new, .label beside it\n" in capsys.readouterr().out
+    Path("a.label").write_bytes(b"mine")
+    with pytest.raises(SystemExit):
+        main(["complete", "a.ply", "--out", "a.npy", *WORDS])
+    assert "expected a name whose .label is not that of a.ply" in capsys.readouterr().err
+
+
 def test_what_a_former_run_wrote_beside_is_replaced(place: Path, capsys: pytest.CaptureFixture[str]):
     write("odo.bin", replace(perfect(SMALL), ring=None, label=None)[np.arange(6144) % 2 == 0])
     for words in (

@@ -219,6 +219,7 @@ IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least an
     "label": ("iu", 0, 19),
     "xyz": ("f", -MAX_METRES, MAX_METRES),
     "confidence": ("f", 0, 1),
+    "new": ("biu", 0, 1),
 }
 
 
@@ -240,7 +241,8 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
         xyz = arrays["xyz"].astype(np.float32) if "xyz" in arrays else None
         sure = arrays["confidence"].astype(np.float32) if "confidence" in arrays else None
         numbers = arrays["range"].astype(np.float32), arrays["reflectance"].astype(np.float32)
-        return RangeImage(*numbers, mask, from_dict(values), label, xyz, confidence=sure)
+        new = arrays["new"].astype(bool) if "new" in arrays else _filled_in(mask, xyz, sure)
+        return RangeImage(*numbers, mask, from_dict(values), label, xyz, confidence=sure, new=new)
     except FileError:
         raise
     except (ValueError, TypeError, RecursionError) as error:
@@ -255,6 +257,17 @@ def _sensor_table(text: str) -> Any:
         return json.loads(text)
     except ValueError:
         raise FileError(f"expected a sensor's fields as JSON, or its word, found {text!r:.60}") from None
+
+
+def _filled_in(mask: np.ndarray, xyz: np.ndarray | None, sure: np.ndarray | None) -> np.ndarray | None:
+    """(H, W) bool, which pixels were filled in, of a file that does not say so, as those of before 2026-11-28: such as
+    are not sure, or have no measured point where others have one; None where there are none."""
+    new = np.zeros_like(mask)
+    if sure is not None and sure.shape == mask.shape:
+        new |= mask & (sure < 1)
+    if xyz is not None and xyz.shape == (*mask.shape, 3):
+        new |= mask & ~xyz.any(axis=-1)
+    return new if new.any() else None
 
 
 def _checked(name: str, array: np.ndarray, returned: np.ndarray) -> np.ndarray:

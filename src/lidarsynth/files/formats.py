@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -65,8 +66,11 @@ def read(
     labels: str | Path | None = None,
     rings: tuple[int, int] | None = None,
 ) -> Scan:
-    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`."""
-    return read_with_report(path, intensity, labels, rings=rings)[0]
+    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`. Warns of marks that do not fit."""
+    scan, dropped = read_with_report(path, intensity, labels, rings=rings)
+    for line in marks_left_out(path, scan, dropped):
+        warnings.warn(f"{path}: {line}", stacklevel=2)
+    return scan
 
 
 def read_with_report(
@@ -85,7 +89,8 @@ def read_with_report(
     labels     a SemanticKITTI `.label` file with one word per point of the file
     words      likewise, of any ids, which are kept as they are in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last to read, as the file numbers them; None = all
-    Of `.bin` and `.npy`, `new` and `confidence` come from the files that `write` puts beside them, where these fit.
+    Of `.bin` and `.npy`, `new` and `confidence` come from the files that `write` puts beside them, where these fit;
+    `marks_left_out` says where they do not.
     Ring, time and label are kept where the file has them under a usual name (`fields.NAMES`), other fields as `extra`.
     Raises FileError, a ValueError of one line "path: expected ..., found ...".
     """
@@ -233,6 +238,18 @@ def _marks_beside(path: Path, count: int) -> Fields:
     marks = {name: path.with_suffix(f".{name}") for name in BESIDE}
     fit = {n: p for n, p in marks.items() if p.is_file() and p.stat().st_size == count * BESIDE[n].itemsize > 0}
     return {name: np.fromfile(place, BESIDE[name]) for name, place in fit.items()}
+
+
+def marks_left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:
+    """What is to be said of marks beside a file that do not fit its scan, which lost `dropped` points, a line each."""
+    lines, count = [], len(scan) + dropped
+    for name, kind in BESIDE.items() if _is_bare(path) else ():
+        if (
+            marks := Path(path).with_suffix(f".{name}")
+        ).is_file() and name not in scan.extra:  # those that fit are read
+            lines.append(f"{marks.name} left out: expected {count * kind.itemsize} bytes for {count} points, "
+                         f"found {marks.stat().st_size} bytes")  # fmt: skip
+    return lines
 
 
 def _without_marks(path: Path, scan: Scan) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidarsynth.lidar.marks import MARKS, confidences, marks_of, were_new
 from lidarsynth.lidar.projection import Pixels
 from lidarsynth.lidar.recognition import elevations_of
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -17,17 +18,15 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
     pixels  of the scan's points in the image
 
     Points come row by row, each row from behind over the left; `ring` is the row. Those above or below the view come
-    last, with the ring of the first or last row. A scan without reflectance takes that of its pixels. Every further
-    field of the scan stays with its points, so do its rings where they are not the rows; new ones have 0 there, the
-    label of their pixel, and the time of the points measured in their direction. Labels of a filled image are those of
-    measured points too, where the scan has none. `extra["new"]` is 1 for new points, and for those that were new in
-    the scan; where the image has `confidence`, measured points have 1, those what they had.
+    last, with the ring of the first or last row. Every further field of the scan stays with its points, so do its rings
+    where they are not the rows; new ones have 0 there, the label of their pixel, and the time of the points measured in
+    their direction. Labels of a filled image are those of measured points too, where the scan has none. `extra["new"]`
+    is 1 for new points, and for those that were new in the scan; where the image has `confidence`, measured points have
+    1, those what they had.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row, column = pixels
-    reflectance, label = scan.reflectance, scan.label
-    if not reflectance.any():
-        reflectance = np.where(row >= 0, filled.reflectance[row, column], reflectance)
+    label = scan.label
     if label is None and filled.label is not None:
         label = np.where(row >= 0, filled.label[row, column], 0)
     assert new.ring is not None
@@ -39,35 +38,29 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
     order = np.argsort(10.0 * place - azimuth, kind="stable")  # by ring, then azimuth: a turn is less than 10
     both = Scan(
         xyz,
-        np.concatenate([reflectance, new.reflectance]),
+        np.concatenate([scan.reflectance, new.reflectance]),
         ring=ring,
         time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
         label=_labels(label, new),
         extra={name: np.concatenate([values, np.zeros(len(new), values.dtype)])
                for name, values in _kept(scan, own).items()}
         | {"new": np.concatenate([were_new(scan), np.ones(len(new), np.uint8)])}
-        | {name: np.concatenate([_sure(scan), values]) for name, values in new.extra.items()},
+        | {name: np.concatenate([confidences(scan), values])
+           for name, values in new.extra.items() if name == "confidence"},
     )  # fmt: skip
     return both[order]
 
 
-def were_new(scan: Scan) -> np.ndarray:
-    """(N,) uint8: 1 for points that the scan says were filled in, 0 for measured ones."""
-    return (scan.extra["new"] != 0).astype(np.uint8) if "new" in scan.extra else np.zeros(len(scan), np.uint8)
-
-
-def _sure(scan: Scan) -> np.ndarray:
-    """(N,) float32 confidences of a scan's own points: 1, or what was said of those that were filled in."""
-    said = scan.extra.get("confidence")
-    return np.where(were_new(scan) > 0, 1 if said is None else said, 1).astype(np.float32)
-
-
 def _kept(scan: Scan, row: np.ndarray) -> dict[str, np.ndarray]:
-    """The further fields of a scan, and its rings where they are not the rows and no field has them as they were. A
-    confidence that is not of filled points is something else of the file's."""
+    """The further fields of a scan, and its rings where they are not the rows and no field has them as they were. What
+    bears the name of a mark and is none is something else of the file's."""
     said = scan.ring is not None and not {"ring", "file_ring"} & set(scan.extra) and (scan.ring != row).any()
-    theirs = {"confidence"} if "new" not in scan.extra else set()
-    kept = {f"file_{name}" if name in theirs else name: values for name, values in scan.extra.items()}
+    theirs, kept = set(MARKS) - marks_of(scan).keys(), {}
+    for name, values in scan.extra.items():
+        word = f"file_{name}" if name in theirs else name
+        while word != name and word in scan.extra:
+            word = f"file_{word}"
+        kept[word] = values
     return {**kept, **({"ring": scan.ring} if said else {})}  # type: ignore[dict-item]
 
 

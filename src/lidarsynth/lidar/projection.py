@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.lidar.marks import confidences, marks_of
 from lidarsynth.lidar.recognition import first_row
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
@@ -102,7 +103,9 @@ def thin(
     grid = np.ix_(rows, _kept(image.shape[1], width, resizing))
     label = None if image.label is None else image.label[grid]
     xyz = None if image.xyz is None else image.xyz[grid]
-    return RangeImage(image.range[grid], image.reflectance[grid], image.mask[grid], sensor, label, xyz)
+    sure, new = (None if part is None else part[grid] for part in (image.confidence, image.new))
+    kept = image.range[grid], image.reflectance[grid], image.mask[grid]
+    return RangeImage(*kept, sensor, label, xyz, confidence=sure, new=new)
 
 
 def _kept(size: int, smaller: int, resizing: str) -> np.ndarray:
@@ -284,6 +287,7 @@ def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray, insi
         canvas[hit] = values.take(point, axis=0)
         return canvas.reshape(*shape, *values.shape[1:])
 
+    marks = marks_of(scan)
     return RangeImage(
         range=image(depth, np.float32),
         reflectance=image(scan.reflectance, np.float32),
@@ -291,4 +295,6 @@ def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray, insi
         sensor=sensor,
         label=None if scan.label is None else image(scan.label, np.int64),
         xyz=image(scan.xyz, np.float32),
+        confidence=image(confidences(scan), np.float32) if "confidence" in marks else None,
+        new=image(marks["new"], np.bool_) if marks else None,
     )

@@ -208,6 +208,7 @@ class RangeImage:
     completed    every point of the scan that was completed to this image, bit by bit, with the new ones, or None
     confidence   (H, W) float32 in [0, 1]: of a filled pixel the estimated chance that its ray returns, and from no
                  farther than 0.3 m + 2 % from the pixel's range; 1 where measured. None where the model gives none
+    new          (H, W) bool: of a completed image, which of its pixels were filled in, now or before; or None
     surface      (H, W) float32, metres: of virtual streets, where exactly each ray meets something, whether it returned
                  or not, 0 for nothing; or None. It is not saved
 
@@ -226,18 +227,20 @@ class RangeImage:
     completed: Scan | None = None
     confidence: np.ndarray | None = None
     surface: np.ndarray | None = None
+    new: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "sensor", get_sensor(self.sensor))
         shape = (self.sensor.height, self.sensor.width)
-        for name in ("range", "reflectance", "mask", "label", "confidence", "surface"):
+        for name in ("range", "reflectance", "mask", "label", "confidence", "surface", "new"):
             value = getattr(self, name)
             if value is not None and not isinstance(value, np.ndarray):
                 raise ValueError(f"{name} must be an array, got a {type(value).__name__}")
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} must be {shape}, the sensor's beams and columns, got {value.shape}")
-        if self.mask.dtype != np.bool_:
-            raise ValueError(f"mask must be bool, got {self.mask.dtype}")
+        for name, marked in (("mask", self.mask), ("new", self.new)):
+            if marked is not None and marked.dtype != np.bool_:
+                raise ValueError(f"{name} must be bool, got {marked.dtype}")
         if self.xyz is not None and np.shape(self.xyz) != (*shape, 3):
             raise ValueError(f"xyz must be {(*shape, 3)}, got {np.shape(self.xyz)}")
         for name in ("range", "reflectance", "xyz", "confidence", "surface"):
@@ -256,7 +259,9 @@ class RangeImage:
     def __repr__(self) -> str:
         """One line: sensor, size, how many pixels are measured, how far away, and what else there is."""
         has = ["reflectance"] * bool(self.reflectance.any())
-        has += [n for n in ("label", "xyz", "completed", "confidence", "surface") if getattr(self, n) is not None]
+        has += [
+            n for n in ("label", "xyz", "completed", "confidence", "surface", "new") if getattr(self, n) is not None
+        ]
         count = f"{np.count_nonzero(self.mask):,} measured{_span(self.range[self.mask])}"
         return f"RangeImage({', '.join([self.sensor.name, '{} x {}'.format(*self.shape), count, *has])})"
 
@@ -276,9 +281,10 @@ class RangeImage:
         if self.completed is not None:
             return self.completed
         chosen = np.flatnonzero(self.mask)
-        kept = (self.reflectance, self.label, self.confidence)
-        shade, label, sure = (None if values is None else values.reshape(-1).take(chosen) for values in kept)
-        extra = {} if sure is None else {"confidence": sure}
+        kept = (self.reflectance, self.label, self.confidence, self.new)
+        shade, label, sure, new = (None if values is None else values.reshape(-1).take(chosen) for values in kept)
+        extra = {} if new is None else {"new": new.astype(np.uint8)}
+        extra |= {} if sure is None else {"confidence": sure}
         assert shade is not None
         return Scan(self._points_of(chosen), shade, chosen // self.sensor.width, None, label, extra)
 
@@ -324,4 +330,5 @@ class RangeImage:
             xyz=xyz,
             completed=None,
             confidence=None if self.confidence is None else np.where(mask, self.confidence, zero),
+            new=None if self.new is None else mask & self.new,
         )

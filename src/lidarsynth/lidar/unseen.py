@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidarsynth.lidar.columns import own_columns
-from lidarsynth.lidar.measured import were_new
+from lidarsynth.lidar.marks import were_new
 from lidarsynth.lidar.own_beams import stray_rings
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.scan import Scan
@@ -22,10 +22,7 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
 
     sensor  that it is said to be of; of one that was recognised, beams are taken where the scan has them
     """
-    said = []
-    if before := int(were_new(scan).sum()):
-        said.append(f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): "
-                    "they are taken as they are, and stay marked")  # fmt: skip
+    said = [] if (before := filled_before(scan)) is None else [before]
     if 0 < len(scan) < SPARSE:
         said.append(f"expected a turn of a sensor, found {plural(len(scan), 'point')}: most of what is put between is "
                     "a guess; of default's a least confidence of 0.5 leaves most out")  # fmt: skip
@@ -40,6 +37,14 @@ def caution(scan: Scan, sensor: Sensor | None = None) -> str | None:
         said.append(f"expected {sensor.width} columns, as {sensor.name} has, found {found}: what lies between them is "
                     "filled in, too; learn the sensor, or leave out a known one's name")  # fmt: skip
     return "; ".join(said) or None
+
+
+def filled_before(scan: Scan) -> str | None:
+    """That a scan holds points that were filled in, and how many, in one line; or None."""
+    if not (before := int(were_new(scan).sum())):
+        return None
+    return (f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): they are "
+            "taken as they are, and stay marked")  # fmt: skip
 
 
 def _never_seen(sensor: Sensor | None) -> float:

@@ -15,16 +15,17 @@ FEW = 3  # beams that may be apart by chance
 
 def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, np.ndarray]:
     """A scan's own image as every `times`-th row of a denser sensor's, and which pixels were looked at: those rows."""
-    shape = (sensor.height, sensor.width)
-    metres, shade, mask = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
-    metres[::times], shade[::times], mask[::times] = sparse.range, sparse.reflectance, sparse.mask
-    known = np.zeros(shape, bool)
+
+    def rows(values: np.ndarray) -> np.ndarray:
+        whole = np.zeros((sensor.height, *values.shape[1:]), values.dtype)
+        whole[::times] = values
+        return whole
+
+    known = np.zeros((sensor.height, sensor.width), bool)
     known[::times] = (sparse.mask.mean(1) > ANSWERS)[:, None]  # a beam that hardly answers may not be there
-    xyz = None
-    if sparse.xyz is not None:
-        xyz = np.zeros((*shape, 3), np.float32)
-        xyz[::times] = sparse.xyz
-    return RangeImage(metres, shade, mask, sensor, xyz=xyz), known
+    xyz, sure, new = (None if part is None else rows(part) for part in (sparse.xyz, sparse.confidence, sparse.new))
+    kept = rows(sparse.range), rows(sparse.reflectance), rows(sparse.mask)
+    return RangeImage(*kept, sensor, xyz=xyz, confidence=sure, new=new), known
 
 
 def beam_step(sparse: RangeImage) -> tuple[int, int]:

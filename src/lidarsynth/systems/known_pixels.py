@@ -53,12 +53,15 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
 
 
 def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_reflectance: bool) -> RangeImage:
-    """The filled image with every known pixel replaced by its measurement, bit by bit, of the sensor that measured."""
+    """The filled image with every known pixel replaced by its measurement, bit by bit, of the sensor that measured.
+    What was filled in before stays so, with the confidence that it had."""
     measured = known & image.mask
     mask = np.where(known, image.mask, filled.mask)
     reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
     points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
-    sure = None if filled.confidence is None else np.where(known, np.float32(1), filled.confidence)
+    before = np.zeros_like(mask) if image.new is None else measured & image.new
+    said = np.float32(1) if image.confidence is None else np.where(before, image.confidence, np.float32(1))
+    sure = None if filled.confidence is None else np.where(known, said, filled.confidence)
     return RangeImage(
         range=np.where(known, np.where(image.mask, image.range, np.float32(0)), filled.range).astype(np.float32),
         reflectance=np.where(mask, reflectance, 0).astype(np.float32),
@@ -67,4 +70,5 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
         label=None if filled.label is None else np.where(mask, filled.label, 0),
         xyz=points,
         confidence=sure,
+        new=np.where(known, before, mask),
     )

@@ -24,14 +24,14 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution
+from lidarsynth.lidar.unseen import caution, filled_before
 from lidarsynth.lidar.view import misfit
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.notes import IN_PYTHON
-from lidarsynth.verbs.companions import LABEL, check_companions
+from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
@@ -185,7 +185,8 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         warning = warning or _viewpoint_warning(job, work)
         done, note = _made(job, model, work, loaded.scan, on_step)
-        warning = warning or _caution(loaded.scan, job, work)  # of what was made: not said where nothing is
+        more = loaded.left_out, _caution(loaded.scan, job, work, alone=warning is None)
+        warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside, picture, other = None, (), None, None
         if work.target is None:
             points = _points(done, loaded, job.transform)
@@ -261,12 +262,22 @@ def _viewpoint_warning(job: Job, work: Work) -> str | None:
     return text and f"{work.item.path}: {text}"
 
 
-def _caution(scan: Scan, job: Job, work: Work) -> str | None:
-    """What must be said of the points that are to be completed, in one line."""
-    if not work.check or job.verb not in ("complete", "upsample"):
+def _caution(scan: Scan, job: Job, work: Work, alone: bool) -> str | None:
+    """What must be said of the points that are to be completed: of each scan, how many were filled in before; of those
+    that are looked at, and of which nothing else is said (`alone`), all that there is to say."""
+    if job.verb not in ("complete", "upsample"):
         return None
-    text = caution(scan, None if job.sensor is None else get_sensor(job.sensor))
-    return text and f"{work.item.path}: {text}"
+    if not (work.check and alone):
+        return filled_before(scan)
+    return caution(scan, None if job.sensor is None else get_sensor(job.sensor))
+
+
+def _in_one_line(path: Path, warning: str | None, *more: str | None) -> str | None:
+    """A warning that begins with the path of its scan, and what else is to be said of that."""
+    text = "; ".join(text for text in more if text is not None)
+    if warning is None:
+        return f"{path}: {text}" if text else None
+    return f"{warning}; {text}" if text else warning
 
 
 def _made(
@@ -328,11 +339,13 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
         if target.suffix.lower() in BARE:
             beside = tuple(f".{name}" for name in BESIDE if name in placed.extra)
-            beside += (LABEL,) if job.labels or "raw_label" in placed.extra else ()
-        check_companions(target, source, beside)  # again: only the points tell of raw labels in a .ply
+            beside += (LABEL,) if placed.label is not None or "raw_label" in placed.extra else ()
+        check_companions(target, source, beside)  # again: only the points tell of labels in a .ply
         if LABEL in beside:
             label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
+        else:
+            check_labels(target)
         content = without_places(placed)
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())

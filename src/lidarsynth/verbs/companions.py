@@ -26,6 +26,13 @@ def check_companions(out: Path, source: Path, endings: Iterable[str]) -> None:
             raise ValueError(f"{out}: expected a name whose {ending} is not that of {source}, found {file}")
 
 
+def check_labels(out: Path) -> None:
+    """Raises ValueError where labels lie beside a `.bin` or `.npy` that gets none of its own: they would be taken for
+    those of its points."""
+    if out.suffix.lower() in BARE and (file := companion(out, LABEL)).exists():
+        raise ValueError(f"{out}: expected a name without the labels of other points beside it, found {file}")
+
+
 def _is_of(source: Path, file: Path, ending: str) -> bool:
     """Whether a companion is where those of `source` are looked for: only a .bin or .npy has others than labels."""
     if ending != LABEL and source.suffix.lower() not in BARE:

@@ -17,7 +17,7 @@ from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
-from lidarsynth.files.formats import READERS, holds_image, read_image, read_with_report, sensor_in
+from lidarsynth.files.formats import READERS, holds_image, marks_left_out, read_image, read_with_report, sensor_in
 from lidarsynth.lidar.columns import columns_note, own_columns
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.ground import LEANING, stance
@@ -92,7 +92,9 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     own = None if reading.moves else sensor_in(path)
     told = {} if own is None else {"sensor": f"{own.name} (the file holds it)"}
     try:
-        return scan_lines(*read_with_report(path, rings=reading.rings), reading) | told
+        read = read_with_report(path, rings=reading.rings)
+        left_out = marks_left_out(path, *read)
+        return scan_lines(*read, reading) | told | ({"beside": "; ".join(left_out)} if left_out else {})
     except FileError as error:
         if "--intensity none" not in str(error):
             raise

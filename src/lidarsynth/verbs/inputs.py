@@ -18,9 +18,10 @@ from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
 from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
-from lidarsynth.files.formats import READERS, read_with_report, sensor_in
+from lidarsynth.files.formats import READERS, marks_left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
+from lidarsynth.lidar.marks import MARKS
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.verbs.earlier_results import EarlierResults, earlier_results
@@ -65,6 +66,7 @@ class Loaded:
     scale    what a reflectance of 1 is in the intensities of a message
     stamp, frame_id, time, published, sequence  of a message, as of a `Cloud`
     sensor   of a range image, whose points were not moved and are on all of its beams; else None
+    left_out  what is to be said of files beside it that do not fit, or None
     """
 
     scan: Scan
@@ -77,6 +79,7 @@ class Loaded:
     published: int | None = None
     sequence: int = 0
     sensor: Sensor | None = None
+    left_out: str | None = None
 
 
 class Input(Protocol):
@@ -102,7 +105,8 @@ class FileInput:
         words = label_path(self.path) if self.reading.labels else None
         words = words if words is not None and words.is_file() else None
         read = read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings)
-        return replace(_loaded(*read, self.reading), sensor=None if self.reading.moves else sensor_in(self.path))
+        sensor, left_out = None if self.reading.moves else sensor_in(self.path), marks_left_out(self.path, *read)
+        return replace(_loaded(*read, self.reading), sensor=sensor, left_out="; ".join(left_out) or None)
 
 
 @dataclass(frozen=True)
@@ -373,6 +377,9 @@ def message_fields(filled: Scan, loaded: Loaded) -> Fields:
         order = np.flatnonzero(old)[np.argsort(azimuth[old])]
         nearest = np.searchsorted(azimuth[order], azimuth[new]).clip(0, len(order) - 1)
         fields[name][new] = fields[name][order[nearest]]
+    for word in sorted(filled.extra.keys() - fields.keys() - {*MARKS}):
+        if (name := word.replace("file_", "")) in MARKS:  # which are none of ours
+            fields[word] = fields.pop(name)
     more = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
     if filled.label is not None and "label" not in fields:
         more["label"] = filled.label.astype(np.uint8)

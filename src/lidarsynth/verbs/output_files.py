@@ -9,7 +9,7 @@ from pathlib import Path
 from lidarsynth.data.bag_writer import FORMATS
 from lidarsynth.files.formats import READERS, WRITERS
 from lidarsynth.verbs.batch import EVERY, FIRST, Work
-from lidarsynth.verbs.companions import check_companions
+from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.file_kinds import STREAMS
 from lidarsynth.verbs.inputs import Inputs
 from lidarsynth.verbs.other_files import PACKED
@@ -29,7 +29,7 @@ def works(
     skip     leave out scans whose file is there already; they are added to `skipped`
     beside   endings of the files that are written beside a .bin or .npy
     Raises ValueError where `out` cannot be written, is a scan's own file, or names one file for several scans, and
-    where a file beside it is a scan's own.
+    where a file beside it is a scan's own, or holds the labels of other points.
     """
     named = bool(out.suffix or out.is_file())
     one = inputs.single and named and (_is(WRITERS, out) or not out.is_dir())
@@ -48,6 +48,8 @@ def works(
                 skipped.append(file)
             continue
         check_companions(file, item.path, beside)
+        if LABEL not in beside and item.path.suffix.lower() == ".bin":  # whose points bring none
+            check_labels(file)
         yield Work(item, file, looked_at(number), number)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarsynth.files.fields import FileError, dropped_points
-from lidarsynth.files.formats import BARE, BESIDE, read_with_report
+from lidarsynth.files.formats import marks_left_out, read_with_report
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.verbs.inputs import stem
@@ -38,12 +38,7 @@ def read_shown(path: Path, intensity: str = "auto", rings: tuple[int, int] | Non
         notes.append(dropped_points(dropped))
     if (placed := viewpoint_note(path)) is not None:
         notes.append(placed)
-    bare = path.name.lower().endswith(BARE) and not path.name.lower().endswith(".pcd.bin")
-    for name, kind in BESIDE.items() if bare else ():
-        if (marks := path.with_suffix(f".{name}")).is_file() and name not in scan.extra:  # those that fit are read
-            count = len(scan) + dropped
-            notes.append(f"{marks.name} left out: expected {count * kind.itemsize} bytes for {count} points, "
-                         f"found {marks.stat().st_size} bytes")  # fmt: skip
+    notes += marks_left_out(path, scan, dropped)
     try:
         boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])
     except ValueError as error:

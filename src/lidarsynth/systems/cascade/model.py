@@ -174,7 +174,8 @@ class CascadeModel(AnySensorModel):
         return calls(how)
 
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
-        """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
+        """The image, filled; new pixels of one whose reflectance is 0 everywhere have a reflectance all the same.
+        Blocked rays stay empty."""
         recorded = image.keep(known)  # on a blocked ray too, which is told as empty
         rng, lit = generators(how.seed, 1), bool(recorded.reflectance.any())
         own = replace(self._as_found(recorded, known), grain=SPECKLE)
@@ -198,7 +199,8 @@ class CascadeModel(AnySensorModel):
         filled = replace(filled, reflectance=unit.read(shade, filled) * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
-        return own._named([filled], recorded=True)[0]
+        filled = own._named([filled], recorded=True)[0]  # told the reflectance that measured pixels would have
+        return replace(filled, reflectance=np.where(recorded.mask, recorded.reflectance, filled.reflectance))
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
