@@ -85,7 +85,6 @@ REFUSED = {  # what is found -> images that are so
     "finite points, found NaN": [points(STREETS[0]) * np.nan],
     r"points of \(N, 3\) .*, found \(64, 64\)": [STREETS[0].range],
     r"found -1 to .*\(lidar.depth.from_x_0 takes -1 to 1\)": np.stack([to_x_0(STREETS[0]).numpy()]),
-    "or one folder for all, found 'a.bin'": ["a.bin", "b.bin"],
 }
 
 
@@ -93,6 +92,11 @@ REFUSED = {  # what is found -> images that are so
 def test_other_scales_and_shapes_are_refused_by_number(found: str):
     with pytest.raises(ValueError, match=f"^image 0: expected .*{found}"):
         ls.evaluate(REFUSED[found], REAL)
+
+
+def test_a_list_of_files_is_refused():
+    with pytest.raises(ValueError, match=r"expected one folder or file of images, .*, found a.bin, b.bin$"):
+        ls.evaluate(["a.bin", "b.bin"], REAL)
 
 
 def test_a_reflectance_that_overshoots_is_clipped():
