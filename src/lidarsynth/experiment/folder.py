@@ -15,15 +15,9 @@ from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment, from_dict
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import whole_file
 
-OWN = ("likeliest.", "by_beams.", "observer.")  # how the weights begin that a model with a base does not share with it
+OWN = ("likeliest.", "observer.")  # how the weights begin that a model with a base does not share with it
 CLASSES = "classes."  # and those that it may have of its own
-OWN_PARTS = (
-    "likeliest",
-    "likeliest_blocks",
-    "by_beams",
-    "observer_channels",
-    "own_classes",
-)  # what a record says of them
+OWN_PARTS = ("likeliest", "likeliest_blocks", "observer_channels", "own_classes")  # what a record says of them
 
 
 def save(

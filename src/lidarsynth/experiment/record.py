@@ -61,7 +61,6 @@ class Model:
     judge_channels: int = within(0, 0, 8192)  # cascade: width of what chooses among drawn grids, in eights, 0 = none
     likeliest: bool = False  # cascade: a fill of its own for the image of least error; samples are by the other
     likeliest_blocks: tuple[int, ...] = within((1, 1, 2, 2), 1, 64)  # cascade: of that fill, at each level
-    by_beams: bool = False  # cascade: and another one like it, for scans of which whole beams are known
     own_classes: bool = False  # cascade with a base: its network of classes goes on too, and is kept with it
     observer_channels: int = within(0, 0, 8192)  # cascade: width of what says what is seen of surfaces, 0 = none
     dropout: float = within(0.0, 0, 0.999)

@@ -30,7 +30,6 @@ class Cascade(nn.Module):
     between  draws the columns between those, twice over
     beams    draws the beams between those, then, twice over
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
-    by_beams   the same of scans of which whole beams are known alone, as `upsample` has them
     observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
     classes    says of each return what it is of
     inside     the same of scans that were taken inside a building, and which are
@@ -52,21 +51,16 @@ class Cascade(nn.Module):
         judge: GridJudge | None = None,
         inside: ClassUNet | None = None,
         drawn: ClassUNet | None = None,
-        by_beams: FillUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
         self.beams, self.likeliest, self.observer, self.classes = beams, likeliest, observer, classes
-        self.judge, self.inside, self.drawn, self.by_beams = judge, inside, drawn, by_beams
+        self.judge, self.inside, self.drawn = judge, inside, drawn
 
     @property
     def surest(self) -> FillUNet:
         """The fill for the image of least error: `likeliest` where there is one."""
         return self.fill if self.likeliest is None else self.likeliest
-
-    def surest_of(self, beams: bool) -> FillUNet:
-        """`surest`, or, where whole `beams` are known and nothing else is, the fill that has learned just that."""
-        return self.by_beams if beams and self.by_beams is not None else self.surest
 
     def velocity(self, x_t: Tensor, log_snr: Tensor, rays: Tensor) -> Tensor:
         """What `coarse` answers, led away from the guide's answer."""

@@ -33,7 +33,6 @@ FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: th
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
 LOSING = 0.7  # of what learns the most likely image lack some of their returns
 JOINED = 0.25  # of sparse patterns have holes besides
-ASKED = 0.1  # of whole beams are known where they returned alone
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -147,18 +146,14 @@ def mixed(image: RangeImage, images: Images, share: float, rng: np.random.Genera
 
 
 def crop(
-    image: RangeImage,
-    rng: np.random.Generator,
-    sampled: bool,
-    upsampling: float = 0.0,
-    beams: tuple[int, int] | None = None,
+    image: RangeImage, rng: np.random.Generator, sampled: bool, upsampling: float = 0.0
 ) -> tuple[Known, Rays, tuple[Tensor, ...]]:
     """Known pixels, rays, and the truth (metres, reflectance, class), each (1, 1, 64, 256), of a part of an image.
 
     A world somewhat larger or smaller, seen in a mirror half of the time, with reflectances of another response; the
     carrier is unknown at times, and the tilt and the beams' dimness, since users do not know theirs either. At times
     all surfaces are known but not which of them return, as in a simulator's scan; or everything is, for the classes.
-    A share `upsampling` of what is not `sampled` knows every fourth beam instead, or every k-th: `beams` (k, first).
+    A share `upsampling` of what is not `sampled` knows every fourth beam instead.
     """
     first = sampled and rng.random() < FIRST
     sensor, rows = _window(image.sensor, rng, first)
@@ -180,8 +175,8 @@ def crop(
     perfect = surface is not None and not first and kind < (0.2 if sampled else 0.1)
     told[:] = ~np.bool_(perfect) & (told | (not sampled and kind > 0.94))
     if upsampling and not sampled and rng.random() < upsampling:
-        told, perfect = every_beam(metres.shape, *(beams or (4, int(rng.integers(4))))), False
-    if rng.random() < (0.4 if beams is None else ASKED) and kind <= 0.94:
+        told, perfect = every_beam(metres.shape, 4, int(rng.integers(4))), False
+    if rng.random() < 0.4 and kind <= 0.94:
         told &= metres > 0
     told = told & ~hole if unaware else told | hole
     lit = told & (metres > 0) & (rng.random() >= 0.1)

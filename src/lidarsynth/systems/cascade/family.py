@@ -43,9 +43,7 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     assert coarse is not None
     widths = _widths(width)
     fill = FillUNet(widths, classes=model.classes)
-    likeliest, by_beams = (
-        FillUNet(widths, model.likeliest_blocks) if there else None for there in (model.likeliest, model.by_beams)
-    )
+    likeliest = FillUNet(widths, model.likeliest_blocks) if model.likeliest else None
     observer = FillUNet(_sixteens(_widths(model.observer_channels))) if model.observer_channels else None
     columns = ColumnTransformer(model.column_channels) if model.column_channels else None
     between = BetweenColumns(model.between_channels) if model.between_channels else None
@@ -54,8 +52,7 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     judge = GridJudge(model.judge_channels) if model.judge_channels else None
     inside = ClassUNet(model.inside_channels) if model.classes and model.inside_channels else None
     drawn = ClassUNet(model.drawn_channels, classes=model.classes) if model.classes and model.drawn_channels else None
-    parts = coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside, drawn
-    return Cascade(*parts, by_beams=by_beams)
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside, drawn)
 
 
 def _widths(first: int) -> tuple[int, int, int, int]:
@@ -84,7 +81,6 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)
-    _start(network.by_beams, (weights.by_beams, weights.surest), name)
     _start(network.observer, (weights.observer, weights.fill), name)
 
 

@@ -36,11 +36,6 @@ def known_of(metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit:
     return Known(ranges, shades, part(told, True), part(returned, False), part(returned & lit, False))
 
 
-def whole_beams(known: np.ndarray) -> bool:
-    """Whether of every beam of known pixels (H, W) bool all are known, or none."""
-    return bool((known == known[:, :1]).all())
-
-
 def standing(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Sensor:
     """The sensor as high above the road, and as tilted, as the returns of an image, known (H, W) bool, tell it is, to 5
     cm and a degree; what they do not tell, or what is within a fifth and three and a half degrees, stays."""

@@ -45,7 +45,7 @@ from lidarsynth.systems.cascade.images import (
     textured,
     with_doubts,
 )
-from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered, whole_beams
+from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, one_thread, sampling, times, told_of
 from lidarsynth.systems.cascade.naming import GROWING, RARER, SKETCHED, class_of_points, named
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
@@ -74,7 +74,6 @@ class CascadeModel(AnySensorModel):
     precision        of the fill's matrix products: fp32 | bf16
     response         how the sensor reports what it sees, as found out from the scan at hand
     grain            how much of each kind of noise its samples take
-    beams            whether whole beams of the scan at hand are known, and nothing else
     layouts          drawn for each generated scan, of which the likeliest street is kept: see `choosing`
     """
 
@@ -85,7 +84,6 @@ class CascadeModel(AnySensorModel):
     precision: str = "fp32"
     response: Response = AS_STREETS
     grain: Grain = GENERATED
-    beams: bool = False
     layouts: int = CHOICE
     description: ClassVar[Description] = DESCRIPTION
     kind: ClassVar[str] = "a cascade"
@@ -190,7 +188,7 @@ class CascadeModel(AnySensorModel):
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
-            rays, fill = own.response.told(rays_told(own.sensor)), own.network.surest_of(own.beams)
+            rays, fill = own.response.told(rays_told(own.sensor)), self.network.surest
             with torch.autocast(self._device.type, torch.bfloat16, enabled=self.precision == "bf16"):
                 own = replace(own, response=tried(own.response, fill, image, known, reflectance, rays, self.tuned))
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
@@ -378,13 +376,12 @@ class CascadeModel(AnySensorModel):
         known = Known(*(part.to(device) for part in known))
         rays = Rays(*(part.to(device).expand(len(known.told), *part.shape[1:]) for part in rays))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-            fill = self.network.fill if classify or rng is not None else self.network.surest_of(self.beams)
+            fill = self.network.fill if classify or rng is not None else self.network.surest
             return fill(known, rays, noise.to(device), classify, doubt, reach, lost, bend), rays
 
     def _as_found(self, image: RangeImage, known: np.ndarray) -> CascadeModel:
         """With what the known returns tell of the sensor: how high it stands, and how it reports reflectance."""
-        sensor, beams = standing(self.sensor, image, known), whole_beams(known)
-        return replace(self, sensor=sensor, response=response_of(image, known), beams=beams)
+        return replace(self, sensor=standing(self.sensor, image, known), response=response_of(image, known))
 
     @property
     def _blocked(self) -> np.ndarray:
