@@ -280,28 +280,6 @@ def test_a_sensor_of_a_few_columns_is_completed(model: CascadeModel, width: int)
     assert model.into(image.sensor).complete(image.keep(known), known).shape == (24, width)
 
 
-def test_whole_beams_have_a_fill_of_their_own_and_nothing_else_has():
-    torch.manual_seed(0)
-    fills = [FillUNet((16, 16, 16, 16)) for _ in range(2)]
-    for fill in fills:
-        torch.nn.init.normal_(fill.out.weight, std=0.02)
-    network = Cascade(CoarseUNet(32, (1, 2, 2, 2), 1), fills[0], by_beams=fills[1]).eval()
-    experiment = Experiment("test", Data(sensor=SMALL.to_dict()), Model(network="cascade"))
-    both, first, second = (
-        CascadeModel(given, SMALL, experiment)
-        for given in (network, *(Cascade(network.coarse, fill).eval() for fill in fills))
-    )
-    image = SyntheticStreets(4, 16, SMALL).image(3)
-    blocked = replace(SMALL, blocked=((3, 10, 60),))
-    for recipe, expected in (("beams:2", second), ("beams:4", second), ("points:0.3", first), ("sector:90", first)):
-        known = corrupt(image, recipe)
-        for sensor in (SMALL, blocked):
-            filled, alone = (one.into(sensor).complete(image.keep(known), known) for one in (both, expected))
-            np.testing.assert_array_equal(filled.range, alone.range, err_msg=recipe)
-    sample, alone = (one.complete(image.keep(known), known, method="sample", seed=1) for one in (both, first))
-    np.testing.assert_array_equal(sample.range, alone.range, "samples are drawn by the fill that has learned to")
-
-
 def test_blocked_rays_stay_empty_and_no_other_sensor_gets_kittis_car(model: CascadeModel):
     blocked = replace(SMALL, blocked=((22, 10, 60), (23, 250, 80)))
     metres = np.zeros((24, 256), np.float32)
