@@ -81,6 +81,10 @@ def test_resized_sensors_keep_evenly_spaced_beams_of_their_own():
     assert (quarter.name, quarter.width, quarter.max_range) == ("hdl-64e-kitti/16", 256, 80.0)
     assert sensor.resized() == sensor
     assert sensor.resized(width=2048).elevations == sensor.elevations
+    around = Sensor("mine", sensor.elevations, 1024, blocked=((63, 1000, 0), (62, 1023, 1), (61, 2, 2)))
+    halved = around.resized(width=512)
+    assert halved.blocked == ((63, 500, 511), (62, 511, 0))
+    assert halved.blocked_rays().sum(1)[-3:].tolist() == [0, 2, 12]
     assert sensor.rows([5, 9]).elevations == (sensor.elevations[5], sensor.elevations[9])
     with pytest.raises(ValueError, match="sensor hdl-64e-kitti: height must divide its 64 beams, got 24"):
         sensor.resized(24)
@@ -211,8 +215,11 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ("elevations = [1]\nmin_range = -1", r"expected 0 <= min_range < max_range, got -1 and 100.0"),
         ("elevations = [1]\nmax_range = nan", r"expected 0 <= min_range < max_range, got 1.0 and nan"),
         ("elevations = [2, 1]\noffsets = [1]", r"offsets must have one height per beam \(2\), got 1"),
-        ("elevations = [1]\nmax_range = inf", r"mine.toml: expected a max_range in metres, found inf"),
-        ("elevations = [1]\nmount = -3", r"mine.toml: expected a mount above the road, found -3 m"),
+        (
+            "elevations = [1]\nmax_range = inf",
+            r"mine.toml: expected finite metres, of a mount 0 or more, found inf as max_range",
+        ),
+        ("elevations = [1]\nmount = -3", r"mine.toml: expected finite metres, of a mount 0 or more, found -3 as mount"),
         ("elevations = [1", r"mine.toml: expected TOML, found"),
     ],
 )

@@ -133,6 +133,19 @@ def test_a_run_can_be_extended(cache: Path, tmp_path: Path):
         list(run(tiny(8, **{"training.learning_rate": 0.5}), cache, out, options=QUIET))
 
 
+def test_a_run_on_scans_of_a_sensor_with_blocked_rays_goes_on(tmp_path: Path):
+    own = Sensor("mine", tuple(np.linspace(10, -20, 16)), width=64, max_range=60.0, blocked=((15, 10, 30), (14, 60, 2)))
+    list(write_cache(tmp_path / "own", lambda i: noise_image(i, own), 4, own, {"name": "noise"}))
+    out = tmp_path / "run"
+    for steps, done in ((1, [0, 1]), (2, [1, 2])):
+        experiment = resolve("tiny", (f"training.steps={steps}", "training.batch_size=2"), data=tmp_path / "own")
+        assert [progress.step for progress in run(experiment, tmp_path / "own", out, options=QUIET)] == done
+    other = with_fields(experiment, {"data.sensor": {**experiment.data.sensor, "blocked": [[15, 10, 31]]}})
+    own = r"its own run, with data.sensor.blocked = \[\[15, 10, 30\], .*found \[\[15, 10, 31\]\]"
+    with pytest.raises(ValueError, match=own):
+        list(run(other, tmp_path / "own", out, options=QUIET))
+
+
 def test_a_run_goes_on_with_its_own_images(cache: Path, tmp_path: Path):
     """Wherever their folder lies now; as many of the same name, but other ones, are other data."""
     out, moved, twin, few = (tmp_path / name for name in ("run", "moved", "twin", "few"))

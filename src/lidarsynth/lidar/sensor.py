@@ -167,7 +167,7 @@ class Sensor:
         width = width or self.width
         place, scale = {row: i for i, row in enumerate(rows)}, width / self.width
         blocked = tuple(
-            (place[row], int(first * scale), min(int((last + 1) * scale), width) - 1)
+            (place[row], int(first * scale), (min(int((last + 1) * scale), width) - 1) % width)
             for row, first, last in self.blocked
             if row in place and (first > last or int(first * scale) < int((last + 1) * scale))
         )
@@ -215,7 +215,8 @@ class Sensor:
 
     def to_dict(self) -> dict:
         """Plain lists and numbers, the inverse of `from_dict`."""
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self).items()}
+        lists = {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self).items()}
+        return lists | {"blocked": [list(run) for run in self.blocked]}
 
 
 EVENLY = {"beams", "top", "bottom"}  # fields that stand for elevations
@@ -250,11 +251,10 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     if not isinstance(values.get("width", 4), int):
         raise ValueError(f"{source}: expected a whole number of columns as width, found {values['width']!r:.60}")
     for key in METRES:
-        if not isinstance(values.get(key, 1), Real):
-            raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values[key]!r:.60} as {key}")
-    if (far := values.get("max_range", 1)) == np.inf or (low := values.get("mount", 1)) < 0:
-        told = f"a max_range in metres, found {far}" if far == np.inf else f"a mount above the road, found {low:g} m"
-        raise ValueError(f"{source}: expected {told}")
+        if not isinstance(value := values.get(key, 1), Real):
+            raise ValueError(f"{source}: expected numbers in the sensor's fields, found {value!r:.60} as {key}")
+        if value == np.inf or (key == "mount" and value < 0):
+            raise ValueError(f"{source}: expected finite metres, of a mount 0 or more, found {value} as {key}")
     beams = {key: _numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
     order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
     for key, numbers in beams.items():  # each number goes with its beam

@@ -251,8 +251,11 @@ def _counts(key: str) -> bool:
 
 
 def _flat(record: dict) -> dict:
-    groups = {key: value if isinstance(value, dict) else {"": value} for key, value in record.items()}
-    return {f"{group}.{key}".rstrip("."): value for group, part in groups.items() for key, value in part.items()}
+    """The fields of nested records by their names with dots between."""
+    flat: dict = {}
+    for key, value in record.items():
+        flat |= {f"{key}.{name}": v for name, v in _flat(value).items()} if isinstance(value, dict) else {key: value}
+    return flat
 
 
 def _with_history(experiment: Experiment, step: int, accelerator: Accelerator) -> Experiment:
