@@ -22,8 +22,11 @@ from torch.utils.flop_counter import FlopCounterMode
 from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.networks.fill_unet import NOISES, Known
 from lidarsynth.networks.interpolation import METHODS
 from lidarsynth.networks.pointnet import PointNet
+from lidarsynth.networks.rays import Rays, padded
+from lidarsynth.systems.cascade.known import known_of, rays_told
 from lidarsynth.systems.gan.build import build_discriminator
 from lidarsynth.systems.gan.family import GAN
 from lidarsynth.systems.table import SYSTEMS, build_network
@@ -52,6 +55,14 @@ def call_of(experiment: Experiment, network: nn.Module, count: int, device: str)
         mask = torch.zeros_like(image)
         mask[:, :, ::4] = 1
         return lambda: network(image, torch.zeros((), device=device), image, mask)
+    if word == "cascade":  # all pixels of a scan, in one step
+        sensor, shape = build_sensor(experiment), (count, height, width)
+        metres, told = np.random.default_rng(0).uniform(2, 80, shape).astype(np.float32), np.zeros(shape, bool)
+        told[:, ::4] = True
+        known = Known(*(part.to(device) for part in known_of(metres, metres / 80, told, True, padded(sensor))))
+        rays = Rays(*(part.to(device).expand(count, *part.shape[1:]) for part in rays_told(sensor)))
+        noise = torch.zeros(count, NOISES, *padded(sensor), device=device)
+        return lambda: network.surest(known, rays, noise)  # type: ignore[union-attr]
     if word in METHODS:
         mask = torch.zeros_like(image)
         mask[:, :, ::4] = 1

@@ -18,7 +18,6 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
         (tmp_path / name).parent.mkdir(exist_ok=True)
         write(tmp_path / name, street("hdl-64e-kitti"))
     shown = blocks(DOC.read_text())
-    (tmp_path / "mine").mkdir()
     namespace: dict[str, object] = {"__name__": "python"}
     for block in (b for b in shown if b.language == "python"):
         exec(compile("\n" * (block.first_line - 1) + "\n".join(block.lines), str(DOC), "exec"), namespace)

@@ -217,9 +217,9 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ("elevations = [2, 1]\noffsets = [1]", r"offsets must have one height per beam \(2\), got 1"),
         (
             "elevations = [1]\nmax_range = inf",
-            r"mine.toml: expected finite metres, of a mount 0 or more, found inf as max_range",
+            r"expected finite metres, of a mount 0 or more, found inf as max_r",
         ),
-        ("elevations = [1]\nmount = -3", r"mine.toml: expected finite metres, of a mount 0 or more, found -3 as mount"),
+        ("elevations = [1]\nmount = -3", r"expected finite metres, of a mount 0 or more, found -3 as mount"),
         ("elevations = [1", r"mine.toml: expected TOML, found"),
     ],
 )

@@ -87,7 +87,7 @@ class AnySensorModel(ScanModel, ABC):
             model = self.at_precision(how.precision)
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
         scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
-        own, how = sensor_that_made(scan, sensor_in), self.resolved(how)
+        own, how = sensor_that_made(scan, sensor_in, self.sensor), self.resolved(how)
         sparse = check_seen(self.into(own).image_of(scan), len(scan))
         beams, dense, every = denser(own, beam_step(sparse), times)
         sparse = sparse if beams == own else self.into(beams).image_of(scan)
