@@ -13,7 +13,7 @@ from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.blocked import blocked_runs
 from lidarsynth.lidar.frame import check_frame
-from lidarsynth.lidar.learning import learn_sensor
+from lidarsynth.lidar.learning import _standing, learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, read_sensor
@@ -102,6 +102,12 @@ def test_scans_that_do_not_tell_the_mount_are_told():
         assert re.search(
             rf"own: expected .*{why}.*: mount and tilt are not learned, 1\.73 m and level are written", line
         )
+
+
+def test_a_sensor_below_the_ground_has_no_mount():
+    mount, tilt, why = _standing([(-0.12, 0.1, 0.0)] * 3, 0, 3)
+    assert (mount, tilt) == (1.73, (0.0, 0.0)) and why is not None
+    assert why.startswith("expected the sensor above the ground, found it 0.12 m below")
 
 
 def test_smeared_and_missing_beams_are_told():
@@ -200,6 +206,13 @@ def test_the_verb_writes_a_sensor_and_its_picture(tmp_path: Path, capsys: pytest
     assert "own: 16 beams from +15.00 to -15.00 degrees, 512 columns" in capsys.readouterr().out
     assert read_sensor(tmp_path / "own.toml").height == 16
     assert (tmp_path / "own.png").stat().st_size > 5000
+    own = turn(SENSORS["vlp-16"], rings=True)
+    near = np.linalg.norm(own.xyz, axis=1).min()
+    assert learn_sensor([own], "own").sensor.min_range <= near, "no measured point is nearer than it sees"
+    (tmp_path / "moved").mkdir()
+    write(tmp_path / "moved/0.pcd", replace(own, xyz=own.xyz + np.float32([1.5, 0, 1.2])))
+    main(["sensor", str(tmp_path / "moved"), "--out", str(tmp_path / "moved.toml"), "--no-picture"])
+    assert "moved/0.pcd: expected points in the sensor's frame" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -48,13 +48,16 @@ def sensor(
         say(f"wrote {out}: {plural(known.height, 'beam')}, {known.width} columns")
         return
     broken: list[str] = []
+    moved: list[str] = []
     how = Reading(intensity, topic, metadata, read_transform(transform, None, axes), rings=parse_rings(rings))
     inputs = inputs_of(scans, how)
     for line in inputs.cut:
         warn(line)
-    learned = learn(inputs, out.stem, broken)
+    learned = learn(inputs, out.stem, broken, moved)
     if broken:
         warn(f"{len(broken)} that could not be read {was(len(broken))} left out, the first: {broken[0]}")
+    if moved:
+        warn(moved[0])
     write_toml(out, sensor_toml(learned.sensor, [*summary(learned).splitlines(), *doubts(learned)]))
     say(summary(learned))
     for line in doubts(learned):

@@ -73,7 +73,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     for scan, ring in kept:
         steps.append(azimuth_step(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
-        depths.append((np.quantile(depth, 0.001), depth.max()))
+        depths.append((depth.min(), depth.max()))
         grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
         above += is_above(scan.xyz)
     guessed = _guessed(kept[0][0])
@@ -122,6 +122,9 @@ def _standing(
     if np.median(np.abs(heights - height)) > ALIKE:
         low, high = np.quantile(heights, [0.1, 0.9])
         why = f"expected the ground as far below in most scans, found it {low:.2f} to {high:.2f} m below"
+        return Sensor.mount, Sensor.tilt, why
+    if height < 0:
+        why = f"expected the sensor above the ground, found it {-height:.2f} m below, as of points in another frame"
         return Sensor.mount, Sensor.tilt, why
     return round(height, 2), (round(pitch, 2), round(roll, 2)), None
 

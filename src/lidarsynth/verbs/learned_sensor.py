@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
+from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.learning import FEWEST, NEAR, SMEARED, LearnedSensor, learn_sensor
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.scan import Scan, with_points
@@ -19,17 +20,19 @@ from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.verbs.inputs import Input, Inputs
 
 T = TypeVar("T")
+LOOKED_AT = 3  # scans, for the frame they are in
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
-def learn(inputs: Inputs, name: str, broken: list[str] | None = None) -> LearnedSensor:
+def learn(inputs: Inputs, name: str, broken: list[str] | None = None, moved: list[str] | None = None) -> LearnedSensor:
     """The sensor of at most ENOUGH of the inputs, evenly chosen. Those that cannot be read are left out, and why is
-    added to `broken`; where none can be, ValueError."""
-    broken = [] if broken is None else broken
+    added to `broken`; where none can be, ValueError. In which other frame one of the first LOOKED_AT is, is added to
+    `moved`."""
+    told = [] if broken is None else broken, [] if moved is None else moved
     if inputs.count is None:
-        return learn_sensor(_readable(spread(inputs.stream(), ENOUGH), broken), name)
+        return learn_sensor(_readable(spread(inputs.stream(), ENOUGH), *told), name)
     every = max(-(-inputs.count // ENOUGH), 1)
-    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every), broken), name)
+    return learn_sensor(_readable(islice(inputs.stream(), 0, None, every), *told), name)
 
 
 def spread(items: Iterable[T], most: int) -> list[T]:
@@ -49,14 +52,18 @@ def from_metadata(path: Path, name: str) -> Sensor | None:
     return sensor_of(read_metadata(path), name) if is_metadata(path) else None
 
 
-def _readable(inputs: Iterable[Input], broken: list[str]) -> Iterator[Scan]:
+def _readable(inputs: Iterable[Input], broken: list[str], moved: list[str]) -> Iterator[Scan]:
     read = 0
     for item in inputs:
         try:
-            yield with_points(item.read().scan, str(item.path))
-            read += 1
+            scan = with_points(item.read().scan, str(item.path))
         except ValueError as error:
             broken.append(str(error))
+            continue
+        if read < LOOKED_AT and (frame := check_frame(scan)).faults:
+            moved.append(f"{item.path}: {frame.warning()}")
+        read += 1
+        yield scan
     if broken and not read:
         raise ValueError(broken[0])
 
