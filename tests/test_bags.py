@@ -243,6 +243,37 @@ def without_summary(path: Path) -> None:
         writer.finish()
 
 
+@pytest.mark.parametrize("left_out", [("channels",), ("schemas",), ("channels", "schemas")])
+@pytest.mark.parametrize("statistics", [True, False])
+@pytest.mark.parametrize("chunks", [True, False])
+def test_an_mcap_is_read_whose_summary_leaves_out_what_it_may(
+    left_out: tuple[str, ...], statistics: bool, chunks: bool, tmp_path: Path
+):
+    from mcap.writer import Writer
+
+    path = clouds_at(tmp_path / "drive.mcap", [102, 100, 101])
+    with open_bag(path) as bag:
+        whole, before = list(bag.messages()), bag.topics
+    with open(path, "wb") as file:
+        rest = {f"repeat_{word}": False for word in left_out}
+        writer = Writer(file, use_statistics=statistics, use_chunking=chunks, **rest)
+        writer.start()
+        channel = writer.register_channel("/points", "cdr", writer.register_schema(POINTS, *whole[0].topic.schema))
+        note = writer.register_channel("/note", "json", 0)
+        for message in whole:
+            writer.add_message(channel, message.time, message.data, message.time)
+            writer.add_message(note, message.time + 1, b"{}", message.time + 1)
+        writer.finish()
+    with open_bag(path) as bag:
+        assert [(t.name, t.kind, t.count) for t in bag.topics if t.name != "/note"] == [
+            (t.name, t.kind, t.count) for t in before
+        ]
+        assert bag.seconds == pytest.approx(2) and bag.point_topic() == "/points"
+        assert [(m.time, m.data) for m in bag.messages(frozenset(["/points"]))] == [(m.time, m.data) for m in whole]
+        assert len(list(bag.messages())) == 6 and len(list(bag.messages(start=101 * 10**9))) == 4
+    assert sum(len(item.read().scan) > 0 for item in inputs_of([path]).stream()) == 3
+
+
 @pytest.mark.parametrize("summary", [True, False])
 def test_the_parts_of_a_bag_are_read_in_the_order_of_their_times(summary: bool, tmp_path: Path):
     """Names sort as 10, 11, 12, 2; the parts overlap, and one is empty."""

@@ -166,6 +166,28 @@ def test_bags_keep_their_columns(place: Path):
     assert cloud.given["label"].min() >= 1
 
 
+@pytest.mark.parametrize(("name", "word"), [("label", 13), ("class", 13), ("label", 252)])
+def test_new_points_of_bags_get_their_class_where_the_message_has_a_column(place: Path, name: str, word: int):
+    """Measured ones keep theirs; words that are no training classes stay beside ours, as in files."""
+    pytest.importorskip("rosbags")
+    from lidarsynth.data.bag_records import Cloud
+    from lidarsynth.data.bag_writer import write_bag
+    from lidarsynth.verbs.inputs import inputs_of
+
+    scan = perfect(SMALL)[np.arange(6144) % 256 % 2 == 0]
+    fields = {**dict(zip("xyz", scan.xyz.T, strict=True)), "intensity": np.full(len(scan), 100, np.float32),
+              name: np.full(len(scan), word, np.uint8)}  # fmt: skip
+    with write_bag("in.mcap") as writer:
+        writer.write_cloud("/points", Cloud(10**9, "lidar", 10**9, fields))
+    main(["complete", "in.mcap", "--out", "out.mcap", "--labels", *WORDS])
+    (cloud,) = (item.read() for item in inputs_of([Path("out.mcap")]).stream())
+    given, new = cloud.given, cloud.given["new"] > 0
+    own = name if word < 20 else "file_label"
+    assert given.keys() - fields.keys() == {"new"} | {own} - {name} and new.sum() > 100
+    assert (given[own][~new] == word).all() and given[name][new].min() >= 1
+    assert word < 20 or (given[own][new] == 0).all()
+
+
 def test_classes_that_are_not_sure_are_left_out(place: Path, capsys: pytest.CaptureFixture[str]):
     scan, model = read("scan.ply"), load("model")
     all_of_them = model.label(scan, "own.toml").label

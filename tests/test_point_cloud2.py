@@ -129,6 +129,25 @@ def test_times_of_the_drivers_become_seconds():
         np.testing.assert_allclose(scan.time - scan.time[0], [0, 0.05, 0.1], atol=1e-6)
 
 
+def test_offset_times_are_nanoseconds_only_where_a_turn_may_last_as_long():
+    base = {axis: np.ones(3) for axis in "xyzi"}
+    for values in (
+        np.array([0, 50, 99.9], np.float32),  # milliseconds
+        np.array([0, 50_000, 99_900], np.uint32),  # microseconds
+        np.array([0, 0.05, 0.0999]),  # seconds
+        np.array([0, 5e7, 9.99e7]),  # nanoseconds, in floats
+        np.array([0, 50_000_000, 99_900_000], np.uint32),
+        1_700_000_000_000_000_000 + np.array([0, 50_000_000, 99_900_000]),
+    ):
+        scan, _ = scan_from_fields({**base, "offset_time": values})
+        assert scan.time is not None
+        np.testing.assert_allclose(scan.time, [0, 0.05, 0.0999], atol=1e-6)
+    scan, _ = scan_from_fields({**base, "offset_ns": np.array([0, 50_000, 99_900], np.int32)})  # its name says so
+    np.testing.assert_allclose(scan.time, [0, 5e-5, 9.99e-5], atol=1e-9)
+    empty, _ = scan_from_fields({name: np.zeros(0, np.float32) for name in (*base, "offset_time")})
+    assert empty.time is not None and not len(empty.time)
+
+
 def test_further_fields_stay_with_their_points():
     keep = {"ambient": np.array([1, 2, 3], np.uint16), "label": np.array([70, 71, 72])}
     fields = {"x": np.array([1.0, np.nan, 3]), "y": np.ones(3), "z": np.ones(3), "i": np.ones(3), **keep}

@@ -174,7 +174,7 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             for together in _overlapping(parts):
-                each = (_mcap_messages(part.stream, names, topics, start) for part in together)
+                each = (_mcap_messages(part, names, topics, start) for part in together)
                 yield from heapq.merge(*each, key=lambda message: message.time)
 
         full = [part for part in parts if part.last]
@@ -184,12 +184,14 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
 
 class _Part(NamedTuple):
-    """An open MCAP file: its topics, the times of its first and last message (nanoseconds), 0 where it has none."""
+    """An open MCAP file: its topics, the times of its first and last message (nanoseconds), 0 where it has none, and
+    whether it is read by its index."""
 
     stream: IO[bytes]
     topics: tuple[Topic, ...]
     first: int
     last: int
+    indexed: bool
 
 
 def _overlapping(parts: list[_Part]) -> list[list[_Part]]:
@@ -204,24 +206,40 @@ def _overlapping(parts: list[_Part]) -> list[list[_Part]]:
 
 
 def _mcap_part(stream: IO[bytes]) -> _Part:
-    """What a file holds, by its summary; one without is read through once."""
+    """What a file holds, by its summary; one without, or with one that leaves out channels or schemas, as writers may
+    to save room, is read through once."""
     from mcap.reader import make_reader
 
     summary = make_reader(stream).get_summary()
-    if summary is not None and summary.statistics is not None:
-        counts, s = summary.statistics.channel_message_counts, summary.statistics
+    s = None if summary is None else summary.statistics
+    if summary is not None and s is not None and _tells_of(summary, s.channel_message_counts):
+        counts = s.channel_message_counts
         topics = [
             _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
             for number, channel in summary.channels.items()
         ]
-        return _Part(stream, tuple(topics), s.message_start_time, s.message_end_time)
-    stream.seek(0)
+        return _Part(stream, tuple(topics), s.message_start_time, s.message_end_time, True)
     seen: dict[int, list[Any]] = {}
     times = [0, 0]
-    for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
+    for schema, channel, message in _mcap_reader(stream, summary is None).iter_messages(log_time_order=False):
         times = [min(times[0] or message.log_time, message.log_time), max(times[1], message.log_time)]
         seen.setdefault(channel.id, [channel, schema, 0])[2] += 1
-    return _Part(stream, tuple(_mcap_topic(*found) for found in seen.values()), *times)
+    topics = tuple(_mcap_topic(*found) for found in seen.values())
+    return _Part(stream, topics, times[0], times[1], summary is None or _tells_of(summary, seen))
+
+
+def _tells_of(summary: Any, channels: Iterable[int]) -> bool:
+    """Whether a summary holds these channels, and the schemas of all that it holds."""
+    schemas = {channel.schema_id for channel in summary.channels.values()} - {0}  # 0: it has none
+    return set(channels) <= summary.channels.keys() and schemas <= summary.schemas.keys()
+
+
+def _mcap_reader(stream: IO[bytes], indexed: bool) -> Any:
+    """A reader by the index, if there is one, or from the first byte to the last, which asks no summary."""
+    from mcap.reader import NonSeekingReader, make_reader
+
+    stream.seek(0)
+    return (make_reader if indexed else NonSeekingReader)(stream, validate_crcs=True)
 
 
 def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
@@ -232,11 +250,8 @@ def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
     return Topic(channel.topic, kind, channel.message_encoding, text, count, offered=tuple(channel.metadata.items()))
 
 
-def _mcap_messages(stream: IO[bytes], names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
-    from mcap.reader import make_reader
-
-    stream.seek(0)
-    reader = make_reader(stream, validate_crcs=True)
+def _mcap_messages(part: _Part, names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
+    reader = _mcap_reader(part.stream, part.indexed)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
         yield Message(topics[channel.topic], message.log_time, message.data, message.publish_time, message.sequence)
 

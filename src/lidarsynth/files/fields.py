@@ -21,7 +21,7 @@ MAX_METRES = 10_000.0
 EARTH = 2e7  # metres; no coordinate of a map is greater
 MAX_RINGS = MOST  # as many as an image may have beams: its rings come back
 SHORTS = 1 << 16  # whole numbers that the labels of a table have
-LONGEST = 10.0  # seconds that a turn may last
+SHORTEST, LONGEST = 1e-3, 10.0  # seconds that a turn may last
 SCALED = "reflectance by the format"  # a further field: intensities as 0-1, of formats that fix their scale; for "auto"
 PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
@@ -103,7 +103,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
     ring, time, label = (fields[key][kept] if (key := find(fields, n)) else None for n in ("ring", "time", "label"))
     classes = None if label is None else _training_classes(label)
     from_top = None if ring is None else rings_from_top(ring, xyz)
-    seconds = None if time is None else seconds_from(time, find(fields, "time") in ("offset_ns", "offset_time"))
+    seconds = None if time is None else seconds_from(time, _of_nanoseconds(time, find(fields, "time")))
     pairs = (("ring", ring, from_top), ("time", time, seconds))
     told = [(name, given, ours) for name, given, ours in pairs if given is not None and ours is not None]
     changed = [find(fields, name) for name, given, ours in told if not np.array_equal(given, ours, equal_nan=True)]
@@ -279,6 +279,15 @@ def seconds_from(time: np.ndarray, nanoseconds: bool = False) -> np.ndarray:
     first = time.min()
     span = max(int(time.max()) - int(first), 1)
     return (time - first).astype(np.float64) / 10.0 ** (9 if nanoseconds else _power(span))
+
+
+def _of_nanoseconds(time: np.ndarray, name: str | None) -> bool:
+    """Whether times (N,) are nanoseconds by the name of their field; `offset_time`, as of Livox, where a turn may last
+    as long."""
+    if name != "offset_time":
+        return name == "offset_ns"
+    known = (exact := _numbers(time, "time").astype(np.float64))[np.isfinite(exact)]
+    return len(known) > 0 and SHORTEST <= float(known.max() - known.min()) / 1e9 <= LONGEST
 
 
 def _power(span: float) -> int:

@@ -17,7 +17,16 @@ from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
 from lidarsynth.data.turns import capture_turns
-from lidarsynth.files.fields import PLACE, Fields, FileError, find, full_scale, rings_from_top, scan_from_fields
+from lidarsynth.files.fields import (
+    PLACE,
+    Fields,
+    FileError,
+    find,
+    full_scale,
+    rings_from_top,
+    scan_from_fields,
+    written_names,
+)
 from lidarsynth.files.formats import READERS, marks_left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
@@ -356,7 +365,7 @@ def message_fields(filled: Scan, loaded: Loaded) -> Fields:
     """A filled scan as the columns that its message had, bit by bit for measured points, and `new`, `confidence`.
 
     New points have their x y z, a reflectance in the message's own scale, the ring number that their row, or the next
-    one that has any, has there, and the time of the points in their direction; other fields are 0.
+    one that has any, has there, the time of the points in their direction, and their class; other fields are 0.
     """
     given, new = loaded.given, filled.extra[PLACE] == 0
     place = np.where(new, 0, filled.extra[PLACE] - 1)
@@ -381,6 +390,11 @@ def message_fields(filled: Scan, loaded: Loaded) -> Fields:
         if (name := word.replace("file_", "")) in MARKS:  # which are none of ours
             fields[word] = fields.pop(name)
     more = {name: filled.extra[name] for name in ("confidence",) if name in filled.extra}
-    if filled.label is not None and "label" not in fields:
-        more["label"] = filled.label.astype(np.uint8)
+    if filled.label is not None:
+        if (name := find(given, "label")) is not None and loaded.scan.label is not None:
+            fields[name][new] = filled.label[new]
+        else:
+            if "label" in fields:  # of other words than ours
+                fields[written_names(["label"], given)[0]] = fields.pop("label")
+            more["label"] = filled.label.astype(np.uint8)
     return fields | {"new": filled.extra["new"]} | more
