@@ -16,6 +16,7 @@ from test_frame import street
 from test_recognise import turn
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, typestore
 from lidarsynth.data.windows import in_window
 from lidarsynth.data.workers import in_order
 from lidarsynth.experiment.folder import save
@@ -303,6 +304,17 @@ def test_a_scan_whose_picture_does_not_fit_on_the_disk_is_not_done(scans, tmp_pa
 
 def full(*names: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("out", ["o.mcap", "o"])
+def test_a_topic_without_messages_is_told(out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+    from rosbags.rosbag1 import Writer
+
+    with Writer(tmp_path / "in.bag") as writer:
+        writer.add_connection("/points", POINTS, typestore=typestore("ros1"))
+    main(["complete", str(tmp_path / "in.bag"), "--out", str(tmp_path / out), *WORDS, "--model", "nearest"])
+    assert " s; there was none to read; see " in capsys.readouterr().out
 
 
 def test_shards_are_the_whole(scans: Path, tmp_path: Path):
