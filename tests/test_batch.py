@@ -16,6 +16,7 @@ from test_frame import street
 from test_recognise import turn
 
 from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, typestore
 from lidarsynth.data.windows import in_window
 from lidarsynth.data.workers import in_order
 from lidarsynth.experiment.folder import save
@@ -25,7 +26,8 @@ from lidarsynth.lidar.frame import parse_transform, transformed
 from lidarsynth.lidar.scan import Scan, scan_of
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.scan_model import ScanModel
-from lidarsynth.verbs.batch_report import merge_shards, parse_shard
+from lidarsynth.verbs.batch import Result
+from lidarsynth.verbs.batch_report import add_to_journal, merge_shards, parse_shard
 from lidarsynth.verbs.inputs import inputs_of
 from lidarsynth.weights.load import load, load_parts
 
@@ -131,6 +133,63 @@ def test_the_report_tells_of_the_scans_that_were_there(shards: int, scans: Path,
         assert sorted(row["name"] for row in again["scans"]) == ["000", "001"]
 
 
+def test_a_folder_may_be_called_otherwise_by_the_run_that_goes_on(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    words = ["complete", "in/d2", *WORDS, "--model", "nearest", "--corrupt", "beams:2", "--out"]
+    main([*words, "o"])
+    whole = told(tmp_path / "o")
+    (tmp_path / "o").rename(tmp_path / "moved")
+    for out in (str(tmp_path / "moved"), "./in/../moved"):
+        main([*words, out, "--skip-existing"])
+        again = told(tmp_path / "moved")
+        assert (again["errors"], again["skipped"], len(again["scans"])) == (whole["errors"], 2, 2)
+        assert [row["target"] for row in again["scans"]] == [str(Path(out) / f"{i:03d}.ply") for i in (0, 1)]
+
+
+@pytest.mark.parametrize("shards", [1, 2])
+@pytest.mark.parametrize("corrupt", [[], ["--corrupt", "beams:2"]], ids=["filled", "judged"])
+def test_what_a_killed_run_has_made_stays_in_the_report(
+    corrupt: list[str], shards: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "in").mkdir()
+    for i in range(4 * shards):
+        write(tmp_path / "in" / f"{i:03d}.pcd", turn(SENSORS["vlp-16"]))
+    words = ["complete", str(tmp_path / "in"), *WORDS, "--model", "nearest", *corrupt, "--skip-existing", "--out"]
+    parts = [["--shard", f"{i + 1}/{shards}"] for i in range(shards)] if shards > 1 else [[]]
+    for part in parts:
+        main([*words, str(tmp_path / "whole"), *part])
+        with monkeypatch.context() as patch:  # the third file is there, and no row yet, as where processes are ahead
+            patch.setattr("lidarsynth.verbs.batch_report.add_to_journal", third_time())
+            with pytest.raises(SystemExit, match="130"):
+                main([*words, str(tmp_path / "o"), *part])
+    place, whole = tmp_path / "o", told(tmp_path / "whole")
+    (journal, *_) = sorted(place.glob(".report*.jsonl"))
+    with journal.open("a") as file:
+        file.write('{"name": "00')
+    capsys.readouterr()
+    for part in parts:
+        main([*words, str(place), *part])
+    again, said = told(place), capsys.readouterr().out
+    assert again["skipped"] == (2 if corrupt else 3) * shards and again.get("errors") == whole.get("errors")
+    assert len(again["scans"]) == (4 if corrupt else 3) * shards and not [n for n in names(place) if n[0] == "."]
+    assert said.count("mean of 4 scans") == (shards if corrupt else 0)
+
+
+def third_time():
+    """What adds to a journal twice, then is stopped."""
+    rows = []
+
+    def add(report: Path, result: Result) -> None:
+        rows.append(result)
+        if len(rows) == 3:
+            raise KeyboardInterrupt
+        add_to_journal(report, result)
+
+    return add
+
+
 def test_what_is_there_of_another_recipe_is_not_gone_on_with(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -164,7 +223,8 @@ def test_a_killed_run_tells_how_its_scans_were_made(
         patch.setattr("lidarsynth.cli.many.tell_of_many", killed)
         with pytest.raises(SystemExit, match="130"):
             main(words)
-    assert told(tmp_path / "o")["unfinished"] and names(tmp_path / "o") == ["000.ply", "report.json"]
+    assert told(tmp_path / "o")["unfinished"]
+    assert names(tmp_path / "o") == [".report.jsonl", "000.ply", "report.json"]
     main(["info", str(tmp_path / "o" / "report.json")])
     assert "not done" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
@@ -244,6 +304,17 @@ def test_a_scan_whose_picture_does_not_fit_on_the_disk_is_not_done(scans, tmp_pa
 
 def full(*names: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("out", ["o.mcap", "o"])
+def test_a_topic_without_messages_is_told(out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+    from rosbags.rosbag1 import Writer
+
+    with Writer(tmp_path / "in.bag") as writer:
+        writer.add_connection("/points", POINTS, typestore=typestore("ros1"))
+    main(["complete", str(tmp_path / "in.bag"), "--out", str(tmp_path / out), *WORDS, "--model", "nearest"])
+    assert " s; there was none to read; see " in capsys.readouterr().out
 
 
 def test_shards_are_the_whole(scans: Path, tmp_path: Path):

@@ -352,6 +352,7 @@ def test_upsample_fills_between_the_rings_of_a_thinned_scan(run: Run, tiny: Path
     answer = run("upsample", tmp_path / "thin.pcd", "--out", tmp_path / "d.npz", "--model", tiny, "--no-picture")
     assert answer.code == 0, answer.err
     image = read_image(tmp_path / "d.npz")
+    assert f" became {image.mask.sum()}" in answer.out, "what the file holds is counted"
     assert image.mask[1::2].mean() > 0.3, "the rows between measured ones are filled"
 
 

@@ -65,6 +65,17 @@ def test_a_second_run_reads_what_the_first_one_read(
 KINDS = (".bin", ".pcd", ".ply", ".npz")
 
 
+def test_a_killed_run_tells_what_it_made_though_its_scans_are_gone(scans: Path):
+    project(scans, scans, "--format", "ply")
+    report = scans / "report.json"
+    rows = json.loads(report.read_text())["scans"]
+    killed(scans)
+    (scans / "a.bin").unlink()
+    assert len(list(inputs_of([scans], None, scans).stream())) == 2  # a.ply may be anybody's
+    (scans / ".report.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    assert [item.path.name for item in inputs_of([scans], None, scans).stream()] == ["b.pcd"]
+
+
 @pytest.mark.parametrize("end", [whole, killed])
 def test_shards_count_the_same_scans_whatever_the_others_have_written(end: Callable[[Path], None], scans: Path):
     for shard in ("1/2", "2/2", "1/2", "2/2"):

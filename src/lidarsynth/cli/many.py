@@ -66,7 +66,8 @@ class Many:
 
 
 def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: str) -> list[Result]:
-    """Do the job with every scan, say what came of it, and return the results. Raises ValueError where all failed."""
+    """Do the job with every scan, say what came of it, and return the results, after those of scans that were there
+    already, as far as reports tell them. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
     from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream
     from lidarsynth.verbs.placement import parse_rings, read_transform
@@ -153,8 +154,10 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         is_mixed,
         merge_shards,
         parse_shard,
+        remove_report,
         report_of,
         report_path,
+        result_of,
         rows_before,
         same,
         shard_reports,
@@ -164,7 +167,9 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending, report = many.format or ("npz" if job.verb == "project" else "ply"), report_path(out, shard)
-    stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside)
+    before = rows_before(out, shard, ending) if many.skip_existing else {}
+    known = {file for file, row in before.items() if "errors" in row} if job.corrupt else None  # else no mean of all
+    stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside, known)
     first = next(stream, None)
     with _held(out, alone=shard[1] == 1):
         replaced = shard_reports(out) if shard[1] == 1 else []
@@ -173,17 +178,17 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
         if shard[1] == 1:
             sweep(out, deep=True, token=TOKEN)
         count = None if inputs.count is None else len(range(shard[0] - 1, inputs.count, shard[1]))
-        results = _done(job, model, _again(first, stream), many, count, report, settings)
+        results = _done(job, model, _again(first, stream), many, count, report, settings, before)
         seconds = time.perf_counter() - begun
         others = report.is_file() and not same(report, settings["recipe"], told=False)  # of a part, to be kept
         nothing = results and not skipped and all(result.error is not None for result in results)
         if nothing and (shard[1] == 1 or others):  # else the other parts may be whole
             refuse_all(results)
         out.mkdir(parents=True, exist_ok=True)
-        before = rows_before([*replaced, report], skipped)
-        write_report(report, report_of(results, len(skipped), seconds, settings, before))
+        rows = [before[file] for file in skipped if file in before]
+        write_report(report, report_of(results, len(skipped), seconds, settings, rows))
         for path in replaced:
-            path.unlink(missing_ok=True)
+            remove_report(path)
         merged = merge_shards(out, shard[1])
     if merged is not None and is_mixed(merged):
         warn(f"{merged}: expected shards of one recipe, found several in report-*-of-{shard[1]}.json; make those of "
@@ -194,7 +199,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
     say_summary(results, len(skipped), seconds, merged or report)
     if merged is not None:
         check_any(merged)
-    return results
+    return [*map(result_of, rows), *results]
 
 
 def _done(
@@ -205,15 +210,22 @@ def _done(
     count: int | None,
     report: Path,
     settings: dict[str, Any],
+    before: dict[Path, dict[str, Any]],
 ) -> list[Result]:
-    """What came of the works, said as they are done; from the first that is, the report tells that the run goes on."""
+    """What came of the works, said as they are done; from the first that is, the report tells that the run goes on, and
+    the journal what has been made, after what was `before`."""
     from lidarsynth.verbs.batch import run
+    from lidarsynth.verbs.batch_report import add_to_journal, begin_journal
 
     results = []
     with scan_bar(job.verb, count, _calls(job, model, many.workers)) as (on_scan, on_step):
         for result in run(job, works, many.workers, model, on_step):
-            if result.error is None and all(earlier.error is not None for earlier in results):
-                _begin(report, settings, many.skip_existing)
+            if result.error is None:
+                if all(earlier.error is not None for earlier in results):
+                    report.parent.mkdir(parents=True, exist_ok=True)
+                    begin_journal(report, before.values())
+                    _begin(report, settings, many.skip_existing)
+                add_to_journal(report, result)
             results.append(result)
             on_scan()
             tell_of_many(result, (count or PICTURES + 1) <= PICTURES, len(results))
@@ -271,7 +283,6 @@ def _begin(report: Path, settings: dict[str, Any], goes_on: bool) -> None:
     others = [] if "shard" in settings else shard_reports(report.parent)
     if all(same(path, recipe) for path in (report, *others)):
         return
-    report.parent.mkdir(parents=True, exist_ok=True)
     there = [path for path in (report, *others) if path.exists()]
     mixed = not all(goes_on and same(path, recipe, told=False) for path in there)
     write_report(report, unfinished(settings, mixed))

@@ -48,7 +48,7 @@ def say_summary(results: list[Result], skipped: int, seconds: float, where: Path
     done = len(results) - len(failed)
     text = f"{plural(done, 'scan')} in {seconds:.1f} s"
     text += f", {done / seconds:.1f} a second" if done and seconds > 1 else ""
-    text += f"; {skipped} {was(skipped)} there already" if skipped else ""
+    text += f"; {skipped} {was(skipped)} there already" if skipped else "" if results else "; there was none to read"
     text += f"; {len(failed)} failed: {', '.join(result.name for result in failed[:NAMED])}" if failed else ""
     text += ", ..." if len(failed) > NAMED else ""
     say(f"{text}; see {where}")

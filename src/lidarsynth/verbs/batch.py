@@ -207,12 +207,19 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         if work.target is not None and work.target.exists():
             text += f"; {work.target} is of an earlier run"
         return Result(work.item.name, work.item.path, work.target, time.perf_counter() - begun, text)
-    count = int(done.mask.sum()) if isinstance(done, RangeImage) else len(done.points)
     errors = {} if isinstance(done, RangeImage) else done.errors
     warning = "; ".join(filter(None, (warning, other))) or None
     whose = work.item.name, work.item.path, work.target, time.perf_counter() - begun
-    return Result(*whose, None, warning, loaded.dropped, (len(loaded.scan), count), note, errors, cloud, beside,
-                  picture)  # fmt: skip
+    count = len(loaded.scan), _count(done, work)
+    return Result(*whose, None, warning, loaded.dropped, count, note, errors, cloud, beside, picture)
+
+
+def _count(done: Filled | RangeImage, work: Work) -> int:
+    """How many points are written: a range image holds one a pixel."""
+    if isinstance(done, RangeImage):
+        return int(done.mask.sum())
+    in_image = work.target is not None and work.target.suffix.lower() == ".npz"
+    return int(done.image.mask.sum()) if in_image else len(done.points)
 
 
 def _of_any_sensor(model: ScanModel | None) -> bool:
@@ -309,7 +316,7 @@ def _made(
         return named, found(named.points, sensor) + _columns(sensor, job, "; ")
     sensor = named_sensor(scan, path, "--from", job.sensor, model.sensor if model.any_sensor else None)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
-    done = f"{len(scan)} points of {sensor.name} became {len(filled.points)}"
+    done = f"{len(scan)} points of {sensor.name} became {_count(filled, work)}"
     own = filled.image.sensor.width == sensor.width  # else the image is another sensor's
     return filled, done + _columns(sensor, job, "; ") if own else done
 

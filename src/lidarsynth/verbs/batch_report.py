@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.verbs.batch import MEANT, Result
-from lidarsynth.verbs.earlier_results import read_report
+from lidarsynth.verbs.earlier_results import journal_path, made_rows, read_report
 
 REPORT = "report.json"
 Shard = tuple[int, int]  # this part, counted from 1, and all parts
@@ -99,14 +99,35 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)[:60]
 
 
-def rows_before(paths: Sequence[Path], skipped: Sequence[Path]) -> list[dict[str, Any]]:
-    """What reports that lie there, the last of which counts most, say of the scans that were left out, by the files
-    that were made of them."""
-    there, rows = set(map(str, skipped)), {}
-    for path in paths:
-        found = ((read_report(path) if path.is_file() else None) or {}).get("scans", [])
-        rows |= {row["target"]: row for row in found if row.get("target") in there and "error" not in row}
-    return list(rows.values())
+def rows_before(out: Path, shard: Shard, ending: str) -> dict[Path, dict[str, Any]]:
+    """What reports in a folder, and journals of runs that were killed, say of the scans that were made, by the files
+    out/NAME.ending, however the folder was called then; a shard's own counts most."""
+    rows = {}
+    for path in (*(shard_reports(out) if shard[1] == 1 else ()), out / REPORT, report_path(out, shard)):
+        report = read_report(path) if path.is_file() else None
+        if report is None or report["settings"].get("format", ending) != ending:
+            continue
+        for row in made_rows(path, report):
+            file = out / f"{row['name']}.{ending}"
+            rows[file] = row | {"target": str(file)}
+    return rows
+
+
+def begin_journal(report: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """A journal of the rows that are known, in place of any that lies there."""
+    write_whole(journal_path(report), "".join(f"{json.dumps(row)}\n" for row in rows))
+
+
+def add_to_journal(report: Path, result: Result) -> None:
+    """The row of a scan that was made, which a kill leaves."""
+    with journal_path(report).open("a", encoding="utf-8") as file:
+        file.write(f"{json.dumps(_row(result))}\n")
+
+
+def result_of(row: Mapping[str, Any]) -> Result:
+    """A scan that a run before has made: whose it is, and its errors."""
+    errors = {name: _errors(table) for name, table in row.get("errors", {}).items()}
+    return Result(row["name"], Path(row["source"]), Path(row["target"]), row["seconds"], errors=errors)
 
 
 def report_of(
@@ -169,8 +190,16 @@ def _row(result: Result) -> dict[str, Any]:
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """The report as JSON, whole or not at all."""
+    """The report as JSON, whole or not at all; once the run is done its journal goes."""
     write_whole(path, json.dumps(report, indent=1) + "\n")
+    if "unfinished" not in report:
+        journal_path(path).unlink(missing_ok=True)
+
+
+def remove_report(path: Path) -> None:
+    """Takes away a report that another one stands for, with its journal."""
+    path.unlink(missing_ok=True)
+    journal_path(path).unlink(missing_ok=True)
 
 
 def merge_shards(out: Path, parts: int) -> Path | None:

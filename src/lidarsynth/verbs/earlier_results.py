@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lidarsynth.data.folder import stem
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
+
+NEEDED = {"name", "source", "seconds"}  # of the row of a scan
 
 
 def read_report(path: Path) -> dict[str, Any] | None:
@@ -20,13 +24,28 @@ def read_report(path: Path) -> dict[str, Any] | None:
         return None
 
 
+def journal_path(report: Path) -> Path:
+    """Where the rows of a run's scans lie until its report is whole: hidden, a line of JSON each."""
+    return report.with_name(f".{report.stem}.jsonl")
+
+
+def made_rows(path: Path, report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The rows of scans that were made: those of the report at `path`, then those of its journal, which are later.
+    Lines that a kill has torn are passed over."""
+    journal, rows = journal_path(path), list(report.get("scans", ()))
+    for line in journal.read_text(errors="replace").splitlines() if journal.is_file() else ():
+        with suppress(ValueError):
+            rows.append(json.loads(line))
+    return [row for row in rows if isinstance(row, dict) and row.keys() >= NEEDED and "error" not in row]
+
+
 @dataclass(frozen=True)
 class EarlierResults:
     """What earlier runs have left in a folder.
 
     folder   absolute, without links
-    told     files that its reports name
-    endings  of the files of its runs, also of those that were killed, whose reports name no file
+    told     files that its reports name, and the journals of runs that were killed
+    endings  of the files of its runs, also of those that were killed, and were not to name their last files
     """
 
     folder: Path
@@ -86,5 +105,5 @@ def earlier_results(out: Path | None) -> EarlierResults | None:
             continue  # something else of the user's
         ending = f".{report['settings'].get('format')}"
         endings.add(ending)
-        told |= {folder / f"{row.get('name')}{ending}" for row in report.get("scans", ()) if "error" not in row}
+        told |= {folder / f"{row['name']}{ending}" for row in made_rows(path, report)}
     return EarlierResults(folder, frozenset(told), frozenset(endings))

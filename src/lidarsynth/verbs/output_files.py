@@ -23,11 +23,13 @@ def works(
     skip: bool = False,
     skipped: list[Path] | None = None,
     beside: tuple[str, ...] = (),
+    known: Collection[Path] | None = None,
 ) -> Iterator[Work]:
     """Each scan of this shard with its file: `out` for a single one that names a file, else out/NAME.ending.
 
     skip     leave out scans whose file is there already; they are added to `skipped`
     beside   endings of the files that are written beside a .bin or .npy
+    known    the only files whose scans may be left out; None = all
     Raises ValueError where `out` cannot be written, is a scan's own file, or names one file for several scans, and
     where a file beside it is a scan's own, or holds the labels of other points.
     """
@@ -43,7 +45,7 @@ def works(
         if number % parts != part - 1:
             continue
         file = target(out if one else out / f"{item.name}.{ending}", item.path)
-        if skip and file.exists():
+        if skip and file.exists() and (known is None or file in known):
             if skipped is not None:
                 skipped.append(file)
             continue
