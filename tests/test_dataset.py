@@ -314,10 +314,19 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         list(write_cache(tmp_path, image, 10, SENSOR, {"name": "other"}, name))
     with pytest.raises(ValueError, match=r"expected a cache of sensor \{width 64\}, found one of \{width 32\}"):
         list(write_cache(tmp_path, image, 10, SENSOR.resized(width=64), WHAT, name))
-    with pytest.raises(ValueError, match=r"expected the scans .*'000007'.*found .*'000000'.*name another folder"):
+    with pytest.raises(
+        ValueError, match=r"the scan drive0/000000, as in this cache, found drive0/000007 in its place; name"
+    ):
         list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: name(i + 7)))
     with pytest.raises(ValueError, match=r"expected a cache folder with index.json, found No such file"):
         CachedImages(tmp_path / "nowhere")
+
+
+def test_a_scan_that_is_gone_from_the_middle_is_named(tmp_path: Path):
+    """The message showed the first scans of both, which were the same."""
+    list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: (".", f"{i}.pcd")))
+    with pytest.raises(ValueError, match=r"expected the scan 5.pcd, as in this cache, found 6.pcd in its place; name"):
+        list(write_cache(tmp_path, image, 9, SENSOR, WHAT, lambda i: (".", f"{i + (i > 4)}.pcd")))
 
 
 def test_the_command_line_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

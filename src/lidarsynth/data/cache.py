@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -174,9 +175,11 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
     if "frames" in entry and task.name:
         lost = [scan[:2] for scan in entry.get("skipped", [])]
         now = [frame for i in task.numbers(first) if (frame := task.frame(i)) not in lost]
-        if now != entry["frames"][: len(now)]:
-            raise ValueError(f"{task.folder}: expected the scans {now[:1]}... from image {first} on, found "
-                             f"{entry['frames'][:1]}...; name another folder")  # fmt: skip
+        stored = entry["frames"][: len(now)]
+        if now != stored:
+            old, new = next((old, new) for old, new in zip_longest(stored, now) if old != new)
+            raise ValueError(f"{task.folder}: expected the scan {_path(old)}, as in this cache, found {_path(new)} in "
+                             "its place; name another folder")  # fmt: skip
     if "files" in entry and task.stamp is not None and task.files(first) != entry["files"]:
         return False
     if entry["count"] == 0:
@@ -185,6 +188,11 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
     if not path.is_file() or path.stat().st_size != size:
         return False
     return not check or sha256(path) == entry["sha256"]
+
+
+def _path(frame: Sequence[str] | None) -> str:
+    """[sequence, frame] as one word of a message, without the sequence of files that lie in the folder itself."""
+    return "none" if frame is None else "/".join(part for part in frame if part not in ("", "."))
 
 
 def _refuse_none(index: dict[str, Any], entry: dict[str, Any]) -> None:
