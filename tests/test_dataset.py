@@ -322,6 +322,17 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         CachedImages(tmp_path / "nowhere")
 
 
+def test_images_of_another_shape_than_the_sensor_s_are_refused(tmp_path: Path):
+    """They were written, and the cache could not be read."""
+    for sensor in (SENSOR.resized(width=64), SENSORS["vlp-16"]):
+        with pytest.raises(
+            ValueError, match=rf"expected images of \(\d+, {sensor.width}\).* found image 0 of \(8, 32\)"
+        ):
+            list(write_cache(tmp_path, image, 3, sensor, WHAT))
+    assert list(write_cache(tmp_path, image, 3, SENSOR, WHAT)) == [3], "the folder serves"
+    assert len(CachedImages(tmp_path)) == 3
+
+
 def test_a_scan_that_is_gone_from_the_middle_is_named(tmp_path: Path):
     """The message showed the first scans of both, which were the same."""
     list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: (".", f"{i}.pcd")))

@@ -75,8 +75,8 @@ def write_cache(
     stamp    image number -> a text that changes when its files do, and one that also does where they were copied
              elsewhere; shards of changed files are made anew
     Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
-    when the folder holds something else, another process writes to it or no scan can be read, OSError of one line when
-    the disk is full.
+    when the folder holds something else, another process writes to it, an image has not the sensor's shape or no scan
+    can be read, OSError of one line when the disk is full.
     """
     folder = Path(folder)
     with only_writer(folder, "preparation of a cache"):
@@ -95,7 +95,7 @@ def _write(
     stamp: Stamp | None,
 ) -> Iterator[int]:
     index = open_index(folder, sensor, source, count, range_step(sensor))
-    task = _Task(folder, image, name, count, stored_step(index), stamp)
+    task = _Task(folder, image, name, count, stored_step(index), stamp, (sensor.height, sensor.width))
     firsts = range(0, count, SHARD)
     for first in firsts if index.pop(MOVED, False) else ():  # a copy has other times
         if (entry := index["shards"].get(_shard(first))) and entry.get("files", [None])[0] == task.files(first)[0]:
@@ -129,6 +129,7 @@ class _Task:
     count: int
     step: float
     stamp: Stamp | None
+    shape: tuple[int, int]
 
     def numbers(self, first: int) -> range:
         return range(first, min(first + SHARD, self.count))
@@ -145,14 +146,21 @@ class _Task:
         return [hashlib.sha256("\n".join(part).encode()).hexdigest()[:16] for part in parts]
 
     def store(self, first: int) -> dict[str, Any]:
-        """Make the shard whose first image is `first`, and say what its entry in the index is."""
+        """Make the shard whose first image is `first`, and say what its entry in the index is. Raises ValueError for an
+        image of another shape than the sensor's: that is no broken scan, the others will have it too."""
         records, frames, skipped, files = [], [], [], self.files(first)
         for i in self.numbers(first):
             try:
-                records.append(pack(self.image(i), self.step))
-                frames.append(self.frame(i))
+                image = self.image(i)
+                record = pack(image, self.step)
             except ValueError as error:
                 skipped.append([*self.frame(i), str(error)])
+                continue
+            if image.shape != self.shape:
+                raise ValueError(f"{self.folder}: expected images of {self.shape}, as the sensor has, found image {i} "
+                                 f"of {image.shape}")  # fmt: skip
+            records.append(record)
+            frames.append(self.frame(i))
         entry: dict[str, Any] = {"count": len(records), "tried": len(self.numbers(first))}
         if records:
             entry["sha256"] = _store(self.folder / _shard(first), np.stack(records))
