@@ -15,13 +15,16 @@ import torch
 from forked import Forked
 from oracle import assert_close
 from random_images import SENSOR, WHAT, image, name
+from test_frame import moved, street
 from torch.utils.data import DataLoader
 
 from lidarsynth.cli.main import main
 from lidarsynth.data import cache
 from lidarsynth.data.dataset import CachedImages, SeveralCaches, read_index, verify, write_cache
-from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, prepare, summary
+from lidarsynth.data.sources import SOURCES, Projected, cache_source, cache_synthetic, prepare, summary, unfit
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.depth import CODECS, to_x_0
+from lidarsynth.lidar.frame import parse_transform
 from lidarsynth.lidar.projection import project, thin
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
@@ -314,10 +317,30 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         list(write_cache(tmp_path, image, 10, SENSOR, {"name": "other"}, name))
     with pytest.raises(ValueError, match=r"expected a cache of sensor \{width 64\}, found one of \{width 32\}"):
         list(write_cache(tmp_path, image, 10, SENSOR.resized(width=64), WHAT, name))
-    with pytest.raises(ValueError, match=r"expected the scans .*'000007'.*found .*'000000'.*name another folder"):
+    with pytest.raises(
+        ValueError, match=r"the scan drive0/000000, as in this cache, found drive0/000007 in its place; name"
+    ):
         list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: name(i + 7)))
     with pytest.raises(ValueError, match=r"expected a cache folder with index.json, found No such file"):
         CachedImages(tmp_path / "nowhere")
+
+
+def test_images_of_another_shape_than_the_sensor_s_are_refused(tmp_path: Path):
+    """They were written, and the cache could not be read."""
+    for sensor in (SENSOR.resized(width=64), SENSORS["vlp-16"]):
+        with pytest.raises(
+            ValueError, match=rf"expected images of \(\d+, {sensor.width}\).* found image 0 of \(8, 32\)"
+        ):
+            list(write_cache(tmp_path, image, 3, sensor, WHAT))
+    assert list(write_cache(tmp_path, image, 3, SENSOR, WHAT)) == [3], "the folder serves"
+    assert len(CachedImages(tmp_path)) == 3
+
+
+def test_a_scan_that_is_gone_from_the_middle_is_named(tmp_path: Path):
+    """The message showed the first scans of both, which were the same."""
+    list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: (".", f"{i}.pcd")))
+    with pytest.raises(ValueError, match=r"expected the scan 5.pcd, as in this cache, found 6.pcd in its place; name"):
+        list(write_cache(tmp_path, image, 9, SENSOR, WHAT, lambda i: (".", f"{i + (i > 4)}.pcd")))
 
 
 def test_the_command_line_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -543,6 +566,62 @@ def test_files_without_intensity_are_read_when_told_so(tmp_path: Path):
     assert image.mask.mean() > 0.9 and not image.reflectance.any()
     with pytest.raises(ValueError, match=r"expected --intensity with files.* found it with kitti"):
         list(cache_source("kitti", tmp_path, tmp_path / "c", intensity="none"))
+
+
+def test_files_in_another_frame_are_told_of_and_taken_with_a_transform(tmp_path: Path, capsys):
+    """They lost the points that were out of view, without the transform that undoes it, and could not be given any."""
+    (tmp_path / "own").mkdir()
+    (tmp_path / "away").mkdir()
+    scan = street("hdl-32e")
+    for i in range(3):
+        write(tmp_path / f"own/{i}.ply", scan)
+        write(tmp_path / f"away/{i}.ply", moved(scan, parse_transform("1.5:0:2.3:0:0:0")))
+    words = ["--sensor", "hdl-32e", "--workers", "0"]
+    main(["data", "files", str(tmp_path / "own"), str(tmp_path / "cache-own"), *words])
+    assert capsys.readouterr().err.count("\n") == 0
+    main(["data", "files", str(tmp_path / "away"), str(tmp_path / "cache-away"), *words])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "away/0.ply: expected points in the sensor's frame" in line and "try --transform -1.5:0:-2.3" in line
+    assert "3 of 3 scans that were looked at are so, and drawn all the same" in line
+    move = ["--transform=-1.5:0:-2.3:0:0:0"]
+    main(["data", "files", str(tmp_path / "away"), str(tmp_path / "cache"), *words, *move])
+    assert capsys.readouterr().err == ""
+    own, back = CachedImages(tmp_path / "cache-own")[0], CachedImages(tmp_path / "cache")[0]
+    assert (own.mask == back.mask).mean() > 0.99
+    main(["data", "files", str(tmp_path / "away"), str(tmp_path / "cache"), *words, *move])
+    assert capsys.readouterr().out.startswith("nothing is new")
+    with pytest.raises(SystemExit):
+        main(["data", "files", str(tmp_path / "away"), str(tmp_path / "cache"), *words])
+    assert "expected a cache of source {transform None}, found one of {transform [[1.0" in capsys.readouterr().err
+
+
+def test_scans_of_another_sensor_among_files_are_told_of(tmp_path: Path):
+    """Only the first was looked at, and of that only its view."""
+    own, other = (Sensor("own", tuple(np.linspace(top, -14, n)), 128) for top, n in ((15, 24), (13, 9)))
+    for i in range(20):
+        without_intensity(tmp_path / f"{i:02d}.pcd", other if i > 16 else own)
+    (tmp_path / "own.toml").write_text("beams = 24\ntop = 15\nbottom = -14\nwidth = 128\n")
+    line = unfit("files", tmp_path, str(tmp_path / "own.toml"), "none")
+    assert line is not None and "18.pcd: expected points of own, found them on 9 rings that are not on its 24" in line
+    assert "1 of 7 scans that were looked at" in line
+    assert unfit("kitti", tmp_path, None) is None
+
+
+def test_some_rings_of_files_of_several_sensors_are_taken(tmp_path: Path):
+    (tmp_path / "scans").mkdir()
+    two = Sensor("two", tuple(np.linspace(15, -15, 32)), 64)
+    without_intensity(tmp_path / "scans/0.pcd", two)
+    first = two.rows(range(16))
+    (tmp_path / "first.json").write_text(json.dumps(first.to_dict()))
+    words = ("files", tmp_path / "scans", tmp_path / "cache", "all", str(tmp_path / "first.json"))
+    list(cache_source(*words, intensity="none", rings=(0, 15)))
+    assert CachedImages(tmp_path / "cache").source["rings"] == [0, 15]
+    assert CachedImages(tmp_path / "cache")[0].mask.sum() == 16 * 64
+    for word, more in (("--rings", {"rings": (0, 15)}), ("--transform", {"transform": np.eye(4)})):
+        with pytest.raises(ValueError, match=rf"expected {word} with files.* found it with kitti"):
+            list(cache_source("kitti", tmp_path, tmp_path / "c", **more))
+        with pytest.raises(ValueError, match=rf"expected {word} with a data set, found it with synthetic"):
+            prepare("synthetic", tmp_path / "c", None, **more)
 
 
 def test_the_sensor_of_files_is_recognised_or_asked_for(tmp_path: Path):

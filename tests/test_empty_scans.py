@@ -13,13 +13,13 @@ import lidarsynth as ls
 from lidarsynth.cli.main import main
 from lidarsynth.data.bag_records import Cloud
 from lidarsynth.data.bag_writer import write_bag
+from lidarsynth.data.frames import moved
 from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.files.fields import FileError, scan_from_fields
 from lidarsynth.files.formats import WRITERS, read, write
 from lidarsynth.files.point_cloud2 import decode, encode
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
-from lidarsynth.verbs.inputs import moved
 
 NONE = "expected points, found a scan of none"
 EMPTY = replace(full_scan(), extra={"tag": np.ones(len(full_scan()), np.uint64)})[:0]

@@ -14,8 +14,8 @@ from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, 
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.recognition import elevations_of, recognise
-from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import INVERTED, SENSORS, get_sensor
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.view import misfit
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.verbs.placement import read_transform
@@ -139,6 +139,24 @@ def test_points_that_a_named_sensor_could_not_see():
     assert misfit(scan.xyz, SENSORS["hdl-32e"], ring) is None
     two = np.concatenate([scan.xyz, scan.xyz]), np.concatenate([ring, ring + 64])
     assert "on 64 rings, more than its 32 beams" in str(misfit(two[0], SENSORS["hdl-32e"], two[1]))
+
+
+def test_rings_between_the_beams_are_no_named_sensors():
+    """Of a sensor of fewer beams: in the view of the named one, whose rows they filled without a word."""
+    other = Sensor("other", tuple(np.linspace(14, -13, 8).tolist()), 512)
+    scan = cylinder(other)
+    assert misfit(scan.xyz, other, scan.ring) is None
+    assert misfit(scan.xyz, SENSORS["vlp-16"], scan.ring) == "them on 8 rings that are not on its 16 beams"
+    own = cylinder(SENSORS["vlp-16"])
+    second = own[np.asarray(own.ring) % 2 == 1]
+    for ring in (np.asarray(second.ring), np.asarray(second.ring) // 2):
+        assert misfit(second.xyz, SENSORS["vlp-16"], ring) is None, "every second beam, numbered as it was, and anew"
+
+
+def cylinder(sensor: Sensor) -> Scan:
+    """A scan of walls 20 m away all around."""
+    distance = np.full((sensor.height, sensor.width), 20, np.float32)
+    return RangeImage(distance, 0 * distance, distance > 0, sensor).to_scan()
 
 
 def test_points_on_no_beams_are_no_named_sensors():

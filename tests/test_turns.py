@@ -13,9 +13,9 @@ from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.columns import azimuth_step
 from lidarsynth.lidar.learning import learn_sensor
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.turns import _in_order, several_turns
-from lidarsynth.verbs.batch import Job, _misfit
+from lidarsynth.lidar.view import misfit_of
 from lidarsynth.verbs.learned_sensor import doubts, sensor_toml
 
 FAN = Sensor("fan", tuple(np.linspace(20, -20, 40)))  # nobody's
@@ -141,10 +141,10 @@ def test_a_sensor_fits_the_scan_that_it_was_learned_from(tmp_path: Path):
     np.testing.assert_allclose(learned.sensor.elevations, np.array(FAN.elevations)[rows], atol=0.02)
     (line,) = doubts(learned)
     assert "found fewer in 3, which are left out of the fit, 2 with their few points as rows" in line
-    job = Job("complete", sensor=str(tmp_path / "own.toml"))
-    assert _misfit(scan, job) is None
-    assert _misfit(thinned(turn(FAN), (30, 12)), job) is None, "a ring that it has not, and hardly the scan"
-    assert "on 40 rings, more than its 39 beams" in str(_misfit(turn(FAN), job))
+    sensor = get_sensor(str(tmp_path / "own.toml"))
+    assert misfit_of(scan, sensor) is None
+    assert misfit_of(thinned(turn(FAN), (30, 12)), sensor) is None, "a ring that it has not, and hardly the scan"
+    assert "on 40 rings, more than its 39 beams" in str(misfit_of(turn(FAN), sensor))
 
 
 def test_stray_points_of_a_ring_move_no_beam():

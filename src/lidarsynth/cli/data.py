@@ -26,6 +26,10 @@ def data(
     intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
     apart: bool = False,
     inside: bool = False,
+    transform: str | None = None,
+    axes: str = "flu",
+    mount: float | None = None,
+    rings: str | None = None,
 ) -> None:
     """Prepare a cache of range images for training; killed at any moment, the same command goes on.
 
@@ -45,17 +49,23 @@ def data(
         intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
         apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
         inside: synthetic scans of rooms, halls and garages, for robots, the sensor as high as its mount says.
+        transform: brings points of files into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers.
+        axes: where x, y, z of files point (f b l r u d), as of complete.
+        mount: metres of the sensor above z = 0 of files, where that is the ground.
+        rings: of files of several sensors, such as 32-63; all others are left out.
     """
     from lidarsynth.data.sources import prepare, shards, summary, unfit
+    from lidarsynth.verbs.placement import parse_rings, read_transform
 
     at_least(1, {"count": count})
     at_least(0, {"seed": seed, "workers": workers})
     if count is not None and count > MOST:
         raise ValueError(f"expected --count of at most {MOST:,} synthetic scans, found {count:,}")
-    more = (workers, count, check, seed, intensity, apart, inside)
+    frame = read_transform(transform, mount, axes), parse_rings(rings)
+    more = (workers, count, check, seed, intensity, apart, inside, *frame)
     there = shards(cache or root)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass
-    if (note := unfit(source, root, sensor, intensity)) is not None:
+    if (note := unfit(source, root, sensor, intensity, *frame)) is not None:
         warn(note)
     say(f"{'nothing is new:' if shards(cache or root) == there else 'wrote'} {summary(cache or root)}")

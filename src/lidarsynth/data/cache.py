@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,8 @@ def write_cache(
     stamp    image number -> a text that changes when its files do, and one that also does where they were copied
              elsewhere; shards of changed files are made anew
     Interrupted at any moment, the next call continues: a shard is moved into place when it is whole. Raises ValueError
-    when the folder holds something else, another process writes to it or no scan can be read, OSError of one line when
-    the disk is full.
+    when the folder holds something else, another process writes to it, an image has not the sensor's shape or no scan
+    can be read, OSError of one line when the disk is full.
     """
     folder = Path(folder)
     with only_writer(folder, "preparation of a cache"):
@@ -94,7 +95,7 @@ def _write(
     stamp: Stamp | None,
 ) -> Iterator[int]:
     index = open_index(folder, sensor, source, count, range_step(sensor))
-    task = _Task(folder, image, name, count, stored_step(index), stamp)
+    task = _Task(folder, image, name, count, stored_step(index), stamp, (sensor.height, sensor.width))
     firsts = range(0, count, SHARD)
     for first in firsts if index.pop(MOVED, False) else ():  # a copy has other times
         if (entry := index["shards"].get(_shard(first))) and entry.get("files", [None])[0] == task.files(first)[0]:
@@ -128,6 +129,7 @@ class _Task:
     count: int
     step: float
     stamp: Stamp | None
+    shape: tuple[int, int]
 
     def numbers(self, first: int) -> range:
         return range(first, min(first + SHARD, self.count))
@@ -144,14 +146,21 @@ class _Task:
         return [hashlib.sha256("\n".join(part).encode()).hexdigest()[:16] for part in parts]
 
     def store(self, first: int) -> dict[str, Any]:
-        """Make the shard whose first image is `first`, and say what its entry in the index is."""
+        """Make the shard whose first image is `first`, and say what its entry in the index is. Raises ValueError for an
+        image of another shape than the sensor's: that is no broken scan, the others will have it too."""
         records, frames, skipped, files = [], [], [], self.files(first)
         for i in self.numbers(first):
             try:
-                records.append(pack(self.image(i), self.step))
-                frames.append(self.frame(i))
+                image = self.image(i)
+                record = pack(image, self.step)
             except ValueError as error:
                 skipped.append([*self.frame(i), str(error)])
+                continue
+            if image.shape != self.shape:
+                raise ValueError(f"{self.folder}: expected images of {self.shape}, as the sensor has, found image {i} "
+                                 f"of {image.shape}")  # fmt: skip
+            records.append(record)
+            frames.append(self.frame(i))
         entry: dict[str, Any] = {"count": len(records), "tried": len(self.numbers(first))}
         if records:
             entry["sha256"] = _store(self.folder / _shard(first), np.stack(records))
@@ -174,9 +183,11 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
     if "frames" in entry and task.name:
         lost = [scan[:2] for scan in entry.get("skipped", [])]
         now = [frame for i in task.numbers(first) if (frame := task.frame(i)) not in lost]
-        if now != entry["frames"][: len(now)]:
-            raise ValueError(f"{task.folder}: expected the scans {now[:1]}... from image {first} on, found "
-                             f"{entry['frames'][:1]}...; name another folder")  # fmt: skip
+        stored = entry["frames"][: len(now)]
+        if now != stored:
+            old, new = next((old, new) for old, new in zip_longest(stored, now) if old != new)
+            raise ValueError(f"{task.folder}: expected the scan {_path(old)}, as in this cache, found {_path(new)} in "
+                             "its place; name another folder")  # fmt: skip
     if "files" in entry and task.stamp is not None and task.files(first) != entry["files"]:
         return False
     if entry["count"] == 0:
@@ -185,6 +196,11 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
     if not path.is_file() or path.stat().st_size != size:
         return False
     return not check or sha256(path) == entry["sha256"]
+
+
+def _path(frame: Sequence[str] | None) -> str:
+    """[sequence, frame] as one word of a message, without the sequence of files that lie in the folder itself."""
+    return "none" if frame is None else "/".join(part for part in frame if part not in ("", "."))
 
 
 def _refuse_none(index: dict[str, Any], entry: dict[str, Any]) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
 from lidarsynth.data.frames import Frame, Frames
 from lidarsynth.files.formats import NAMED_ONLY, READERS
 
@@ -13,14 +15,19 @@ BESIDE = ("labels", "rings", "point_times", "lidarseg", "panoptic", "predictions
 RADAR = "radar_"
 
 
-def folder(root: str | Path, intensity: str = "auto") -> Frames:
+def folder(
+    root: str | Path,
+    intensity: str = "auto",
+    transform: np.ndarray | None = None,
+    rings: tuple[int, int] | None = None,
+) -> Frames:
     """Every scan under `root`, sorted by path; sequence = the folder below `root`, frame = the file's name.
 
-    intensity  scale of the files, as in `files.formats.read`
+    intensity, transform, rings  as of `Frames`
     A `.label` file beside a scan, of the same name, gives its SemanticKITTI labels. Raises ValueError without any scan.
     """
     frames = [_frame(path, Path(root)) for path in scan_files(root)]
-    return Frames("files", frames, intensity=intensity)
+    return Frames("files", frames, intensity=intensity, transform=transform, rings=rings)
 
 
 def _frame(path: Path, root: Path) -> Frame:

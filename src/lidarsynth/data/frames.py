@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from lidarsynth.files.arrays import is_text
-from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, MAX_POINTS
+from lidarsynth.files.fields import MAX_BYTES, MAX_METRES, MAX_POINTS, find, rings_from_top
 from lidarsynth.files.formats import BESIDE, read
+from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.scan import MEDIAN, Scan
 
 
@@ -62,12 +63,16 @@ class Frames:
     frames     one per scan
     missing    sequences of the chosen split that are not on this disk
     intensity  scale of the files, as in `files.formats.read`
+    transform  (4, 4) that brings the points into the sensor's frame, or None
+    rings      of files of several sensors, the first and last to read, as in `files.formats.read`
     """
 
     source: str
     frames: Sequence[Frame]
     missing: tuple[str, ...] = ()
     intensity: str = "unit"
+    transform: np.ndarray | None = None
+    rings: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -75,13 +80,26 @@ class Frames:
     def __getitem__(self, index: int) -> Scan:
         frame = self.frames[index]
         kitti = frame.path.endswith(".bin") and not frame.path.endswith(".pcd.bin")
-        if kitti and frame.labels is None and self.intensity == "unit":
-            return read_velodyne(frame.path)
-        return read(frame.path, self.intensity, frame.labels)
+        if kitti and frame.labels is None and self.intensity == "unit" and self.rings is None:
+            scan = read_velodyne(frame.path)
+        else:
+            scan = read(frame.path, self.intensity, frame.labels, self.rings)
+        return scan if self.transform is None else moved(scan, self.transform)
 
     def name(self, index: int) -> Name:
         """Source, sequence and frame of scan `index`."""
         return Name(self.source, self.frames[index].sequence, self.frames[index].frame)
+
+
+def moved(scan: Scan, transform: np.ndarray) -> Scan:
+    """The scan in another frame, by a (4, 4) `transform`: where up is elsewhere then, its rings count from the other
+    end, and `extra["ring"]` has the numbers as they were. Raises FileError for ring numbers that are none."""
+    xyz, ring, extra = transformed(scan.xyz, transform), scan.ring, dict(scan.extra)
+    if (was := scan.ring) is not None:
+        ring = rings_from_top(was, xyz)
+        if (ring != was).any() and find(extra, "ring") is None:
+            extra["ring"] = was
+    return replace(scan, xyz=xyz, ring=ring, extra=extra)
 
 
 def read_velodyne(path: str | Path) -> Scan:

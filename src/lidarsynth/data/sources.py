@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidarsynth.data.cache import write_cache
 from lidarsynth.data.folder import folder as scan_folder
 from lidarsynth.data.folder import scan_files
@@ -24,7 +26,7 @@ from lidarsynth.lidar.projection import PROJECTIONS, columns_of, project_thinned
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.view import misfit
+from lidarsynth.lidar.view import placement
 from lidarsynth.streets.edition import EDITION
 
 __all__ = ["SOURCES", "Projected", "Source", "cache_source", "cache_synthetic", "prepare", "scan_files", "summary"]
@@ -58,6 +60,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "files": Source(lambda root, split: _files(root, split), "all", None, "auto", 1024),
 }
 
+CHECKED = 8  # scans from everywhere, whether they are in their sensor's frame: 0.3 s
 LOOKED_AT = 16  # scans from everywhere, whether all are of one sensor
 SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
 
@@ -91,13 +94,16 @@ def prepare(
     intensity: str = "auto",
     apart: bool = False,
     inside: bool = False,
+    transform: np.ndarray | None = None,
+    rings: tuple[int, int] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """`cache_synthetic` for the word synthetic, whose cache may be `root` itself; `cache_source` for the others.
 
     count  of synthetic scans alone; None = 1000
     """
     if name == "synthetic":
-        for word, given in (("--split", split), ("--projection", projection)):
+        others = {"--split": split, "--projection": projection, "--transform": transform, "--rings": rings}
+        for word, given in others.items():
             if given is not None:
                 raise ValueError(f"expected {word} with a data set, found it with synthetic, whose scans are cast")
         spec = SYNTHETIC if sensor is None else sensor
@@ -110,7 +116,8 @@ def prepare(
         raise ValueError(f"expected -n with synthetic, of which there are endless ones, found it with {name}")
     if folder is None:
         raise ValueError(f"expected data {name} ROOT CACHE, found no CACHE")
-    return cache_source(name, root, folder, split, sensor, projection, width, workers, check, intensity)
+    return cache_source(name, root, folder, split, sensor, projection, width, workers, check, intensity,
+                        transform, rings)  # fmt: skip
 
 
 def cache_source(
@@ -124,12 +131,14 @@ def cache_source(
     workers: int | None = 0,
     check: bool = False,
     intensity: str = "auto",
+    transform: np.ndarray | None = None,
+    rings: tuple[int, int] | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Project a data set into a cache; yields (scans done, scans in all). What is None is the source's own.
 
     name     a word of SOURCES; `root` is where the data set lies, `folder` the cache; `split` a word of its reader
     workers, check  as in `write_cache`; None = as many as there are processors
-    intensity       scale of the source `files`, as in `files.formats.read`
+    intensity, transform, rings  of the source `files`: scale, frame and part of them, as of `Frames`
     Raises ValueError for unknown words, a root without scans, or a cache of something else; OSError for a full disk.
     """
     if name not in SOURCES:
@@ -140,12 +149,14 @@ def cache_source(
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
-    reader = _reader(name, Path(root), split, intensity)
+    reader = _reader(name, Path(root), split, intensity, transform, rings)
     word = sensor or own.sensor or _recognised(reader)
     spec, columns = _sensor(word, width), columns_of(projection, width, get_sensor(word).width)
     image = Projected(reader, spec, projection, columns, own.resizing)
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
     source |= {} if intensity == "auto" else {"intensity": intensity}
+    source |= {} if transform is None else {"transform": np.asarray(transform).tolist()}
+    source |= {} if rings is None else {"rings": list(rings)}
     source |= {"root": str(Path(root).resolve()), "missing": list(reader.missing)}
     stamp = partial(stamped, reader.frames) if isinstance(reader, Frames | NuScenes) else None
     for done in write_cache(folder, image, len(reader), spec, source, reader.name, _processes(workers), check, stamp):
@@ -190,31 +201,59 @@ def _width(given: int | None, sensor: str | None, source: int) -> int:
     return source if sensor is None or sensor in WORDS else get_sensor(sensor).width
 
 
-def _files(root: Path, split: str, intensity: str = "auto") -> Frames:
+def _files(
+    root: Path,
+    split: str,
+    intensity: str = "auto",
+    transform: np.ndarray | None = None,
+    rings: tuple[int, int] | None = None,
+) -> Frames:
     choose("files", split, ("all",))
-    return scan_folder(root, intensity)
+    return scan_folder(root, intensity, transform, rings)
 
 
-def _reader(name: str, root: Path, split: str, intensity: str) -> Reader:
-    if intensity == "auto":
+def _reader(
+    name: str,
+    root: Path,
+    split: str,
+    intensity: str,
+    transform: np.ndarray | None,
+    rings: tuple[int, int] | None,
+) -> Reader:
+    asked = {"--intensity": intensity != "auto", "--transform": transform is not None, "--rings": rings is not None}
+    if not any(asked.values()):
         return SOURCES[name].reader(root, split)
     if name != "files":
-        raise ValueError(f"expected --intensity with files, whose scale is not known, found it with {name}")
-    return _files(root, split, intensity)
+        word, what = next(word for word in asked if asked[word]), "scale" if asked["--intensity"] else "frame"
+        raise ValueError(f"expected {word} with files, whose {what} is not known, found it with {name}")
+    return _files(root, split, intensity, transform, rings)
 
 
-def unfit(name: str, root: Path, sensor: str | None, intensity: str = "auto") -> str | None:
-    """That the first of files that can be read cannot be of the sensor that is named for all, in one line, or None."""
-    if name != "files" or sensor is None:
+def unfit(
+    name: str,
+    root: Path,
+    sensor: str | None,
+    intensity: str = "auto",
+    transform: np.ndarray | None = None,
+    rings: tuple[int, int] | None = None,
+) -> str | None:
+    """That files are not in their sensor's frame, or cannot be of the sensor that is named for all, by some scans from
+    everywhere, in one line, or None. What only seems so must seem so of most of them."""
+    if name != "files":
         return None
-    reader, named = _files(root, "all", intensity), get_sensor(sensor)
-    for i in range(len(reader)):
+    reader, named = _files(root, "all", intensity, transform, rings), None if sensor is None else get_sensor(sensor)
+    looked, told = 0, []
+    for i in range(0, len(reader), -(-len(reader) // CHECKED)):
         with suppress(ValueError):
-            scan = reader[i]
-            found = misfit(scan.xyz, named, scan.ring)
-            where = "/".join(reader.name(i)[1:])
-            return found and f"{where}: expected points of {named.name}, found {found}: it is drawn all the same"
-    return None
+            text, certain = placement(with_points(reader[i]), named)
+            looked += 1
+            told += [] if text is None else [(certain, f"{reader.frames[i].path}: {text}")]
+    sure = [line for certain, line in told if certain]
+    lines = sure or [line for _, line in told]
+    if not sure and 2 * len(lines) <= looked:
+        return None
+    which = "it is" if looked == 1 else f"{len(lines)} of {looked} scans that were looked at are so, and"
+    return f"{lines[0]}; {which} drawn all the same"
 
 
 def _recognised(reader: Reader) -> str:

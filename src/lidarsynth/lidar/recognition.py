@@ -103,6 +103,16 @@ def first_row(ring: np.ndarray, xyz: np.ndarray, sensor: Sensor) -> int | None:
     return best if off[best] < ON_ROW else usual
 
 
+def off_rows(ring: np.ndarray, xyz: np.ndarray, sensor: Sensor) -> bool:
+    """Whether rings (N,) of points (N, 3), enough of them to tell, are neither rows of the sensor in their order nor on
+    any of its beams."""
+    number, beams = beams_of(xyz, ring)
+    if len(number) < min(RINGS, sensor.height) or first_row(ring, xyz, sensor) is not None:
+        return False
+    error = _off_beams(beams, sensor)
+    return error is None or error > SUBSET
+
+
 def elevations_of(xyz: np.ndarray) -> np.ndarray:
     """(..., 3) metres -> (...) degrees above the horizon."""
     return np.degrees(np.arctan2(xyz[..., 2], np.hypot(xyz[..., 0], xyz[..., 1])))
@@ -209,8 +219,11 @@ def _whole_error(beams: np.ndarray, middle: np.ndarray, sensor: Sensor) -> float
 
 def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:
     """Mean distance of the rings from the nearest beams, in units of the spacing there; None if two meet one beam."""
-    if len(beams) >= 0.9 * sensor.height or sensor.height < 32:
-        return None
+    return None if len(beams) >= 0.9 * sensor.height or sensor.height < 32 else _off_beams(beams, sensor)
+
+
+def _off_beams(beams: np.ndarray, sensor: Sensor) -> float | None:
+    """Of (rings, N, 3) points, as `_subset_error`, of any number of rings."""
     table, plain = np.array(sensor.elevations), median_elevations(beams)[:, None]
     near = np.argsort(np.abs(table - plain), axis=1)[:, :16]  # an offset of 0.2 m moves a near ring by a few beams
     seen = median_elevations(beams[:, None], np.array(sensor.offsets)[near]) if sensor.offsets else plain

@@ -1,9 +1,11 @@
-"""Whether a scan's points can be of the sensor that is named: on its rings and beams, in its view, to its lowest."""
+"""Whether a scan's points can be of the sensor that is named: in its frame, on its rings and beams, in its view, to
+its lowest."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import is_even_grid
 from lidarsynth.lidar.recognition import (
     EVERYWHERE,
@@ -12,6 +14,7 @@ from lidarsynth.lidar.recognition import (
     elevations_of,
     layers,
     lies_on,
+    off_rows,
     recognise,
     rings_in_order,
     same_kind,
@@ -25,6 +28,7 @@ MARGIN = 1.0  # degrees
 # degrees 8 %; and none has a beam below all points.
 OUTSIDE, BELOW = 0.04, 0.25
 LOWEST = 0.002  # of the points are left out to find the lowest
+THIN = 0.1  # of the usual points of a ring; fewer do not make it one more than a sensor's beams
 FEW = 5  # points: a ring that has fewer is a wrong number
 # Least `share_on_beams` of points that no rings tell of: of maps at most 0.05, of train scans 0.98 and more, with a
 # carrier's 25 m/s taken out 0.08.
@@ -51,10 +55,32 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
         return f"them on {rings} rings, more than its {sensor.height} beams"
     if other := _of_another(Scan(xyz, ring=ring), sensor):
         return other
+    if ring is not None and off_rows(ring, xyz, sensor):
+        return f"them on {_count(ring)} rings that are not on its {sensor.height} beams"
     if ring is not None or turns is not None or is_even_grid(sensor):
         return None
     few = far[np.random.default_rng(0).permutation(len(far))[:POINTS]]
     return BESIDE if share_on_beams(few, sensor) < BETWEEN else None
+
+
+def placement(scan: Scan, sensor: Sensor | None) -> tuple[str | None, bool]:
+    """What is wrong with the frame of a scan, or with the sensor that is named as its, in one line, or None, and
+    whether that is certain, and no mere hint."""
+    frame = check_frame(scan)
+    if frame.lifted and sensor is not None and lies_on(scan, sensor):
+        return None, False  # one that was learned in this frame
+    alien = None if frame.faults or sensor is None else misfit_of(scan, sensor)
+    return alien or frame.warning(), bool(frame.faults or alien)
+
+
+def misfit_of(scan: Scan, sensor: Sensor) -> str | None:
+    """That the points of a scan cannot be of the sensor that was named as theirs, in one line, or None."""
+    if scan.ring is not None and len(scan):  # what learning a sensor may leave out is no other sensor's
+        _, own, count = np.unique(scan.ring, return_inverse=True, return_counts=True)
+        scan = scan[count[own] >= THIN * np.median(count)]
+    found = misfit(scan.xyz, sensor, scan.ring)
+    return found and f"expected points of {sensor.name}, found {found}: is it another sensor, or another frame " \
+                     "(--transform, --mount)?"  # fmt: skip
 
 
 def out_of_view(xyz: np.ndarray, sensor: Sensor) -> str | None:

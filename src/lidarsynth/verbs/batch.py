@@ -19,13 +19,11 @@ from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.columns import columns_note, usual_at_most
-from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.recognition import lies_on
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution, filled_before
-from lidarsynth.lidar.view import misfit
+from lidarsynth.lidar.view import placement
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
@@ -42,7 +40,6 @@ if TYPE_CHECKING:  # `project` needs no torch
     from lidarsynth.metrics.reconstruction import Errors
     from lidarsynth.systems.scan_model import OnStep, ScanModel
 
-THIN = 0.1  # of the usual points of a ring; fewer do not make it one more than a sensor's beams
 FIRST, EVERY = 2, 50  # whose frame is looked at: the first ones, and every so many
 MEANT = {"model": "weights", "sensor": "sensor_is", "into": "into_is"}  # words of a recipe -> what they mean, in digits
 FIELDS = {"realise": realised_fields, "label": labelled_fields}  # of a bag's messages; of the others, `message_fields`
@@ -232,27 +229,10 @@ def _of_any_sensor(model: ScanModel | None) -> bool:
 def _frame_warning(loaded: Loaded, job: Job, work: Work) -> str | None:
     if not (work.check or job.strict):
         return None
-    frame = check_frame(loaded.scan)
-    if frame.lifted and job.sensor is not None and lies_on(loaded.scan, get_sensor(job.sensor)):
-        return None  # one that was learned in this frame
-    alien = None if frame.faults else _misfit(loaded.scan, job)
-    warning = alien or frame.warning()
-    if warning is not None and (frame.faults or alien) and job.strict:
+    warning, certain = placement(loaded.scan, None if job.sensor is None else get_sensor(job.sensor))
+    if certain and job.strict:
         raise ValueError(f"{work.item.path}: {warning}")
     return None if warning is None else f"{work.item.path}: {warning}"
-
-
-def _misfit(scan: Scan, job: Job) -> str | None:
-    """That the points cannot be of the sensor that was named as theirs, in one line."""
-    if job.sensor is None or job.verb not in ("complete", "upsample", "label", "realise", "project"):
-        return None
-    sensor = get_sensor(job.sensor)
-    if scan.ring is not None and len(scan):  # what learning a sensor may leave out is no other sensor's
-        _, own, count = np.unique(scan.ring, return_inverse=True, return_counts=True)
-        scan = scan[count[own] >= THIN * np.median(count)]
-    found = misfit(scan.xyz, sensor, scan.ring)
-    return found and f"expected points of {sensor.name}, found {found}: is it another sensor, or another frame " \
-                     "(--transform, --mount)?"  # fmt: skip
 
 
 def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:

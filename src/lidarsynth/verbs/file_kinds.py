@@ -13,6 +13,7 @@ from lidarsynth.data.bag_records import POINTS, Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
+from lidarsynth.data.frames import moved
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
@@ -25,7 +26,7 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict, get_sensor
-from lidarsynth.verbs.inputs import Reading, has_scans, is_stream, moved
+from lidarsynth.verbs.inputs import Reading, has_scans, is_stream
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 from lidarsynth.verbs.viewpoint import viewpoint_note

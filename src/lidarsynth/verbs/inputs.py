@@ -16,6 +16,7 @@ from lidarsynth.data.bag_records import Message, cloud_of
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
+from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import capture_turns
 from lidarsynth.files.fields import (
     PLACE,
@@ -23,7 +24,6 @@ from lidarsynth.files.fields import (
     FileError,
     find,
     full_scale,
-    rings_from_top,
     scan_from_fields,
     written_names,
 )
@@ -332,17 +332,6 @@ def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
         return Loaded(scan, given, dropped)
     extra = {PLACE: np.arange(1, len(scan) + 1), **scan.extra}  # that of a message stays
     return Loaded(moved(replace(scan, extra=extra), reading.transform), given, dropped)
-
-
-def moved(scan: Scan, transform: np.ndarray) -> Scan:
-    """The scan in another frame, by a (4, 4) `transform`: where up is elsewhere then, its rings count from the other
-    end, and `extra["ring"]` has the numbers as they were. Raises FileError for ring numbers that are none."""
-    xyz, ring, extra = transformed(scan.xyz, transform), scan.ring, dict(scan.extra)
-    if (was := scan.ring) is not None:
-        ring = rings_from_top(was, xyz)
-        if (ring != was).any() and find(extra, "ring") is None:
-            extra["ring"] = was
-    return replace(scan, xyz=xyz, ring=ring, extra=extra)
 
 
 def back_in_place(filled: Scan, loaded: Loaded, transform: np.ndarray | None) -> Scan:

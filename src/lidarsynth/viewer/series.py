@@ -11,8 +11,9 @@ from typing import Protocol
 
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.folder import scan_files
+from lidarsynth.data.frames import moved
 from lidarsynth.files.fields import dropped_points
-from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of, moved
+from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.packing import Shown
 
