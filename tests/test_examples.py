@@ -53,3 +53,35 @@ def test_beams_are_those_of_the_sensor_that_took_the_scan(program: Program, scan
         assert code == 0 and out.strip().endswith(f" of {len(scan)} points of {name}")
         assert scan.ring is not None
         np.testing.assert_array_equal(ls.read(tmp_path / f"{name}.ply").xyz, scan.xyz[scan.ring % 4 == 0])
+
+
+@pytest.mark.parametrize("script", ["thin_beams", "front_page", "labelled_scans"])
+def test_an_example_without_arguments_says_how_it_is_used(program: Program, script: str):
+    code, _, error = program(f"examples/{script}.py")
+    assert code == 2 and error.startswith(f"usage: {script}.py [-h] [--sensor SENSOR] ")
+
+
+@pytest.mark.parametrize(("script", "before", "after"), [
+    ("benchmarks/any_sensor.py", ("errors",), ()),
+    ("benchmarks/confidence.py", (), ("--corrupt", "beams:4")),
+    ("examples/thin_beams.py", (), ("out.ply",)),
+    ("examples/front_page.py", ("out.png",), ()),
+    ("examples/labelled_scans.py", ("out.png",), ("other.ply",)),
+])  # fmt: skip
+def test_what_a_script_cannot_read_is_one_line(
+    program: Program, scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    script: str, before: tuple[str, ...], after: tuple[str, ...],
+):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    for path, told in ((scans / "forty.ply", "expected the beams of hdl-64e, "),
+                       (tmp_path / "nowhere.bin", "expected a readable file, found: No such file")):  # fmt: skip
+        code, _, error = program(script, *before, path, *after)
+        assert code == 2 and error.startswith(f"lidarsynth: {path}: {told}") and "\n" not in error
+        assert "model.into" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sensor_of_one_s_own_is_named_to_a_benchmark(program: Program, scans: Path):
+    words = ("errors", scans / "forty.ply", "--sensor", scans / "forty.json", "--models", "nearest")
+    code, out, error = program("benchmarks/any_sensor.py", *words)
+    assert (code, error) == (0, "") and "| forty.ply 1/4 |" in out
