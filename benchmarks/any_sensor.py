@@ -2,14 +2,15 @@
 
 python benchmarks/any_sensor.py errors SCAN...      every 2nd and 4th beam of real scans, against the best interpolation
     --returned: hidden pixels where the truth returned alone, empty ones in the result counting as 0 m
-    --rings, --transform: of a file of several sensors, which one, and into its frame, as `lidarsynth complete`
 python benchmarks/any_sensor.py phantoms SCAN...    points nearer than 5 m that are not there, every 4th beam known
 python benchmarks/any_sensor.py floating SCAN...    new points where no surface is, every 4th beam known
 python benchmarks/any_sensor.py shadow SCAN...      unknown pixels where KITTI's own car stands: how many stay empty
 python benchmarks/any_sensor.py dense [--sensor vlp-16] [--mount 0.5] [--tilt 8 0]   streets in four times the beams
 python benchmarks/any_sensor.py inside              buildings that nothing was trained on, seen by virtual sensors
 python benchmarks/any_sensor.py responses           reflectance of held-out streets, reported in ways never trained on
-Each takes --models (words or folders).
+Each takes --models (words or folders); those of SCAN... --sensor, of scans whose sensor is not recognised (a word or a
+.toml file), and --rings and --transform as `lidarsynth complete`: of a file of several sensors, which one, and into its
+frame.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import lidarsynth as ls
+from lidarsynth.cli.terminal import answer
 from lidarsynth.lidar.frame import parse_transform
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.streets import hdl64e
@@ -32,6 +34,7 @@ from lidarsynth.streets.interiors import interiors
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import SHARING, VirtualStreets
 from lidarsynth.streets.world import POSES
+from lidarsynth.verbs.completion import named_sensor
 from lidarsynth.verbs.inputs import Reading, inputs_of
 
 AS_IT_IS = Reading()
@@ -40,13 +43,14 @@ NEAR, FREE = 5.0, 1.25  # metres; a truth so many times as far, or none, proves 
 FLOATING = (0.5, 0.03)  # metres, and share of its range, by which a point is off all that was measured
 ON_GROUND = 0.25  # metres above flat ground under the sensor, at most, of what lies on it
 HELD_OUT = 777_001  # a seed that nothing was trained on
+Own = Callable[[Path], RangeImage]  # `own_image`, told more of how to read
 loaded = cache(ls.load)
 
 
-def own_image(path: Path, reading: Reading = AS_IT_IS) -> RangeImage:
-    """A scan, of a capture the first one, in the rays of the sensor that made it."""
+def own_image(path: Path, reading: Reading = AS_IT_IS, sensor: str | None = None) -> RangeImage:
+    """A scan, of a capture the first one, in the rays of the sensor that made it, None = as recognised."""
     scan = next(inputs_of([path], reading).stream()).read().scan
-    return loaded("nearest").suited_to(scan).image_of(scan)
+    return loaded("nearest").into(named_sensor(scan, path, "--sensor", sensor)).image_of(scan)
 
 
 def every(image: RangeImage, step: int) -> np.ndarray:
@@ -71,13 +75,11 @@ def mean_errors(filled: RangeImage, image: RangeImage, hidden: np.ndarray) -> np
     return np.array([np.abs(a - b)[hidden].mean() for a, b in pairs])
 
 
-def errors(
-    paths: Sequence[Path], models: Sequence[str], returned: bool = False, reading: Reading = AS_IT_IS
-) -> Iterator[str]:
+def errors(paths: Sequence[Path], models: Sequence[str], own: Own = own_image, returned: bool = False) -> Iterator[str]:
     """Metres / reflectance of each, and of the last model against the best of the interpolations."""
     yield "| scan, beams kept | " + " | ".join((*RIVALS, *models)) + " | against the best |"
     yield "|---" * (len(RIVALS) + len(models) + 2) + "|"
-    for image, name in ((own_image(path, reading), path.name) for path in paths):
+    for image, name in ((own(path), path.name) for path in paths):
         for step in (2, 4):
             known = every(image, step)
             hidden = ~known & (image.mask | (not returned))
@@ -87,11 +89,11 @@ def errors(
             yield f"| {name} 1/{step} | {shown} | {gain[0]:+.0f} %, {gain[1]:+.0f} % |"
 
 
-def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+def phantoms(paths: Sequence[Path], models: Sequence[str], own: Own = own_image) -> Iterator[str]:
     """Hidden pixels filled nearer than 5 m where the truth is empty, or where it is a quarter farther; how many of the
     first lie on flat ground, from which a ray came back to nobody; and how many of both the median scan has."""
     counts: dict[str, list[tuple[int, int, int]]] = {word: [] for word in ("bilinear", *models)}
-    for image in map(own_image, paths):
+    for image in map(own, paths):
         known = every(image, 4)
         for word, found in counts.items():
             filled = completed(word, image, known)
@@ -107,11 +109,11 @@ def phantoms(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
         yield f"| {word} | {nothing:.0f} | {ground:.0f} | {far:.0f} | {np.median(np.array(found)[:, ::2].sum(1)):.0f} |"
 
 
-def floating(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+def floating(paths: Sequence[Path], models: Sequence[str], own: Own = own_image) -> Iterator[str]:
     """New points farther than 0.5 m, and 3 % of their range, from every point of the whole scan; and how far new points
     are from the nearest one on average."""
     rows: dict[str, list[tuple[float, float, float]]] = {word: [] for word in (*RIVALS, *models)}
-    for image in map(own_image, paths):
+    for image in map(own, paths):
         known, measured = every(image, 4), KDTree(image.sensor.points(image.range)[image.mask])
         for word, found in rows.items():
             filled = completed(word, image, known)
@@ -126,13 +128,13 @@ def floating(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
         yield f"| {word} | {count:.0f} | {100 * count / total:.1f} % | {off:.3f} |"
 
 
-def shadow(paths: Sequence[Path], models: Sequence[str]) -> Iterator[str]:
+def shadow(paths: Sequence[Path], models: Sequence[str], own: Own = own_image) -> Iterator[str]:
     """Of unknown pixels that KITTI's car would hide, and of others of the same beams: the share that stays empty."""
     kitti = ls.get_sensor("hdl-64e-kitti")
     mask, elevations = hdl64e.hidden(kitti), np.asarray(kitti.elevations)
     yield "| scan | model | empty where KITTI's car stands | truly so | elsewhere in these beams | truly so |"
     yield "|---" * 6 + "|"
-    for image, name in ((own_image(path), path.name) for path in paths):
+    for image, name in ((own(path), path.name) for path in paths):
         row = np.abs(np.asarray(image.sensor.elevations)[:, None] - elevations).argmin(1)
         column = (np.arange(image.shape[1]) * kitti.width / image.shape[1]).astype(int)
         car, known = mask[np.ix_(row, column)], every(image, 4)
@@ -228,7 +230,7 @@ def _firsts(count: int) -> range:
     return range(0, SHARING * count, SHARING)
 
 
-REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str]], Iterator[str]]] = {
+REPORTS: dict[str, Callable[[Sequence[Path], Sequence[str], Own], Iterator[str]]] = {
     "errors": errors,
     "phantoms": phantoms,
     "floating": floating,
@@ -241,7 +243,7 @@ def main() -> None:
     parser.add_argument("what", choices=(*REPORTS, "dense", "inside", "responses"))
     parser.add_argument("scans", nargs="*", type=Path)
     parser.add_argument("--models", nargs="+", default=["default"])
-    parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--sensor", help="of SCAN..., None = as recognised; of dense, None = vlp-16")
     parser.add_argument("--mount", type=float)
     parser.add_argument("--tilt", type=float, nargs=2, help="pitch and roll, degrees")
     parser.add_argument("--returned", action="store_true")
@@ -249,13 +251,14 @@ def main() -> None:
     parser.add_argument("--transform", type=parse_transform, help="x:y:z:roll:pitch:yaw")
     args = parser.parse_args()
     rings = None if args.rings is None else tuple(map(int, args.rings.split("-")))
-    REPORTS["errors"] = partial(errors, returned=args.returned, reading=Reading(transform=args.transform, rings=rings))
+    REPORTS["errors"] = partial(errors, returned=args.returned)
+    own = partial(own_image, reading=Reading(transform=args.transform, rings=rings), sensor=args.sensor)
     stance = {name: value for name, value in (("mount", args.mount), ("tilt", args.tilt)) if value is not None}
-    others = {"responses": responses, "dense": partial(dense, args.sensor, args.models, stance),
+    others = {"responses": responses, "dense": partial(dense, args.sensor or "vlp-16", args.models, stance),
               "inside": partial(inside, args.models)}  # fmt: skip
-    for line in others[args.what]() if args.what in others else REPORTS[args.what](args.scans, args.models):
+    for line in others[args.what]() if args.what in others else REPORTS[args.what](args.scans, args.models, own):
         print(line, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    answer(main)

@@ -1,7 +1,7 @@
 """Is a new point as often right as its confidence says? Right: its ray returns, within 0.3 m + 2 % of its range.
 
 python benchmarks/confidence.py                          on streets that nothing was trained or fitted on
-python benchmarks/confidence.py SCANS --corrupt beams:4  on scans of your own
+python benchmarks/confidence.py SCANS --corrupt beams:4  on scans of your own; --sensor, where it is not recognised
 python benchmarks/confidence.py --fit FOLDER             fit the confidences of a cascade, and keep them in FOLDER
 """
 
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.cli.terminal import answer
 from lidarsynth.data.folder import scan_files
 from lidarsynth.experiment.record import RECORD
 from lidarsynth.files.formats import read
@@ -21,13 +22,18 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.systems.cascade.calibration import calibrated, held_out, judged, with_confidence
 from lidarsynth.systems.cascade.confidence import reliability
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.verbs.completion import named_sensor
 from lidarsynth.weights.load import load
 
 
-def scans_of(paths: list[Path], model: CascadeModel, recipe: str) -> Iterator[tuple[RangeImage, str]]:
+def scans_of(
+    paths: list[Path], model: CascadeModel, recipe: str, sensor: str | None = None
+) -> Iterator[tuple[RangeImage, str]]:
+    """Each scan in the rays of its sensor, None = as recognised, and what is to be hidden of it."""
     for file in [file for path in paths for file in (scan_files(path) if path.is_dir() else [path])]:
         scan = read(file)
-        yield model.suited_to(scan).image_of(scan), recipe
+        own = model.into(named_sensor(scan, file, "--sensor", sensor, model.sensor)) if model.own else model
+        yield own.image_of(scan), recipe
 
 
 def table(stated: np.ndarray, right: np.ndarray, off: np.ndarray, bins: int) -> str:
@@ -53,6 +59,7 @@ def main() -> None:
     parser.add_argument("scans", nargs="*", type=Path)
     parser.add_argument("--model", default="default")
     parser.add_argument("--corrupt", default="beams:4")
+    parser.add_argument("--sensor", help="of the scans, a word or a .toml file")
     parser.add_argument("--fit", type=Path, metavar="FOLDER")
     parser.add_argument("--streets", type=int, default=26)
     parser.add_argument("--bins", type=int, default=10)
@@ -65,9 +72,9 @@ def main() -> None:
         model = with_confidence(model, weights)
         (args.fit / RECORD).write_text(json.dumps(model.experiment.to_dict(), indent=1) + "\n")
         print(f"{weights}\nwrote {args.fit / RECORD}\n")
-    pairs = scans_of(args.scans, model, args.corrupt) if args.scans else held_out(515152, args.streets)
+    pairs = scans_of(args.scans, model, args.corrupt, args.sensor) if args.scans else held_out(515152, args.streets)
     print(table(*judged(model, pairs), args.bins))
 
 
 if __name__ == "__main__":
-    main()
+    answer(main)

@@ -177,36 +177,124 @@ def test_the_example_needs_no_torch(exported: Exported, tmp_path: Path):
     assert abs(len(dense) - len(filled.to_scan())) < 0.1 * len(filled.to_scan())
 
 
+STUB = """
+import json, numpy as np
+from types import SimpleNamespace as N
+META = {"sensor": json.dumps({"name": "four", "elevations": [2, 0, -2, -4], "width": 8, "min_range": 1,
+                              "max_range": 90}), "does": "completion in one step"}
+def InferenceSession(*_, **__):
+    filled = lambda _, feed: [np.where(feed["known"] > 0, feed["range"], 10), np.full((1, 1, 4, 8), 0.5)]
+    return N(get_modelmeta=lambda: N(custom_metadata_map=META), get_inputs=lambda: [], run=filled)
+"""  # of a network that sees 10 m everywhere
+BEAMS = np.radians(np.repeat([2.0, 0.0, -2.0, -4.0], 2))
+
+
+def example(folder: Path, *words: str) -> tuple[int, str]:
+    """Exit code and stderr of the example in a folder, where onnxruntime is the one that lies there, if any."""
+    program = [sys.executable, str(ROOT / "examples" / "onnx_complete.py"), *words]
+    done = subprocess.run(program, capture_output=True, text=True, cwd=folder, timeout=60,
+                          env={**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"})  # fmt: skip
+    return done.returncode, done.stderr.strip()
+
+
+def cloud(elevations: np.ndarray = BEAMS, **light: np.ndarray) -> np.ndarray:
+    """Eight points 5 m away, two a beam, as a table with a field `intensity`, or others."""
+    light = light or {"intensity": np.full(8, 0.25, np.float32)}
+    table = np.zeros(8, [(axis, "<f4") for axis in "xyz"] + [(k, v.dtype, v.shape[1:]) for k, v in light.items()])
+    table["x"], table["y"] = 5 * np.cos(elevations), 0.5 * np.cos(elevations) * np.tile([1, -1], 4)
+    table["z"] = np.hypot(table["x"], table["y"]) * np.tan(elevations)
+    for name, values in light.items():
+        table[name] = values
+    return table
+
+
+def pcd(table: np.ndarray, size: str = "POINTS 8") -> bytes:
+    """The table as a binary .pcd; fields that begin with `_` are padding."""
+    fields = {name: table.dtype[name] for name in table.dtype.names or ()}
+    rows = {
+        "FIELDS": ["_" if name.startswith("_") else name for name in fields],
+        "SIZE": [str(dtype.base.itemsize) for dtype in fields.values()],
+        "TYPE": [dtype.base.kind.upper() for dtype in fields.values()],
+        "COUNT": [str(int(np.prod(dtype.shape))) for dtype in fields.values()],
+    }
+    head = "".join(f"{key} {' '.join(words)}\n" for key, words in rows.items())
+    return f"# .PCD v0.7\n{head}{size}\nDATA binary\n".encode() + table.tobytes()
+
+
+@pytest.fixture
+def stubbed(tmp_path: Path) -> Path:
+    (tmp_path / "onnxruntime.py").write_text(STUB)
+    (tmp_path / "x.onnx").touch()
+    return tmp_path
+
+
+SHADES = np.arange(8)
+
+
+@pytest.mark.parametrize(("table", "size", "shade"), [
+    (cloud(normal=np.full((8, 3), 7, "<f4"), intensity=SHADES.astype("<f4") / 10), "POINTS 8", SHADES / 10),
+    (cloud(_1=np.full((8, 4), 9, "u1"), intensity=SHADES.astype("<f4") / 10, _2=np.zeros((8, 12), "u1")), "POINTS 8",
+     SHADES / 10),
+    (cloud(intensity=SHADES.astype("<f4"), timestamp=np.full(8, 2**60, "<u8")), "WIDTH 4\nHEIGHT 2", SHADES / 255),
+    (cloud(intensity=(SHADES / 7).astype("u1")), "POINTS 8", (SHADES == 7) / 255),
+    (cloud(intensity=SHADES.astype("u1")), "POINTS 8", SHADES / 255),
+    (cloud(intensity=(SHADES * 9000).astype("<u2")), "POINTS 8", SHADES * 9000 / 65535),
+    (cloud(intensity=np.where(SHADES == 3, np.nan, 0.5).astype("<f4")), "POINTS 8", (SHADES != 3) / 2),
+])  # fmt: skip
+def test_the_example_reads_what_the_header_says(stubbed: Path, table: np.ndarray, size: str, shade: np.ndarray):
+    (stubbed / "scan.pcd").write_bytes(pcd(table, size))
+    assert example(stubbed, "x.onnx", "scan.pcd", "d.npy") == (0, "")
+    dense = np.load(stubbed / "d.npy")
+    np.testing.assert_array_equal(dense[:8, :3], np.stack([table[axis] for axis in "xyz"], 1))
+    np.testing.assert_allclose(dense[:8, 3], shade, rtol=1e-6)
+    assert len(dense) == 32  # of 4 x 8 pixels the points are in one each
+    np.testing.assert_allclose(np.linalg.norm(dense[8:, :3], axis=1), 10, rtol=1e-6)
+
+
+def test_the_example_takes_no_other_sensor_s_scan_for_its_own(stubbed: Path):
+    (stubbed / "scan.pcd").write_bytes(pcd(cloud(np.radians(np.repeat([2.0, 0.0, -2.0, -9.0], 2)))))
+    said = "scan.pcd: expected a scan of four, found 25% of the points a step off all its beams"
+    assert example(stubbed, "x.onnx", "scan.pcd", "d.npy") == (2, said) and not (stubbed / "d.npy").exists()
+    (stubbed / "scan.pcd").write_bytes(pcd(cloud(np.radians(np.linspace(2.0, -4.0, 8)))))
+    code, said = example(stubbed, "x.onnx", "scan.pcd", "d.npy")
+    assert code == 0 and said.endswith("if another sensor took them, the new points are wrong")
+
+
+def test_the_example_refuses_targets_that_it_would_not_write(stubbed: Path):
+    (stubbed / "scan.pcd").write_bytes(pcd(cloud()))
+    for target, told in (("out.bin", "a file that ends in .npy, found another"),
+                         ("no/d.npy", "a folder to write into, found none")):  # fmt: skip
+        assert example(stubbed, "x.onnx", "scan.pcd", target) == (2, f"{target}: expected {told}")
+    assert sorted(path.name for path in stubbed.iterdir() if path.is_file()) == ["onnxruntime.py", "scan.pcd", "x.onnx"]
+    assert example(stubbed)[0] == 2
+
+
 def test_the_example_refuses_what_is_no_network_in_one_line(tmp_path: Path):
     for name in ("x.onnx", "scan.pcd"):
         (tmp_path / name).write_bytes(b"no network")
-    program = [sys.executable, str(ROOT / "examples" / "onnx_complete.py"), "x.onnx", "scan.pcd", "d.npy"]
-    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, timeout=60)
-    assert done.returncode == 1
-    assert done.stderr.strip() == "x.onnx: expected a file of `lidarsynth export`, found another or a damaged one"
+    said = "x.onnx: expected a file of `lidarsynth export`, found another or a damaged one"
+    assert example(tmp_path, "x.onnx", "scan.pcd", "d.npy") == (2, said)
 
 
-def test_the_example_refuses_what_is_no_binary_cloud_in_one_line(tmp_path: Path):
-    meta = {"sensor": json.dumps({"elevations": [1.0, 0.0], "width": 8})}
-    (tmp_path / "onnxruntime.py").write_text(
-        "from types import SimpleNamespace as N\n"
-        f"def InferenceSession(*_, **__): return N(get_modelmeta=lambda: N(custom_metadata_map={meta!r}))\n"
-    )
+def test_the_example_refuses_what_is_no_binary_cloud_in_one_line(stubbed: Path):
     head = (
         "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
     )
-    (tmp_path / "x.onnx").touch()
     kind, other = "a .pcd with DATA binary, found", head.replace("intensity", "i")
+    header = "FIELDS, SIZE, TYPE, COUNT and POINTS of a .pcd, found"
     for content, told in ((f"{head}DATA binary_compressed\n0000", f"{kind} binary_compressed"),
                           (f"{head}DATA ascii\n1 2 3 0\n", f"{kind} ascii"), (head, f"{kind} no DATA"),
                           ("", f"{kind} no DATA"), ("\x89PNG\x00\xff", f"{kind} no DATA"),
-                          (f"{head}DATA binary\n0000", "1 points, found the file cut off after 0"),
+                          (f"{head}DATA binary\n0000", "1 points of 16 bytes, found 4 bytes"),
+                          (f"{head}DATA binary\n{'0' * 32}", "1 points of 16 bytes, found 32 bytes"),
                           (f"{other}DATA binary\n{'0' * 16}", "the fields x y z intensity, found no intensity"),
+                          (f"{head}DATA binary\n{chr(0) * 16}", "points with a return, found none of 1 points"),
+                          (f"{head.replace('POINTS 1', 'POINTS 0')}DATA binary\n",
+                           "points with a return, found none of 0 points"),
+                          (f"{head.replace('F F F F', 'F F F X')}DATA binary\n", f"{header} TYPE and SIZE X4"),
+                          (f"{head.replace('FIELDS', '#')}DATA binary\n", f"{header} no FIELDS"),
+                          ("FIELDS x\nSIZE 4\nTYPE F\nDATA binary\n", f"{header} no WIDTH"),
                           ):  # fmt: skip
-        (tmp_path / "scan.pcd").write_text(content, "latin-1")
-        program = [sys.executable, str(ROOT / "examples" / "onnx_complete.py"), "x.onnx", "scan.pcd", "d.npy"]
-        done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, timeout=60,
-                              env={**os.environ, "PYTHONPATH": str(tmp_path)})  # fmt: skip
-        said = done.stderr.strip()
-        assert done.returncode == 1 and "\n" not in said and not (tmp_path / "d.npy").exists()
-        assert said == f"scan.pcd: expected {told}"
+        (stubbed / "scan.pcd").write_text(content, "latin-1")
+        code, said = example(stubbed, "x.onnx", "scan.pcd", "d.npy")
+        assert (code, said) == (2, f"scan.pcd: expected {told}") and not (stubbed / "d.npy").exists()
