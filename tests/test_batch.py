@@ -3,6 +3,7 @@
 import errno
 import json
 import multiprocessing
+import re
 import time
 import warnings
 from dataclasses import replace
@@ -527,6 +528,29 @@ def test_the_library_warns_of_another_sensor_as_the_verbs_do(word: str):
 
 
 SENSOR_FILE = "name = 'mine'\nwidth = 512\nelevations = [{}]\n"
+
+
+def test_upsample_says_how_many_points_lie_beyond_the_beams_of_the_sensor_it_gives(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    scan, path, out = turn(SENSORS["hdl-32e"]), tmp_path / "s.pcd", tmp_path / "o.pcd"
+    write(path, scan)
+    words = ["upsample", str(path), "--model", "bilinear", "--no-picture", "--out", str(out), "--to"]
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "vlp-16", "--strict"])
+    elevation = np.degrees(np.arctan2(scan.xyz[:, 2], np.hypot(*scan.xyz[:, :2].T)))
+    said = (
+        f"expected points in vlp-16's view of -15.0 to +15.0 degrees, found {(elevation < -16).sum()} of {len(scan)} "
+    )
+    assert said in capsys.readouterr().err and not out.exists()
+    main([*words, "vlp-16"])
+    assert f"{path}: {said}" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match=f"^{re.escape(said)}"):
+        load("bilinear").into("vlp-16").upsample(scan)
+    narrow = np.array(SENSORS["hdl-32e"].elevations).clip(-30, 10) + np.linspace(0.01, 0, 32)
+    (tmp_path / "narrow.toml").write_text(SENSOR_FILE.format(", ".join(map(str, narrow))))
+    main([*words, str(tmp_path / "narrow.toml"), "--strict"])
+    assert capsys.readouterr().err == ""
 
 
 def test_a_recipe_is_what_its_words_mean(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

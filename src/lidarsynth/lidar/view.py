@@ -89,12 +89,33 @@ def out_of_view(xyz: np.ndarray, sensor: Sensor) -> str | None:
     far = _far(xyz)
     if len(far) < 100:
         return None
-    elevation, (top, bottom) = elevations_of(far - _lift(sensor)), (sensor.elevations[0], sensor.elevations[-1])
-    outside = float(((elevation > top + MARGIN) | (elevation < bottom - MARGIN)).mean())
+    elevation = elevations_of(far - _lift(sensor))
+    outside = float(_outside(elevation, sensor).mean())
     if outside > OUTSIDE:
-        return f"{outside:.0%} of them outside its view of {bottom:+.1f} to {top:+.1f} degrees"
+        return f"{outside:.0%} of them outside its view of {_view(sensor)}"
     below = int((np.array(sensor.elevations) < np.quantile(elevation, LOWEST) - MARGIN).sum())
     return f"none on its {below} lowest beams of {sensor.height}" if below > BELOW * sensor.height else None
+
+
+def beyond_beams(xyz: np.ndarray, sensor: Sensor) -> str | None:
+    """That points (N, 3), whoever measured them, are above or below the view of the sensor in whose image they are
+    drawn, and how many, in one line; or None where they are few. Whether they are, those beyond 3 m say, if there are
+    100: of a sensor's own view are many nearer ones, as of its carrier's roof."""
+    beyond, far = _outside(elevations_of(xyz - _lift(sensor)), sensor), np.hypot(xyz[:, 0], xyz[:, 1]) > FAR
+    judged, outside = beyond[far] if far.sum() >= 100 else beyond, int(beyond.sum())
+    if judged.sum() <= OUTSIDE * len(judged):
+        return None
+    return (f"expected points in {sensor.name}'s view of {_view(sensor)}, found {outside} of {len(xyz)} above or below "
+            "it: they stay, with the ring of its first or last beam")  # fmt: skip
+
+
+def _outside(elevation: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """(N,) bool: which elevations, in degrees, are above or below the sensor's view."""
+    return (elevation > sensor.elevations[0] + MARGIN) | (elevation < sensor.elevations[-1] - MARGIN)
+
+
+def _view(sensor: Sensor) -> str:
+    return f"{sensor.elevations[-1]:+.1f} to {sensor.elevations[0]:+.1f} degrees"
 
 
 def _far(xyz: np.ndarray) -> np.ndarray:

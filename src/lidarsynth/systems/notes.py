@@ -10,7 +10,7 @@ from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
-from lidarsynth.lidar.view import out_of_view
+from lidarsynth.lidar.view import beyond_beams, out_of_view
 
 IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
 
@@ -40,6 +40,21 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
         if filling and (text := caution(scan, None if sensor is None else get_sensor(sensor))) is not None:
             warnings.warn(text, stacklevel=3)
     return scan
+
+
+def beyond_noted(model: Knows, scan: Any, filled: RangeImage) -> RangeImage:
+    """The image that a model made of a scan, or an array, with a warning of points beyond its beams."""
+    if (text := beyond_image(model, as_scan(scan))) is not None:
+        warnings.warn(text, stacklevel=3)
+    return filled
+
+
+def beyond_image(model: Knows, scan: Scan) -> str | None:
+    """That points are above or below the view of the sensor in whose image a model draws a scan of any, and how many;
+    or None, as until `into`, where it is the scan's own."""
+    if model.any_sensor and not model.experiment.data.fixed:
+        return None
+    return beyond_beams(scan.xyz, model.sensor)
 
 
 def displaced(model: Knows, scan: Scan, sensor: Sensor | str | None = None) -> str | None:

@@ -28,7 +28,7 @@ from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.notes import IN_PYTHON
+from lidarsynth.systems.notes import IN_PYTHON, beyond_image
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
@@ -181,8 +181,9 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         with_points(loaded.scan, str(work.item.path))
         warning = _frame_warning(loaded, job, work) or _sensor_warning(loaded.scan, job, work, model)
         warning = warning or _viewpoint_warning(job, work)
+        beyond = _view_warning(loaded.scan, job, work, model)
         done, note = _made(job, model, work, loaded.scan, on_step)
-        more = loaded.left_out, _caution(loaded.scan, job, work, alone=warning is None)
+        more = loaded.left_out, beyond, _caution(loaded.scan, job, work, alone=warning is None)
         warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside, picture, other = None, (), None, None
         if work.target is None:
@@ -241,6 +242,17 @@ def _sensor_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -
         return None
     text = model.stranger(scan, None if job.sensor is None else get_sensor(job.sensor))
     return text and f"{work.item.path}: {job.model} {text}; use --model default"
+
+
+def _view_warning(scan: Scan, job: Job, work: Work, model: ScanModel | None) -> str | None:
+    """That measured points are out of the view of the sensor that `upsample` gives. Raises ValueError where that is to
+    be refused."""
+    if job.verb != "upsample" or model is None or not (work.check or job.strict):
+        return None
+    text = beyond_image(model, scan)
+    if text is not None and job.strict:
+        raise ValueError(f"{work.item.path}: {text}")
+    return text
 
 
 def _viewpoint_warning(job: Job, work: Work) -> str | None:
