@@ -3,7 +3,6 @@
 import errno
 import json
 import multiprocessing
-import re
 import time
 import warnings
 from dataclasses import replace
@@ -545,8 +544,6 @@ def test_upsample_says_how_many_points_lie_beyond_the_beams_of_the_sensor_it_giv
     assert said in capsys.readouterr().err and not out.exists()
     main([*words, "vlp-16"])
     assert f"{path}: {said}" in capsys.readouterr().err
-    with pytest.warns(UserWarning, match=f"^{re.escape(said)}"):
-        load("bilinear").into("vlp-16").upsample(scan)
     narrow = np.array(SENSORS["hdl-32e"].elevations).clip(-30, 10) + np.linspace(0.01, 0, 32)
     (tmp_path / "narrow.toml").write_text(SENSOR_FILE.format(", ".join(map(str, narrow))))
     main([*words, str(tmp_path / "narrow.toml"), "--strict"])

@@ -265,7 +265,6 @@ def test_sparse_images_know_what_the_other_sensor_looked_at(model, sparse):
     assert empty.any() and (azimuth < 0.1).all(), "only the empty half was looked at in vain"
 
 
-@pytest.mark.filterwarnings("ignore:expected points in hdl-64e-kitti/16's view")  # which looks less far up
 def test_upsampling_keeps_what_was_measured_and_fills_the_rest(model, sparse):
     image, known = sparse_image(sparse, get_sensor("vlp-16"), model.sensor)
     result = model.upsample(sparse, "vlp-16", steps=2)
@@ -275,7 +274,6 @@ def test_upsampling_keeps_what_was_measured_and_fills_the_rest(model, sparse):
     np.testing.assert_array_equal(result.range, model.upsample(sparse, get_sensor("vlp-16"), steps=2).range)
 
 
-@pytest.mark.filterwarnings("ignore:expected points in hdl-64e-kitti/16's view")  # which looks less far up
 def test_upsampling_recognises_the_sensor_by_its_rings(model, sparse):
     recognised = model.upsample(sparse, steps=2)
     np.testing.assert_array_equal(recognised.range, model.upsample(sparse, "vlp-16", steps=2).range)

@@ -42,13 +42,6 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
     return scan
 
 
-def beyond_noted(model: Knows, scan: Any, filled: RangeImage) -> RangeImage:
-    """The image that a model made of a scan, or an array, with a warning of points beyond its beams."""
-    if (text := beyond_image(model, as_scan(scan))) is not None:
-        warnings.warn(text, stacklevel=3)
-    return filled
-
-
 def beyond_image(model: Knows, scan: Scan) -> str | None:
     """That points are above or below the view of the sensor in whose image a model draws a scan of any, and how many;
     or None, as until `into`, where it is the scan's own."""

@@ -25,7 +25,7 @@ from lidarsynth.systems.filling import Filling, check_counts, whole
 from lidarsynth.systems.hub import push
 from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
-from lidarsynth.systems.notes import beyond_noted, made_by, noted, stranger
+from lidarsynth.systems.notes import made_by, noted, stranger
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -181,7 +181,7 @@ class ScanModel(ABC):
             scan = noted(self, scan, sensor_in, filling=True)
         how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision)
         with usual_torch():
-            return beyond_noted(self, scan, self.upsampled(scan, how, sensor_in, on_step, times))
+            return self.upsampled(scan, how, sensor_in, on_step, times)
 
     def realise(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
         """A simulator's scan, in which every ray returns, as the real sensor would have reported it.
