@@ -18,15 +18,17 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
     pixels  of the scan's points in the image
 
     Points come row by row, each row from behind over the left; `ring` is the row. Those above or below the view come
-    last, with the ring of the first or last row. Every further field of the scan stays with its points, so do its rings
-    where they are not the rows; new ones have 0 there, the label of their pixel, and the time of the points measured in
-    their direction. Labels of a filled image are those of measured points too, where the scan has none. `extra["new"]`
-    is 1 for new points, and for those that were new in the scan; where the image has `confidence`, measured points have
-    1, those what they had.
+    last, with the ring of the first or last row. A scan without reflectance takes that of its pixels. Every further
+    field of the scan stays with its points, so do its rings where they are not the rows; new ones have 0 there, the
+    label of their pixel, and the time of the points measured in their direction. Labels of a filled image are those of
+    measured points too, where the scan has none. `extra["new"]` is 1 for new points, and for those that were new in
+    the scan; where the image has `confidence`, measured points have 1, those what they had.
     """
     new = replace(filled, mask=filled.mask & ~measured).to_scan()
     row, column = pixels
-    label = scan.label
+    reflectance, label = scan.reflectance, scan.label
+    if not reflectance.any():
+        reflectance = np.where(row >= 0, filled.reflectance[row, column], reflectance)
     if label is None and filled.label is not None:
         label = np.where(row >= 0, filled.label[row, column], 0)
     assert new.ring is not None
@@ -38,7 +40,7 @@ def with_measured(scan: Scan, measured: np.ndarray, filled: RangeImage, pixels: 
     order = np.argsort(10.0 * place - azimuth, kind="stable")  # by ring, then azimuth: a turn is less than 10
     both = Scan(
         xyz,
-        np.concatenate([scan.reflectance, new.reflectance]),
+        np.concatenate([reflectance, new.reflectance]),
         ring=ring,
         time=None if scan.time is None else np.concatenate([scan.time, _time_towards(new.xyz, scan)]),
         label=_labels(label, new),

@@ -172,8 +172,7 @@ class CascadeModel(AnySensorModel):
         return calls(how)
 
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
-        """The image, filled; new pixels of one whose reflectance is 0 everywhere have a reflectance all the same.
-        Blocked rays stay empty."""
+        """The image, filled; one whose reflectance is 0 everywhere gets a reflectance. Blocked rays stay empty."""
         recorded = image.keep(known)  # on a blocked ray too, which is told as empty
         rng, lit = generators(how.seed, 1), bool(recorded.reflectance.any())
         own = replace(self._as_found(recorded, known), grain=SPECKLE)
@@ -197,8 +196,7 @@ class CascadeModel(AnySensorModel):
         filled = replace(filled, reflectance=unit.read(shade, filled) * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
-        filled = own._named([filled], recorded=True)[0]  # told the reflectance that measured pixels would have
-        return replace(filled, reflectance=np.where(recorded.mask, recorded.reflectance, filled.reflectance))
+        return own._named([filled], recorded=True)[0]
 
     def realised(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> RangeImage:
         """The image of `realise`, of as many columns as the scan's rings have, where those are not the sensor's."""
@@ -349,6 +347,8 @@ class CascadeModel(AnySensorModel):
         bend = BEND if kinds is None else BEND / 2
         filled, rays = self._network(known, rng, weights is not None, classify, reach, bend)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
+        unlit = (known.told & known.returned & ~known.lit).to(logit.device)  # of a scan without reflectance: gets one
+        logit = torch.where(unlit, torch.inf, logit)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
         sure = None if weights is None else confidence(filled, rays, weights)

@@ -128,13 +128,13 @@ class LidarModel(ScanModel):
         return repaint.evaluations(how.steps, how.resamples)
 
     def fill(self, image: RangeImage, known: np.ndarray, how: Filling, on_step: OnStep = None) -> RangeImage:
-        """The image, filled; new pixels of one whose reflectance is 0 everywhere have a reflectance all the same."""
+        """The image, filled; one whose reflectance is 0 everywhere gets a reflectance."""
         x_0 = to_x_0(image, self.experiment.data.codec)[None].to(self._device)
         mask = torch.from_numpy(known).to(self._device).expand(1, 2, *known.shape).clone()
         mask[:, 1] &= bool(image.reflectance[known].any())
         states = self._completion(x_0, mask, how, generators(how.seed, 1))
         filled = self._image(_last(states, on_step, self.calls(how))[0])
-        return with_known(filled, image, known, keep_reflectance=True)
+        return with_known(filled, image, known, keep_reflectance=bool(mask[:, 1].any()))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How many steps of the sampler `generate` takes per batch."""
