@@ -160,6 +160,8 @@ def test_a_saved_model_loads_as_it_was(tmp_path, half):
     size = (folder / "model.safetensors").stat().st_size
     save(folder, experiment, network, not half)
     assert (folder / "model.safetensors").stat().st_size != size, "saving again replaces"
+    with pytest.raises(ValueError, match=r"model.safetensors: expected a folder to write to, found a file"):
+        save(folder / "model.safetensors", experiment, network)
 
 
 def test_matrices_in_eight_bits_are_off_by_little_and_take_half_of_the_place(tmp_path):

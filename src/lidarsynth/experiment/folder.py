@@ -27,8 +27,11 @@ def save(
 
     Of an experiment with a `base`, the weights that are not the base's.
     bytewise  how the names begin of matrices that are stored in eight bits (`eight_bits.packed`)
+    Raises ValueError where a file has the folder's name.
     """
     folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: expected a folder to write to, found a file")
     folder.mkdir(parents=True, exist_ok=True)
     dtype = torch.float16 if half else torch.float32
     # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
