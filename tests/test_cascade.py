@@ -280,6 +280,18 @@ def test_a_sensor_of_a_few_columns_is_completed(model: CascadeModel, width: int)
     assert model.into(image.sensor).complete(image.keep(known), known).shape == (24, width)
 
 
+def test_generated_scans_bear_no_marks_of_completed_ones(model: CascadeModel):
+    (image,) = model.generate(1, steps=1)
+    assert image.new is None and image.confidence is None and not image.to_scan().extra
+
+
+def test_scans_of_the_sensor_that_a_model_was_tuned_on_become_denser_without_its_name(model: CascadeModel):
+    scan = SyntheticStreets(4, 16, SMALL).image(3).to_scan()
+    up, named = model.upsample(scan, times=2), model.upsample(scan, SMALL, times=2)
+    assert up.shape == (47, 256)
+    np.testing.assert_array_equal(up.range, named.range)
+
+
 def test_blocked_rays_stay_empty_and_no_other_sensor_gets_kittis_car(model: CascadeModel):
     blocked = replace(SMALL, blocked=((22, 10, 60), (23, 250, 80)))
     metres = np.zeros((24, 256), np.float32)

@@ -244,9 +244,8 @@ def marks_left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:
     """What is to be said of marks beside a file that do not fit its scan, which lost `dropped` points, a line each."""
     lines, count = [], len(scan) + dropped
     for name, kind in BESIDE.items() if _is_bare(path) else ():
-        if (
-            marks := Path(path).with_suffix(f".{name}")
-        ).is_file() and name not in scan.extra:  # those that fit are read
+        marks = Path(path).with_suffix(f".{name}")
+        if marks.is_file() and name not in scan.extra:  # those that fit are read
             lines.append(f"{marks.name} left out: expected {count * kind.itemsize} bytes for {count} points, "
                          f"found {marks.stat().st_size} bytes")  # fmt: skip
     return lines

@@ -17,7 +17,6 @@ from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 from lidarsynth.systems.denser import TIMES, beam_step, denser, spread
 from lidarsynth.systems.filling import Filling, whole
-from lidarsynth.systems.known_pixels import sensor_that_made
 from lidarsynth.systems.notes import IN_PYTHON
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
@@ -87,7 +86,7 @@ class AnySensorModel(ScanModel, ABC):
             model = self.at_precision(how.precision)
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
         scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
-        own, how = sensor_that_made(scan, sensor_in, self.sensor), self.resolved(how)
+        own, how = self.suited_to(scan).sensor if sensor_in is None else get_sensor(sensor_in), self.resolved(how)
         sparse = check_seen(self.into(own).image_of(scan), len(scan))
         beams, dense, every = denser(own, beam_step(sparse), times)
         sparse = sparse if beams == own else self.into(beams).image_of(scan)

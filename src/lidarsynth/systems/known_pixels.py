@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarsynth.lidar.columns import as_scanned
 from lidarsynth.lidar.projection import project
-from lidarsynth.lidar.recognition import lies_on, recognise
+from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
@@ -23,15 +23,10 @@ def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
     return known
 
 
-def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None, own: Sensor | None = None) -> Sensor:
-    """The given sensor, or as recognised from the points. Raises ValueError when it is not.
-
-    own  the user's own, on which the model was tuned: that of scans of no known sensor whose points lie on its beams
-    """
+def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
+    """The given sensor, or as recognised from the points. Raises ValueError when it is not."""
     if sensor_in is None:
         sensor_in, reason = recognise(scan)
-        if sensor_in is None and own is not None and lies_on(scan, own):
-            return own
         if sensor_in is None:
             raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
         return as_scanned(scan, get_sensor(sensor_in))

@@ -269,7 +269,8 @@ class CascadeModel(AnySensorModel):
         if len(rows) == ROWS < self.sensor.height:
             told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
             drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
-        return [replace(a, sensor=self.sensor, confidence=None) for a in drawn], shades_of(drawn, calm)
+        whole = [replace(a, sensor=self.sensor, confidence=None, new=None) for a in drawn]  # nothing was measured
+        return whole, shades_of(drawn, calm)
 
     def sketched(self, images: Sequence[RangeImage], seed: int = 0) -> list[RangeImage]:
         """What generation would draw if the layouts of these images (H, W), in metres, of the model's sensor, had been
