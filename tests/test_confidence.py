@@ -151,6 +151,19 @@ def test_what_has_no_confidence_says_so(model: CascadeModel, street: RangeImage)
         from_dict({"name": "x", "confidence": {"spread": 1.0}})
 
 
+def test_points_that_were_filled_in_without_a_confidence_get_none_later(model: CascadeModel, street: RangeImage):
+    sparse = street.keep(corrupt(street, "beams:4")).to_scan()
+    interpolated = ls.load("nearest").into(SENSOR).complete(sparse).to_scan()
+    some = interpolated[(interpolated.extra["new"] == 0) | (np.arange(len(interpolated)) % 2 > 0)]
+    with pytest.warns(UserWarning, match="filled in before"):
+        twice = model.into(SENSOR).complete(some).to_scan()
+    ours = {xyz.tobytes() for xyz in some.xyz[some.extra["new"] > 0]}
+    earlier = np.array([xyz.tobytes() in ours for xyz in twice.xyz])
+    assert earlier.sum() == len(ours) > 100
+    assert (twice.extra["confidence"][earlier] == 0).all()
+    assert (twice.extra["confidence"][twice.extra["new"] == 0] == 1).all()
+
+
 def test_bags_get_a_column_of_confidences(model: CascadeModel, street: RangeImage):
     sparse = street.keep(corrupt(street, "beams:4")).to_scan()
     given = {"x": sparse.xyz[:, 0], "y": sparse.xyz[:, 1], "z": sparse.xyz[:, 2]}

@@ -27,8 +27,7 @@ def were_new(scan: Scan) -> np.ndarray:
 
 
 def confidences(scan: Scan) -> np.ndarray:
-    """(N,) float32 confidences of a scan's own points: 1, or what was said of those that were filled in."""
+    """(N,) float32 confidences of a scan's own points: 1 of a measured one, of one that was filled in what was said of
+    it, or 0 where nothing was."""
     marks = marks_of(scan)
-    if "confidence" not in marks:
-        return np.ones(len(scan), np.float32)
-    return np.where(marks["new"] > 0, marks["confidence"], 1).astype(np.float32)
+    return np.where(were_new(scan) > 0, marks.get("confidence", 0), 1).astype(np.float32)
