@@ -649,6 +649,16 @@ def test_the_width_is_the_given_one_else_that_of_one_s_own_sensor(tmp_path: Path
         assert CachedImages(folder).sensor.width == expected
 
 
+def test_files_and_streets_have_as_many_columns_as_the_sensor(tmp_path: Path):
+    """Of the sensor that `generate` draws: 1,024 were no reference for a Pandar64's 1,800."""
+    (tmp_path / "scans").mkdir()
+    without_intensity(tmp_path / "scans/0.pcd", SENSORS["pandar64"])
+    list(prepare("files", tmp_path / "scans", tmp_path / "files", sensor="pandar64", intensity="none"))
+    list(prepare("synthetic", tmp_path / "streets", None, sensor="pandar64", count=1))
+    for folder in ("files", "streets"):
+        assert CachedImages(tmp_path / folder).sensor.width == 1800
+
+
 def test_a_sensor_that_sees_200_metres_keeps_them(tmp_path: Path):
     """Ranges beyond 131 m were cut silently; the step is in the index now, and an index without one means 2 mm."""
     sensor = replace(SENSOR, max_range=250.0)

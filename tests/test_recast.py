@@ -15,7 +15,7 @@ from lidarsynth.streets.raycast import Caster, FewTriangles
 from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.systems.cascade import recast as module
-from lidarsynth.systems.cascade.placing import best_place
+from lidarsynth.systems.cascade.placing import View, best_place
 from lidarsynth.systems.cascade.recast import as_cast, recast
 
 CAR, PERSON, ROAD = (CLASS_NUMBER[name] for name in ("car", "person", "road"))
@@ -93,6 +93,17 @@ def test_a_few_triangles_are_met_where_embree_says(scattered: bool) -> None:
 def test_no_ray_meets_nothing() -> None:
     face, away, cosine = FewTriangles(standing("car", 0, 8, 0, 0).corners).cast(np.zeros((0, 3)), np.zeros((0, 3)))
     assert len(face) == len(away) == len(cosine) == 0
+
+
+def test_rays_along_the_side_of_a_place_do_not_meet_it() -> None:
+    """Numpy warned of them, in the middle of `generate`."""
+    seen = np.stack([np.linspace(8, 9, 30), np.zeros(30), np.full(30, -1)], 1).astype(np.float32)
+    metres = np.linalg.norm(seen, axis=1)
+    rays = seen / metres[:, None]
+    yes, shape = np.ones(30, bool), module.KINDS[0].shapes[0]
+    place = best_place(shape, 2, [seen], View(rays, metres, yes, ~yes, yes.astype(np.float32)), -1.8, None)
+    assert np.isfinite(place).all()
+    assert place.share == 1
 
 
 @pytest.mark.parametrize(("x", "y", "yaw"), [(9.0, 3.0, 0.4), (-7.0, -6.0, 1.3), (4.0, 14.0, 2.6)])

@@ -41,7 +41,8 @@ def data(
         sensor: whose images: hdl-64e, ... or a .toml/.json file. This, projection and width have defaults by source;
             the sensor of files is recognised from the first.
         projection: how points become rows: auto, spherical or unfolding.
-        width: columns; below 1024 they are chosen from 1024, or 2048 when unfolding, as in R2DM.
+        width: columns; of files and synthetic streets as many as the sensor has, if not given. Below 1024 they are
+            chosen from 1024, or 2048 when unfolding, as in R2DM.
         workers: processes, one per processor core if not given.
         count: synthetic scans; 1000 if not given.
         check: also compare the checksums of what is there already, and make anew what is damaged.

@@ -37,6 +37,7 @@ class Source:
     """A data set: its reader (root, split) -> Reader, and what its images are unless said otherwise.
 
     sensor    None = recognised from the first scan
+    width     columns; None = the sensor's own
     resizing  which columns stay of wider drawings, as in `projection.thin`
     """
 
@@ -44,7 +45,7 @@ class Source:
     split: str
     sensor: str | None
     projection: str
-    width: int
+    width: int | None
     resizing: str = "nearest-exact"
 
 
@@ -57,7 +58,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "kitti360-lidargen": Source(kitti360_lidargen, "train", "hdl-64e-lidargen", "spherical", 1024),
     "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
     "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
-    "files": Source(lambda root, split: _files(root, split), "all", None, "auto", 1024),
+    "files": Source(lambda root, split: _files(root, split), "all", None, "auto", None),
 }
 
 CHECKED = 8  # scans from everywhere, whether they are in their sensor's frame: 0.3 s
@@ -107,7 +108,7 @@ def prepare(
             if given is not None:
                 raise ValueError(f"expected {word} with a data set, found it with synthetic, whose scans are cast")
         spec = SYNTHETIC if sensor is None else sensor
-        wide, many = _width(width, spec, 1024), 1000 if count is None else count
+        wide, many = _width(width, spec, None), 1000 if count is None else count
         return cache_synthetic(folder or root, many, spec, wide, seed, workers, check, apart, inside)
     if apart or inside:
         word = "--apart" if apart else "--inside"
@@ -144,13 +145,14 @@ def cache_source(
     if name not in SOURCES:
         raise ValueError(f"expected a source of {', '.join(SOURCES)} or synthetic, found {name!r}")
     own = SOURCES[name]
-    split, projection, width = split or own.split, projection or own.projection, _width(width, sensor, own.width)
+    split, projection = split or own.split, projection or own.projection
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
     reader = _reader(name, Path(root), split, intensity, transform, rings)
     word = sensor or own.sensor or _recognised(reader)
+    width = _width(width, word, own.width)
     spec, columns = _sensor(word, width), columns_of(projection, width, get_sensor(word).width)
     image = Projected(reader, spec, projection, columns, own.resizing)
     source = {"name": name, "split": split, "projection": projection, "columns": columns}
@@ -194,11 +196,11 @@ def cache_synthetic(
         yield done, count
 
 
-def _width(given: int | None, sensor: str | None, source: int) -> int:
-    """The given width, else that of a sensor of the user's own, else the source's."""
+def _width(given: int | None, sensor: str, source: int | None) -> int:
+    """The given width, else the source's for a sensor that we name, else the sensor's own."""
     if given is not None:
         return given
-    return source if sensor is None or sensor in WORDS else get_sensor(sensor).width
+    return source if source is not None and sensor in WORDS else get_sensor(sensor).width
 
 
 def _files(

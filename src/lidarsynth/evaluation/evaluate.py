@@ -373,7 +373,7 @@ def _at_size(sensor: Sensor, like: Sensor) -> Sensor:
     """The reference's sensor, as its images are thinned to the samples' size. Raises ValueError where they cannot."""
     if sensor.height % like.height or sensor.width % like.width:
         raise ValueError(f"expected a reference of the samples' {like.height} x {like.width} pixels or a multiple, "
-                         f"found {sensor.height} x {sensor.width}")  # fmt: skip
+                         f"found {sensor.height} x {sensor.width}; data takes --sensor and --width")  # fmt: skip
     return resized(sensor, like.height, like.width)
 
 

@@ -171,7 +171,8 @@ def _through(places: np.ndarray, boxes: np.ndarray, rays: np.ndarray, level: flo
         ]
     met, left = [], []
     for low, high in boxes:
-        sides = [((a - o) * w, (b - o) * w) for a, b, o, w in zip(low, high, starts, slopes, strict=True)]
+        with np.errstate(invalid="ignore"):  # along a side and in it: no number, which is no less than any
+            sides = [((a - o) * w, (b - o) * w) for a, b, o, w in zip(low, high, starts, slopes, strict=True)]
         first = np.maximum.reduce([np.minimum(*pair) for pair in sides])
         last = np.minimum.reduce([np.maximum(*pair) for pair in sides])
         met.append(np.where((first < last) & (last > 0), first, np.float32(np.inf)))
