@@ -19,6 +19,7 @@ from lidarsynth.networks.column_neighbours import Grid, known_grid
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
 from lidarsynth.networks.pixel_mixture import CODES, TONES, picked
+from lidarsynth.networks.rays import decode_range
 from lidarsynth.systems.cascade import layout
 from lidarsynth.systems.cascade.examples import TALL, WIDE, taller
 from lidarsynth.systems.cascade.layout import beyond, grids
@@ -183,7 +184,20 @@ def test_what_is_beyond_goes_on_with_the_plane_or_stands_upright():
             found = beyond(grid, told[:, :, inner], told[:, :, outer], side)
             both = found.returned & truth.returned & (truth.code < 0.4)
             assert (found.returned == truth.returned)[..., 10:14].all()
-            assert not both.any() or float((found.code - truth.code).abs()[both].max()) < 2e-3
+            nearer = torch.minimum(truth.code, told[:, 1, outer] / 2)  # a wall ends on the ground
+            assert not both.any() or float((found.code - nearer).abs()[both].max()) < 2e-3
+
+
+def test_the_ground_goes_on_as_ground_however_far_apart_beams_are_and_nothing_is_below_it():
+    """A VLP-32C has beams at -11.3, -15.6 and -25 degrees: the road ended at a wall where the last one was beyond."""
+    sensor = Sensor("far apart", (1.0, -6.0, -11.3, -15.6, -25.0), 64, mount=1.8)
+    told = grid_rays(sensor, np.zeros((5, 64), bool), np.arange(5), np.arange(64))[0][None]
+    road = 1.8 / -sensor.directions()[..., 2]
+    metres = np.where(road > 0, road, 20)
+    metres[:4, 20:30] = 5 / np.cos(np.radians(np.asarray(sensor.elevations[:4])))[:, None]  # a wall, 5 m away
+    grid = known_grid(torch.from_numpy(metres).float()[None], torch.full((1, 5, 64), 0.3))
+    found = beyond(Grid(*(part[:, :4] for part in grid)), told[:, :, :4], told[:, :, 4:], (-1, -2))
+    np.testing.assert_allclose(decode_range(found.code)[0, 0].numpy(), road[4], rtol=0.02)
 
 
 def test_taller_grids_of_training_have_each_beam_with_its_own_rays():

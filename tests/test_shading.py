@@ -57,10 +57,10 @@ def test_dark_patches_of_what_grows_go_and_those_of_walls_stay() -> None:
         image = flat(KITTI, np.where(rows < 24, label, ROAD))
         even = image.reflectance.copy()
         even[8:12, 300:308] = 0.0  # a cell of a grid
-        patch = 0.3 - shaded(even, image)[8:12, 300:308]
-        assert (np.abs(patch) <= 0.3 * share + 0.02).all()
+        found = shaded(even, image, own=True)
+        assert (np.abs(0.3 - found[8:12, 300:308]) <= 0.3 * share + 0.02).all()
         if share == 1:
-            np.testing.assert_array_equal(shaded(even, image)[:24], even[:24])
+            np.testing.assert_array_equal(found[:24], even[:24])
 
 
 @pytest.mark.parametrize("word", ["hdl-64e-kitti", "os1-64", "vlp-16"])
@@ -71,10 +71,34 @@ def test_a_sidewalk_that_reads_as_the_road_gets_brighter_and_the_scan_does_not(w
     ground = image.mask & (sensor.directions()[..., 2] < -0.06) & (image.range < 15)
     walk = ground & (image.label == SIDEWALK)
     even = np.where(image.mask, 0.2 - unevenness(sensor), 0).astype(np.float32)
-    found = shaded(even, image)
+    found = shaded(even, image, own=True)
     brighter = [float(np.median(found[part] - even[part])) for part in (walk, ground & ~walk)]
     assert brighter[0] > brighter[1] + 0.02
     assert abs(np.median(found[ground]) - np.median(even[ground])) < 0.03
+
+
+@pytest.mark.parametrize("word", ["hdl-64e-kitti", "os1-64", "vlp-16"])
+def test_layouts_of_dark_and_of_bright_sensors_read_as_bright_as_streets(word: str) -> None:
+    """Each was as bright as a sensor of training, so that the scans of one sensor differed by a factor of five."""
+    sensor = ls.get_sensor(word)
+    image = flat(sensor, np.where(rows_of(sensor) < sensor.height // 3, WALL, ROAD))
+    ground = image.mask & (image.label == ROAD) & (image.range < 15)
+    expected = np.zeros(image.shape, np.float32)
+    seen = ~hidden(sensor)
+    expected[seen] = flat_ground("road", image.range[seen], sensor.mount, lasers(sensor))
+    even = np.where(image.mask, 0.3 - unevenness(sensor), 0).astype(np.float32)
+    dark, bright = (shaded(even + step, image) for step in (-0.1, 0.2))
+    np.testing.assert_allclose(dark, bright, atol=1e-5)
+    assert abs(np.median(dark[ground] - expected[ground])) < 0.01
+    wall = image.mask & (image.label == WALL)
+    assert abs(np.median((dark - even)[wall]) - np.median((dark - even)[ground])) < 0.05
+
+
+def test_of_no_ground_one_cannot_tell_how_bright_a_scan_is() -> None:
+    image = flat(KITTI, np.where(rows_of(KITTI) < 62, WALL, ROAD))
+    image.label[62:, 9:] = WALL
+    even = image.reflectance / 3
+    np.testing.assert_array_equal(shaded(even, image)[:62], even[:62])
 
 
 def test_markings_stay() -> None:

@@ -45,6 +45,7 @@ ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about
 # The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it
 # has: so there is as much terrain and fence as in streets, while labels are right more often.
 TEXTURE = 64
+FAR_ABOVE = 2.0  # degrees from a grid's first row to the sensor's first beam, from which on it is drawn, not gone on to
 # What gives a class its speckle, and what gives it to all others.
 _MADE_OF = {"road": "road", "parking": "parking", "sidewalk": "sidewalk", "building": "wall", "fence": "fence",
             "vegetation": "leaves", "trunk": "bark", "terrain": "grass", "car": "paint", "truck": "paint",
@@ -53,11 +54,18 @@ SPREAD = np.array([TABLE[NUMBER[_MADE_OF.get(name, "cloth")], 2] for name, _ in 
 
 
 def grid_of(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (16,) and columns (128,) of the coarse grid. Raises ValueError for a sensor that has fewer."""
+    """Rows (16,) and columns (128,) of the coarse grid. Raises ValueError for a sensor that has fewer.
+
+    The rows begin half a step below the first beam, or with it where that is far above the next ones: what reaches so
+    high has to be drawn, while below the last row there is ground.
+    """
     if sensor.height < ROWS or sensor.width < COLUMNS:
         raise ValueError(f"expected a sensor of at least {ROWS} beams and {COLUMNS} columns to generate, found "
                          f"{sensor.name} with {sensor.height} and {sensor.width}")  # fmt: skip
-    return grid_rows(sensor.height), grid_columns(sensor.width)
+    rows = grid_rows(sensor.height)
+    if sensor.elevations[0] - sensor.elevations[rows[0]] > FAR_ABOVE:
+        rows = grid_rows(sensor.height, first=0.0)
+    return rows, grid_columns(sensor.width)
 
 
 def parts(first: int, stop: int, size: int) -> list[slice]:

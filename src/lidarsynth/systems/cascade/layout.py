@@ -33,6 +33,7 @@ STEPS_DEFAULT = 16
 # Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
 DRAFT, DRAFT_STEPS = 0.53, 8
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
+LEVEL = 0.15  # natural logarithm of the range of flat ground by which a return on the ground may be nearer or farther
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
 BY_COLUMNS = "columns"  # the sampler that is no diffusion
 CHOICE = 3  # grids of which one is kept, where the network has a judge: docs/generation.md
@@ -251,13 +252,20 @@ def _whole(grid: Grid, rows: np.ndarray, columns: np.ndarray, rays_of: RaysOf, h
 def beyond(grid: Grid, rays: Tensor, new: Tensor, side: tuple[int, int]) -> Grid:
     """Beams of rays (B, 8, E, C) beyond those at `side` of a grid and its rays, the next one and the one behind it.
 
-    On the plane of both where they are of one, else upright on the next one; what returns there, returns.
+    Where the next one is of the ground, as high as that; else on the plane of both where they are of one, or upright on
+    the next one, down to flat ground. What returns there, returns.
     """
     told = nearness(grid.code, grid.returned, rays), (rays[:, 0] / 3).tan()
     (near, near2), (slope, slope2) = ([part[:, i, None] for i in side] for part in told)
-    far = near + (near - near2) * ((new[:, 0] / 3).tan() - slope) / (slope - slope2)
+    steep, flat = (new[:, 0] / 3).tan(), 1 / (decode_range(new[:, 1] / 2) * levelled(new))
+    far = near + (near - near2) * (steep - slope) / (slope - slope2)
     plane = (near2 > 0) & ((near / near2.clamp_min(1e-6)).log().abs() < SMOOTH) & (far > 0.3 * near)
-    metres = 1 / (torch.where(plane, far, near).clamp_min(1e-4) * levelled(new))
+    far = torch.where(plane, far, near)
+    far = torch.where(steep < 0, torch.maximum(far, flat), far)
+    off = decode_range(grid.code).clamp_min(0.1).log() - decode_range(rays[:, 1] / 2).log()
+    ground = (off[:, side[0], None].abs() < LEVEL) & (slope < 0) & (steep < 0)
+    far = torch.where(ground, near * steep / slope.clamp_max(-1e-6), far)
+    metres = 1 / (far.clamp_min(1e-4) * levelled(new))
     back = grid.returned[:, side[0], None] & (new[:, 6] < 0.5)
     code = torch.where(back, encode_range(metres), 0)
     return Grid(code, grid.shade[:, side[0], None] * back, back)

@@ -246,7 +246,7 @@ class CascadeModel(AnySensorModel):
         if network is None:  # one that has seen recorded scans alone: calm between the beams of the grid
             network, more = self.network.classes, RARER | (GROWING if len(rows) > ROWS else {})
         seen = named(network, recorded, self.response, self.sensor, self.precision, more=more, alone=True)
-        shades = np.stack([shaded(even, image) for even, image in zip(shades, seen, strict=True)])
+        shades = np.stack([shaded(even, image, self.tuned) for even, image in zip(shades, seen, strict=True)])
         recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
         cast = all_recast(recorded, rng)
         if self.network.drawn is None:

@@ -18,13 +18,17 @@ GROUND = {"road": "road", "parking": "parking", "sidewalk": "sidewalk", "terrain
 # is brighter or darker all around, and of a pixel alone, on the ground; from which difference on that stays: markings.
 WIDE, TALL = 1 / 21, 1 / 10
 AROUND, ALONE, MARKED = 0.4, 0.5, 0.1
+ENOUGH = 0.02  # of an image's pixels: of less ground one cannot tell how bright it is in the whole
 
 
-def shaded(even: np.ndarray, image: RangeImage) -> np.ndarray:
+def shaded(even: np.ndarray, image: RangeImage, own: bool = False) -> np.ndarray:
     """Reflectances (H, W) on average of a generated image with labels, given those that were drawn, `even` (H, W).
 
     Of what grows they are those of all of it around. Of the ground they are nearer to what flat ground of that kind
-    reads so far away, as bright as the scan's ground is in the whole.
+    reads so far away. All are brighter or darker by as much as makes the ground as bright as streets': each layout is
+    of a sensor that reports in its own way.
+
+    own  it stays as bright as it was drawn, by a model that has learned how its sensor reports
     """
     assert image.label is not None
     label = np.where(image.mask, image.label, 0)
@@ -37,6 +41,8 @@ def shaded(even: np.ndarray, image: RangeImage) -> np.ndarray:
         return even.clip(0, 1).astype(np.float32)
     off = even - expected
     off = off - (usual := np.median(off[ground]))
+    if not own and ground.mean() > ENOUGH:
+        even, usual = even - usual, 0
     here = [(label == CLASS_NUMBER[name]) & ground for name in GROUND]
     around = sum(np.where(kind, _around(off, kind & (np.abs(off) < 2 * MARKED)), 0) for kind in here)
     alone = off - around
