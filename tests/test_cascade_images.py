@@ -14,6 +14,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import draw_coherent, draw_noise
 from lidarsynth.networks.rays import decode_range, encode_range
+from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.images import TEXTURE, agreed, as_read, grid_of, noisy, with_doubts
 from lidarsynth.systems.cascade.model import CascadeModel
@@ -179,3 +180,18 @@ def test_a_beam_far_above_the_others_is_drawn_with_the_grid():
         assert len(rows) == 16
         assert (np.diff(rows) == SENSORS[name].height // 16).all()
         assert len(columns) == 128
+
+
+def test_beams_between_those_of_a_tall_grid_are_as_smooth_as_these():
+    """Of an OS1-128 every second beam is left to the fill, which was told every second column, too, and made rings of
+    them that strayed by 15 cm."""
+    sensor = SENSORS["os1-128"]
+    street = SyntheticStreets(616, 16, sensor).image(4)
+    (drawn,) = ls.load("default").into(sensor).sketched([street], seed=1)
+    flat = np.arange(90, 120)  # beams of -9 to -20 degrees
+    log = np.log(np.maximum(drawn.range, 0.1))
+    bend = np.abs(2 * log - np.roll(log, 1, 1) - np.roll(log, -1, 1))
+    ground = drawn.mask & street.mask & np.isin(street.label, [CLASS_NUMBER["road"], CLASS_NUMBER["sidewalk"]])
+    rows = [np.median(bend[row][ground[row]]) for row in flat]
+    assert np.median(rows[1::2]) < 1.5 * np.median(rows[::2])
+    assert np.median(rows[::2]) < 1.5 * np.median(rows[1::2])

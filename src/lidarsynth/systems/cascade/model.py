@@ -256,19 +256,19 @@ class CascadeModel(AnySensorModel):
     def _whole(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> tuple[list[RangeImage], np.ndarray]:
-        """Grids (B, R, C) as whole images, with the labels of `answered`, and reflectances (B, H, W), the likeliest. Of
-        16 beams, first these are filled, then all between: at once, most would know nothing above or below."""
+        """Grids (B, R, C) as whole images, with the labels of `answered`, and reflectances (B, H, W), the likeliest.
+
+        First their beams are filled, then all between: at once, most pixels would know nothing above or below."""
         own = replace(self, sensor=written_out(self.sensor))
         told = metres.cpu().numpy(), reflectance.cpu().numpy()
-        if len(rows) > ROWS:  # little is left to say
-            drawn = calm = with_edges(own._between(*told, rows, columns, None, rng), columns, rng)
-        else:
-            beams = replace(own, sensor=own.sensor.rows(rows.tolist()))
-            drawn, calm = (beams._between(*told, np.arange(ROWS), columns, noise, rng) for noise in (rng, None))
-            drawn = with_edges(agreed(drawn, calm, told[0], columns), columns, rng)
-        if len(rows) == ROWS < self.sensor.height:
-            told, every = (np.stack([a.range for a in drawn]), shades_of(drawn, calm)), np.arange(self.sensor.width)
-            drawn, calm = (own._between(*told, rows, every, noise, rng) for noise in (rng, None))
+        beams = own if len(rows) == own.sensor.height else replace(own, sensor=own.sensor.rows(rows.tolist()))
+        noises = (rng, None) if len(rows) == ROWS else (None,)  # of more beams little is left to say
+        some = [beams._between(*told, np.arange(len(rows)), columns, noise, rng) for noise in noises]
+        some[0] = with_edges(agreed(some[0], some[-1], told[0], columns) if some[1:] else some[0], columns, rng)
+        if len(rows) < self.sensor.height:
+            told = np.stack([a.range for a in some[0]]), shades_of(some[0], some[-1])
+            some = [own._between(*told, rows, np.arange(own.sensor.width), noise, rng) for noise in noises]
+        drawn, calm = some[0], some[-1]
         whole = [replace(a, sensor=self.sensor, confidence=None, new=None) for a in drawn]  # nothing was measured
         return whole, shades_of(drawn, calm)
 
