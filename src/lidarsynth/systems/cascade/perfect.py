@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.lidar.columns import FINEST
+from lidarsynth.lidar.columns import columns_by_steps
 from lidarsynth.lidar.projection import pixel_of_points, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -17,35 +17,18 @@ from lidarsynth.systems.cascade.images import OBSERVED, REALISED, TUNED, Grain
 
 ALIKE = 1.33  # a scan with so many times the sensor's columns, or so many times fewer, has its own
 COLUMNS = (128, 4096)
-UNSEEN = 5.0  # degrees in which no ring has a point are not seen
 
 
 def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
-    """The sensor with as many columns as the scan has around, where that is not about its own number.
+    """The sensor with as many columns as the scan's steps give a turn, where that is not about its own number.
 
-    A scan of a part of the turn, such as the half that CARLA gives a tick, has as many as its steps give a whole one.
+    So it is for the half of a turn that CARLA gives a tick, for points that it drops at random, and two beams in a row.
     """
     row = row_of_points(scan, sensor, projection)
-    azimuth = np.arctan2(scan.xyz[row >= 0, 1], scan.xyz[row >= 0, 0]).astype(np.float64)
-    if not len(azimuth):
-        return sensor
-    around = np.sort(azimuth)
-    gap = np.diff(around, append=around[0] + 2 * np.pi)
-    gap = gap[gap > np.radians(UNSEEN)]
-    covered = 1 - gap.sum() / (2 * np.pi)
-    full = round((_firings(azimuth, row[row >= 0]) - len(gap)) / covered) if 360 * covered > UNSEEN else sensor.width
-    if sensor.width / ALIKE <= full <= sensor.width * ALIKE:
+    full = columns_by_steps(scan.xyz[row >= 0], row[row >= 0])
+    if full is None or sensor.width / ALIKE <= full <= sensor.width * ALIKE:
         return sensor
     return sensor.resized(width=int(np.clip(full, *COLUMNS)))
-
-
-def _firings(azimuth: np.ndarray, row: np.ndarray) -> int:
-    """How often the fuller rows fired; points of one azimuth, of two beams in a row, are one firing."""
-    order = np.lexsort((azimuth, row))
-    azimuth, row = azimuth[order], row[order]
-    first = np.r_[True, (np.diff(azimuth) > FINEST) | (np.diff(row) > 0)]
-    count = np.bincount(row[first])
-    return int(np.percentile(count[count > 0], 75))
 
 
 def observing(network: Cascade, tuned: bool) -> tuple[Cascade, Grain]:
