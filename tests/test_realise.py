@@ -18,6 +18,7 @@ from lidarsynth.files.labels import read_words
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.cascade.perfect import fitting
 from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
@@ -92,6 +93,19 @@ def test_columns_of_the_scans_own_are_said_in_the_line(place: Path, capsys: pyte
     for words in ((), ("--sensor", "os1-64")):
         main(["realise", "sim.pcd", "--out", "real.pcd", "--model", "model", "--no-picture", *words])
         assert f"of {len(dense)} points; os1-64 in 2048 columns, by the scan's own steps\n" in capsys.readouterr().out
+
+
+def test_columns_are_of_the_whole_turn_though_the_scan_is_a_part_of_it_or_lost_points_or_has_two_beams_a_row():
+    sensor = SENSORS["os1-64"]
+    whole = turn(sensor, 2048, jitter=0.0, keep=1.0)
+    for low, high in ((-180, 0), (-90, 90), (30, 90)):
+        angle = np.degrees(np.arctan2(whole.xyz[:, 1], whole.xyz[:, 0]))
+        assert fitting(whole[(angle > low) & (angle < high)], sensor, "spherical").width == 2048
+    dropped = whole[np.random.default_rng(0).random(len(whole)) < 0.55]  # as CARLA does by itself
+    assert fitting(dropped, sensor, "spherical").width == 2048
+    two = turn(SENSORS["os1-128"], 1024, jitter=0.0, keep=1.0)
+    assert fitting(two, sensor, "spherical") is sensor
+    assert fitting(whole[:1], sensor, "spherical") is sensor
 
 
 def test_axes_and_files_of_simulators(place: Path, capsys: pytest.CaptureFixture[str]):

@@ -13,6 +13,7 @@ from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+from lidarsynth.streets.ground import Ground
 from lidarsynth.streets.layout import build
 from lidarsynth.streets.objects import USUAL, library
 from lidarsynth.streets.reader import SyntheticStreets
@@ -426,6 +427,20 @@ def test_cyclists_roll_off_kerbs_and_do_not_fall():
             x, y, z = before.place[both].T
             lowest = min(lowest, (z - drive.world.ground.height(x, y)).min(initial=1))
     assert lowest < 0.02  # some do cross
+
+
+def test_where_kerbs_end_is_asked_once_for_everyone_however_many_roads_a_drive_has(monkeypatch: pytest.MonkeyPatch):
+    drive = draw_drive(0, 0, 60.0)
+    asked: list[int] = []
+    carriageway = Ground.carriageway
+
+    def counted(ground: Ground, x: np.ndarray, y: np.ndarray, skip: int = -1) -> np.ndarray:
+        asked.append(skip)
+        return carriageway(ground, x, y, skip)
+
+    monkeypatch.setattr(Ground, "carriageway", counted)
+    drive.moment(1.0)
+    assert len(drive.world.ground.roads) > 4 and asked == 3 * [-1]  # now, before and after
 
 
 def test_kerbs_are_as_high_as_asked_and_all_else_stays():

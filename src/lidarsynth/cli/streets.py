@@ -39,7 +39,7 @@ def streets(
     traffic: Annotated[float, arg(help="moving vehicles, riders among them: 1 = as usual, 2 = twice, 0 = none.")] = 1.0,
     parking: Annotated[float, arg(help="parked vehicles, likewise; 0 = no car parks or bicycles either.")] = 1.0,
     pedestrians: Annotated[float, arg(help="likewise; 0.08 = the share of real scans, of which 1 has 14 times.")] = 1.0,
-    vegetation: Annotated[float, arg(help="trees and bushes, likewise.")] = 1.0,
+    vegetation: Annotated[float, arg(help="trees and bushes, likewise; hedges stay.")] = 1.0,
     groups: Annotated[float, arg(help="of people who stand together, per 100 m and side of the street.")] = 0.0,
     motorcycles: Annotated[float, arg(help="places with parked ones, likewise.")] = 0.0,
     works: Annotated[float, arg(help="construction sites, likewise.")] = 0.0,

@@ -33,6 +33,13 @@ def azimuth_step(xyz: np.ndarray, ring: np.ndarray) -> float:
     return _step_of(_steps(azimuth, ring), azimuth, ring)
 
 
+def columns_by_steps(xyz: np.ndarray, ring: np.ndarray) -> int | None:
+    """Columns of a whole turn by `azimuth_step`, though part of it or of its points be lost; None where none follow."""
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    step = _steps(azimuth, ring)
+    return round(2 * np.pi / _step_of(step, azimuth, ring)) if len(step) else None
+
+
 def _steps(azimuth: np.ndarray, ring: np.ndarray) -> np.ndarray:
     """Steps in radians along the rings, but those of one firing."""
     turn = np.sort(azimuth.astype(np.float64) + 10.0 * ring)  # a turn is less than 10

@@ -91,21 +91,30 @@ class Drive:
     def _placed(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         place, yaw = self.actors.place.copy(), self.actors.yaw.copy()
         s = _at(self.along, np.array([time]))[0]
+        x, y = np.zeros((2, len(place)))
         for number, road in enumerate(self.world.ground.roads):
-            mine = self.number == number
-            x, y, heading = road.at(s[mine], self.aside[mine])
-            up = self._up(mine, number, x, y) if road.walk > 0 else 0.0
-            place[mine] = np.column_stack([x, y, self.world.ground.height(x, y) + up])
-            yaw[mine] = heading + np.where(self.ahead[mine] > 0, 0, np.pi)
+            mine = np.flatnonzero(self.number == number)
+            if len(mine):
+                x[mine], y[mine], heading = road.at(s[mine], self.aside[mine])
+                yaw[mine] = heading + np.where(self.ahead[mine] > 0, 0, np.pi)
+        moved = np.flatnonzero(self.number >= 0)  # on all roads at once: long drives have many
+        x, y = x[moved], y[moved]
+        place[moved] = np.column_stack([x, y, self.world.ground.height(x, y) + self._up(moved, x, y)])
         return place, yaw
 
-    def _up(self, mine: np.ndarray, number: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Metres above the carriageway of the actors `mine` of a road: where another road meets theirs, people step off
-        the kerb, cyclists roll down and up again."""
-        ground, walks = self.world.ground, self.actors.pace[mine] == WALK
-        rolls = walks & (self.actors.kind[mine] == "bicyclist")
-        raised = np.where(rolls, np.clip(ground.carriageway(x, y, skip=number) / RAMP, 0, 1), 1.0)
-        return ground.kerb * raised * (walks & (ground.carriageway(x, y) > 0))
+    def _up(self, moved: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Metres above the carriageway of the actors `moved`: where another road meets theirs, people step off the
+        kerb, cyclists roll down and up again."""
+        ground, number = self.world.ground, self.number[moved]
+        paved = np.array([road.walk > 0 for road in ground.roads])[number]
+        walks = np.flatnonzero((self.actors.pace[moved] == WALK) & paved)
+        rolls = walks[self.actors.kind[moved[walks]] == "bicyclist"]
+        up = np.zeros(len(moved))
+        up[walks] = ground.kerb * (ground.carriageway(x[walks], y[walks]) > 0)
+        for own in np.unique(number[rolls]):
+            mine = rolls[number[rolls] == own]
+            up[mine] *= np.clip(ground.carriageway(x[mine], y[mine], skip=own) / RAMP, 0, 1)
+        return up
 
 
 def draw_drive(seed: int, number: int, seconds: float, density: Density = TODAY, speed: float | None = None) -> Drive:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.lidar.columns import columns_by_steps
 from lidarsynth.lidar.projection import pixel_of_points, row_of_points
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -19,11 +20,13 @@ COLUMNS = (128, 4096)
 
 
 def fitting(scan: Scan, sensor: Sensor, projection: str) -> Sensor:
-    """The sensor with as many columns as the scan has points a ring, where that is not about its own number."""
+    """The sensor with as many columns as the scan's steps give a turn, where that is not about its own number.
+
+    So it is for the half of a turn that CARLA gives a tick, for points that it drops at random, and two beams in a row.
+    """
     row = row_of_points(scan, sensor, projection)
-    count = np.bincount(row[row >= 0], minlength=1)
-    full = int(np.percentile(count[count > 0], 75)) if count.any() else sensor.width
-    if sensor.width / ALIKE <= full <= sensor.width * ALIKE:
+    full = columns_by_steps(scan.xyz[row >= 0], row[row >= 0])
+    if full is None or sensor.width / ALIKE <= full <= sensor.width * ALIKE:
         return sensor
     return sensor.resized(width=int(np.clip(full, *COLUMNS)))
 
