@@ -56,6 +56,16 @@ def test_payloads_of_a_capture(kind: str, tmp_path: Path):
     assert len(list(datagrams(path))) == 1, "a record cut short ends the capture"
 
 
+@pytest.mark.parametrize(("link", "head"), [
+    (113, b"\0" * 14 + b"\x08\0"), (276, b"\x08\0" + b"\0" * 18), (101, b""), (0, b"\2\0\0\0"),
+])  # fmt: skip
+def test_captures_of_other_link_layers(link: int, head: bytes, tmp_path: Path):
+    """As of `tcpdump -i any`, which writes another one since its version 4.99."""
+    content = pcap([head + udp(b"first", 2368)[14:]])
+    (tmp_path / "c.pcap").write_bytes(content[:20] + struct.pack("<I", link) + content[24:])
+    assert [(d.port, d.payload, d.address) for d in datagrams(tmp_path / "c.pcap")] == [(2368, b"first", "10.0.0.1")]
+
+
 def test_what_is_no_capture_is_one_line(tmp_path: Path):
     (tmp_path / "c.pcap").write_bytes(b"hello, hello")
     with pytest.raises(FileError, match=r"c.pcap: expected a capture"):

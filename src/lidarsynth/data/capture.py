@@ -16,7 +16,8 @@ NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
 INTERFACE, SIMPLE, ENHANCED = 1, 3, 6  # kinds of blocks of pcapng (draft-ietf-opsawg-pcapng)
 RESOLUTION, OFFSET = 9, 14  # if_tsresol and if_tsoffset, options of an interface
 MAX_RECORD = 1 << 18
-ETHERNET, RAW_IP, LOOPBACK, LINUX = 1, (12, 101, 228), 0, 113  # link types (the tcpdump group's list)
+ETHERNET, RAW_IP, LOOPBACK = 1, (12, 101, 228), 0  # link types (the tcpdump group's list)
+COOKED = {113: (14, 16), 276: (0, 20)}  # `tcpdump -i any`, before 4.99.0 and since: where kind and packet are
 IPV4, UDP = 0x0800, 17
 VLAN = (b"\x81\x00", b"\x88\xa8", b"\x91\x00")  # IEEE 802.1Q, 802.1ad, and what came before it
 
@@ -156,8 +157,8 @@ def _ip(frame: bytes, link: int) -> bytes:
         return frame
     if link == LOOPBACK:
         return frame[4:]
-    at = 16 if link == LINUX else 14
-    kind = frame[at - 2 : at]
+    place, at = COOKED.get(link, (12, 14))
+    kind = frame[place : place + 2]
     while kind in VLAN and link == ETHERNET:  # a tag each
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if kind == IPV4.to_bytes(2, "big") else b""
