@@ -145,12 +145,12 @@ def test_packets_that_come_twice_or_late_make_no_turn():
             np.testing.assert_array_equal(found[1][name], column)
 
 
-@pytest.mark.parametrize("ends", [16000, 30000])
-def test_a_sensor_that_is_set_to_a_sector_has_turns(ends: int):
-    """From 100 degrees to less or more than half a turn on; packets go on over what is left out."""
+@pytest.mark.parametrize(("begins", "ends"), [(10000, 16000), (10000, 30000), (27000, 45000), (34000, 39000)])
+def test_a_sensor_that_is_set_to_a_sector_has_turns(begins: int, ends: int):
+    """To less or more than half a turn on, also over azimuth 0; packets go on over what is left out."""
     step, blocks = 40, []
     for _ in range(6):
-        blocks += list(range(10000, ends, step))
+        blocks += [azimuth % 36000 for azimuth in range(begins, ends, step)]
     packets = []
     for i in range(0, len(blocks) - 11, 12):
         payload = bytearray(velodyne_packet(0x22, 0, step, 5000))
@@ -160,8 +160,9 @@ def test_a_sensor_that_is_set_to_a_sector_has_turns(ends: int):
     found = list(velodyne.turns(packets))
     assert len(found) in (5, 6)
     for turn in found:
-        azimuth = np.degrees(np.arctan2(-turn["y"], turn["x"])) % 360
-        assert azimuth.min() > 99.9 and azimuth.max() < ends / 100 + 0.5
+        azimuth = (np.degrees(np.arctan2(-turn["y"], turn["x"])) - begins / 100 + 1) % 360
+        assert azimuth.min() > 0.9 and azimuth.max() < (ends - begins) / 100 + 1.5
+        assert np.all(np.diff(azimuth[::16]) > -0.1), "swept once"
 
 
 @pytest.mark.parametrize("kind", ["pcap", "pcapng"])

@@ -9,18 +9,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.whole_turns import whole_turns
+from lidarsynth.data.whole_turns import until_broken, whole_turns
 from lidarsynth.files.fields import Fields, FileError
 
 SIZE = 1206  # bytes of a packet's payload
 FLAG = 0xEEFF  # of a block
 TURN = 36000  # hundredths of a degree
 LATE = 2000  # of them: two packets of the fastest spin; what lies no farther back is late, and begins no turn
+LOOKED_AT = 2000  # packets for the sector that a sensor is set to: more than a turn of any
 REPEATED = 8  # packets that are looked through for the same one
 BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("return", [("distance", "<u2"), ("light", "u1")], 32)])
 DUAL = 0x39
@@ -88,12 +89,29 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
     y left, z up; ring 0 is the highest beam. Of two returns the last is taken. Raises FileError for a model that is not
     in MODELS.
     """
-    return whole_turns(_parts(packets))
+    fault: list[FileError] = []
+    stream = until_broken(packets, fault)
+    first = list(islice(stream, LOOKED_AT))
+    return whole_turns(_parts(chain(first, stream), _seam(first)), fault)
 
 
-def _parts(packets: Iterable[Datagram]) -> Iterator[tuple[float, Fields]]:
-    """Share of a turn and points of each. A packet that comes once more, as from two interfaces, is passed over; one
-    that comes after its next is of the turn that it is in."""
+def _seam(packets: list[Datagram]) -> int:
+    """Where one turn ends and the next begins, hundredths of a degree: amid what a sector leaves out, else 0."""
+    own = [_azimuths(packet.payload) for packet in packets if is_velodyne(packet.payload)]
+    seen = np.unique(np.concatenate(own)).astype(int) if own else np.zeros(1, int)
+    gaps = np.diff(seen, append=seen[0] + TURN)
+    widest = int(gaps.argmax())
+    return int(seen[widest] + gaps[widest] // 2) % TURN if gaps[widest] >= LATE else 0
+
+
+def _azimuths(payload: bytes) -> np.ndarray:
+    """(12,) hundredths of a degree, of each block."""
+    return np.frombuffer(payload, BLOCK, 12)["azimuth"]
+
+
+def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Fields]]:
+    """Share of a turn and points of each, from seam to seam. A packet that comes once more, as from two interfaces, is
+    passed over; one that comes after its next is of the turn that it is in."""
     parts: list[Fields] = []
     recent: deque[bytes] = deque(maxlen=REPEATED)
     last: int | None = None
@@ -103,11 +121,12 @@ def _parts(packets: Iterable[Datagram]) -> Iterator[tuple[float, Fields]]:
             continue
         recent.append(packet.payload)
         points, azimuth = decode(packet.payload, packet.time)
+        azimuth = (azimuth.astype(int) - seam) % TURN
         for first, end in _runs(azimuth):
             late = last is not None and 0 < (last - int(azimuth[first])) % TURN < LATE
             if last is None:
                 begun = int(azimuth[first])
-            elif not late and int(azimuth[first]) < last:  # passed 0, or where a sector ends
+            elif not late and int(azimuth[first]) < last:  # passed the seam
                 yield swept / TURN, _joined(parts)
                 parts, begun = [], int(azimuth[first])
             inside = (points["block"] >= first) & (points["block"] < end)
@@ -120,8 +139,8 @@ def _parts(packets: Iterable[Datagram]) -> Iterator[tuple[float, Fields]]:
 
 
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
-    """Runs (first block, block after the last) of a packet, cut where the azimuth passes 0 or where a sector ends."""
-    cuts = [0, *(np.flatnonzero(np.diff(azimuth.astype(int)) <= -LATE) + 1).tolist(), len(azimuth)]
+    """Runs (first block, block after the last) of a packet, cut where the azimuth, from the seam on, falls."""
+    cuts = [0, *(np.flatnonzero(np.diff(azimuth) <= -LATE) + 1).tolist(), len(azimuth)]
     return list(pairwise(cuts))
 
 

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import chain
+from typing import TypeVar
 
 from lidarsynth.files.fields import Fields, FileError
 
+T = TypeVar("T")
 WHOLE, HALF = 0.9, 0.5  # of the turns beside it
 
 
-def whole_turns(parts: Iterable[tuple[float, Fields]]) -> Iterator[Fields]:
+def whole_turns(parts: Iterable[tuple[float, Fields]], fault: list[FileError] | None = None) -> Iterator[Fields]:
     """The turns, of parts (share of a turn, points) as a capture has them.
 
     The first and the last, which a capture cuts, come if they are nine tenths as long as the one beside them; those
     between, which may have lost packets, if they are half as long: a sensor may be set to a sector. One that is alone
-    comes from half a turn on. What a broken capture raises comes after the turns before it.
+    comes from half a turn on. What a broken capture raises comes after the turns before it, and so does
+    what `until_broken` has put on `fault` by then.
     """
     before, held = 0.0, None
-    fault: list[FileError] = []
-    for after in chain(_until_broken(parts, fault), [(0.0, None)]):
+    fault = [] if fault is None else fault
+    for after in chain(until_broken(parts, fault), [(0.0, None)]):
         if held is not None:
             share, fields = held
             least = WHOLE if before == 0 or after[1] is None else HALF
@@ -33,8 +36,9 @@ def whole_turns(parts: Iterable[tuple[float, Fields]]) -> Iterator[Fields]:
         raise fault[0]
 
 
-def _until_broken(parts: Iterable[tuple[float, Fields]], fault: list[FileError]) -> Iterator[tuple[float, Fields]]:
+def until_broken(items: Iterable[T], fault: list[FileError]) -> Iterator[T]:
+    """The items before a FileError, which is put on `fault`."""
     try:
-        yield from parts
+        yield from items
     except FileError as error:
         fault.append(error)
