@@ -1,5 +1,6 @@
 """Captures: packets built here by the published layouts decode to the points they were built from; one real capture."""
 
+import pickle
 import struct
 from pathlib import Path
 
@@ -163,6 +164,20 @@ def test_a_sensor_that_is_set_to_a_sector_has_turns(begins: int, ends: int):
         azimuth = (np.degrees(np.arctan2(-turn["y"], turn["x"])) - begins / 100 + 1) % 360
         assert azimuth.min() > 0.9 and azimuth.max() < (ends - begins) / 100 + 1.5
         assert np.all(np.diff(azimuth[::16]) > -0.1), "swept once"
+
+
+def test_turns_that_are_passed_over_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As of a shard, or of a page that goes back to one; to another process go packets."""
+    path = tmp_path / "c.pcap"
+    path.write_bytes(pcap([udp(packet.payload, 2368) for packet in spun(30000, 190)]))
+    with monkeypatch.context() as broken:
+        broken.setattr(velodyne, "decode", None)
+        _, item = inputs_of([path]).stream()
+    data = pickle.dumps(item)
+    assert len(data) < 80 * 1300, "75 packets, and no points"
+    _, other = capture_turns(path)
+    scan = pickle.loads(data).read().scan
+    np.testing.assert_array_equal(scan.xyz, np.stack([other[axis] for axis in "xyz"], axis=1))
 
 
 @pytest.mark.parametrize("kind", ["pcap", "pcapng"])

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, islice, pairwise
 
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.whole_turns import until_broken, whole_turns
+from lidarsynth.data.whole_turns import Unread, until_broken, whole_turns
 from lidarsynth.files.fields import Fields, FileError
 
 SIZE = 1206  # bytes of a packet's payload
@@ -89,6 +90,11 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
     y left, z up; ring 0 is the highest beam. Of two returns the last is taken. Raises FileError for a model that is not
     in MODELS.
     """
+    return (turn() for turn in unread_turns(packets))
+
+
+def unread_turns(packets: Iterable[Datagram]) -> Iterator[Unread]:
+    """The same, each decoded when it is called."""
     fault: list[FileError] = []
     stream = until_broken(packets, fault)
     first = list(islice(stream, LOOKED_AT))
@@ -109,10 +115,13 @@ def _azimuths(payload: bytes) -> np.ndarray:
     return np.frombuffer(payload, BLOCK, 12)["azimuth"]
 
 
-def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Fields]]:
-    """Share of a turn and points of each, from seam to seam. A packet that comes once more, as from two interfaces, is
-    passed over; one that comes after its next is of the turn that it is in."""
-    parts: list[Fields] = []
+_Piece = tuple[Datagram, int, int]  # a packet, the first of its blocks that are meant, and the one after the last
+
+
+def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Unread]]:
+    """Share and turn of each, from seam to seam. A packet that comes once more, as from two interfaces, is passed over;
+    one that comes after its next is of the turn that it is in."""
+    pieces: list[_Piece] = []
     recent: deque[bytes] = deque(maxlen=REPEATED)
     last: int | None = None
     begun = swept = 0
@@ -120,22 +129,21 @@ def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Fiel
         if not is_velodyne(packet.payload) or packet.payload in recent:
             continue
         recent.append(packet.payload)
-        points, azimuth = decode(packet.payload, packet.time)
-        azimuth = (azimuth.astype(int) - seam) % TURN
+        _model(packet.payload)
+        azimuth = (_azimuths(packet.payload).astype(int) - seam) % TURN
         for first, end in _runs(azimuth):
             late = last is not None and 0 < (last - int(azimuth[first])) % TURN < LATE
             if last is None:
                 begun = int(azimuth[first])
             elif not late and int(azimuth[first]) < last:  # passed the seam
-                yield swept / TURN, _joined(parts)
-                parts, begun = [], int(azimuth[first])
-            inside = (points["block"] >= first) & (points["block"] < end)
-            parts.append({name: points[name][inside] for name in NAMES})
+                yield swept / TURN, partial(_decoded, pieces)
+                pieces, begun = [], int(azimuth[first])
+            pieces.append((packet, first, end))
             if not late:
                 last = int(azimuth[end - 1])
                 swept = last - begun
-    if parts:
-        yield swept / TURN, _joined(parts)
+    if pieces:
+        yield swept / TURN, partial(_decoded, pieces)
 
 
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
@@ -144,7 +152,13 @@ def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
     return list(pairwise(cuts))
 
 
-def _joined(parts: list[Fields]) -> Fields:
+def _decoded(pieces: list[_Piece]) -> Fields:
+    """The returns of a turn."""
+    parts: list[Fields] = []
+    for packet, first, end in pieces:
+        points, _ = decode(packet.payload, packet.time)
+        inside = (points["block"] >= first) & (points["block"] < end)
+        parts.append({name: points[name][inside] for name in NAMES})
     return {name: np.concatenate([part[name] for part in parts]) for name in NAMES}
 
 
@@ -156,10 +170,7 @@ def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
     """
     if not is_velodyne(payload):
         raise FileError(f"expected a Velodyne packet of {SIZE} bytes, found {len(payload)}")
-    if payload[1205] not in MODELS:
-        known = ", ".join(model.name for model in MODELS.values())
-        raise FileError(f"expected a packet of {known}, found the product byte {payload[1205]:#04x}")
-    model, dual = MODELS[payload[1205]], payload[1204] == DUAL
+    model, dual = _model(payload), payload[1204] == DUAL
     blocks = np.frombuffer(payload, BLOCK, 12)
     block, place = np.meshgrid(np.arange(12), np.arange(32), indexing="ij")
     micros = firing_time(model, block, place, dual)
@@ -177,6 +188,14 @@ def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
     fields = _points(model, laser[keep], azimuth[keep], distance[keep])
     fields |= {"intensity": blocks["return"]["light"][keep], "ring": row[laser[keep]], "time": seconds[keep]}
     return fields | {"block": block[keep], "azimuth": azimuth[keep]}, blocks["azimuth"]
+
+
+def _model(payload: bytes) -> Model:
+    """Which one sent a packet. Raises FileError for one that is not in MODELS."""
+    if payload[1205] not in MODELS:
+        known = ", ".join(model.name for model in MODELS.values())
+        raise FileError(f"expected a packet of {known}, found the product byte {payload[1205]:#04x}")
+    return MODELS[payload[1205]]
 
 
 def firing_time(model: Model, block: np.ndarray, place: np.ndarray, dual: bool) -> np.ndarray:

@@ -17,7 +17,8 @@ from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
 from lidarsynth.data.frames import moved
-from lidarsynth.data.turns import capture_turns
+from lidarsynth.data.turns import unread_turns
+from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import (
     PLACE,
     Fields,
@@ -144,17 +145,17 @@ class MessageInput:
 
 @dataclass(frozen=True)
 class TurnInput:
-    """A turn of a capture."""
+    """A turn of a capture, still in its packets."""
 
     name: str
     path: Path
     reading: Reading
-    fields: Fields
+    turn: Unread
 
     def read(self) -> Loaded:
         """The scan. Raises FileError that names the capture."""
         try:
-            return _loaded(*scan_from_fields(self.fields, self.reading.intensity, self.reading.rings), self.reading)
+            return _loaded(*scan_from_fields(self.turn(), self.reading.intensity, self.reading.rings), self.reading)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
 
@@ -322,8 +323,8 @@ def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
 
 
 def _capture_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
-    for number, fields in enumerate(capture_turns(path, reading.metadata, reading.topic)):
-        yield TurnInput(f"{folder}/{number:06d}", path, reading, fields)
+    for number, turn in enumerate(unread_turns(path, reading.metadata, reading.topic)):
+        yield TurnInput(f"{folder}/{number:06d}", path, reading, turn)
 
 
 def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
