@@ -13,6 +13,7 @@ from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.data.whole_turns import whole_turns
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.recognition import recognise
+from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading, inputs_of
 
 OUSTER_SDK = (3203.2061, 20918.6877, 7149.6797)  # metres, sums of x, y, z
@@ -164,6 +165,17 @@ def test_a_sensor_that_is_set_to_a_sector_has_turns(begins: int, ends: int):
         azimuth = (np.degrees(np.arctan2(-turn["y"], turn["x"])) - begins / 100 + 1) % 360
         assert azimuth.min() > 0.9 and azimuth.max() < (ends - begins) / 100 + 1.5
         assert np.all(np.diff(azimuth[::16]) > -0.1), "swept once"
+
+
+def test_captures_that_tcpdump_goes_on_in_are_captures(tmp_path: Path):
+    """Of `tcpdump -C 100 -w drive.pcap`: a folder of them was read as the first alone."""
+    for name in ("drive.pcap", "drive.pcap2", "drive.pcap10", "drive.pcapng1"):
+        (tmp_path / name).write_bytes(pcap([udp(packet.payload, 2368) for packet in spun(0, 160)]))
+    (tmp_path / "drive.pcap1.json").write_text("{}")
+    names = [item.name for item in inputs_of([tmp_path]).stream()]
+    folders = ["drive", "drive_2", "drive_10", "drive_1"]
+    assert names == [f"{folder}/{turn:06d}" for folder in folders for turn in (0, 1)]
+    assert "4 bags and captures" in str(file_lines(tmp_path, Reading()))
 
 
 def test_turns_that_are_passed_over_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import IO, NamedTuple
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.small_file import check_regular
 
+ENDING = re.compile(r"\.pcap(ng)?\d*$", re.IGNORECASE)
 MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
 NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
@@ -40,8 +42,8 @@ class Datagram(NamedTuple):
 
 
 def is_capture(path: str | Path) -> bool:
-    """Whether a path is a capture by its name."""
-    return Path(path).name.lower().endswith((".pcap", ".pcapng"))
+    """Whether a path is a capture by its name: also drive.pcap1, drive.pcap2, ..., as `tcpdump -C` goes on."""
+    return ENDING.search(Path(path).name) is not None
 
 
 def datagrams(path: str | Path) -> Iterator[Datagram]:

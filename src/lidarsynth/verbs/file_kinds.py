@@ -46,7 +46,7 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
     if model or path.suffix.lower() in MODELS:
         return None
     if not path.exists():
-        if path.name.lower().endswith((*READERS, *KINDS, *STREAMS)):
+        if path.name.lower().endswith((*READERS, *KINDS, *STREAMS)) or is_capture(path):
             raise FileError(f"{path}: expected a file, found no file or folder of that name")
         return None
     if path.is_dir():

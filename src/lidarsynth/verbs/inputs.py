@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -213,7 +214,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)
     each = list(dict.fromkeys(streams))
-    folders = dict(zip(each, _unlike([path.stem for path in each], each), strict=True))
+    folders = dict(zip(each, _unlike([_folder(path) for path in each], each), strict=True))
     cut: list[str] = []
     for path in streams:
         more = _stream_count(path, reading, cut)
@@ -290,6 +291,12 @@ def _names(expanded: list[Path]) -> Iterator[tuple[str, Path]]:
     """(name, path) of each scan file: its stem, with the folders above it as far as names repeat without them."""
     files = [path for path in expanded if not is_stream(path)]
     return iter(zip(_unlike([stem(path) for path in files], files), files, strict=True))
+
+
+def _folder(path: Path) -> str:
+    """Where the results of a bag or capture belong: its stem, of drive.pcap2 drive_2."""
+    number = re.sub(r"\D", "", path.suffix) if is_capture(path) else ""
+    return f"{path.stem}_{number}" if number else path.stem
 
 
 def _unlike(stems: list[str], files: list[Path]) -> list[str]:
