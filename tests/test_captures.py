@@ -282,6 +282,27 @@ def test_ouster_packets_hold_what_was_put_in(name: str):
     np.testing.assert_allclose(np.cos(turned), np.cos(np.radians(azimuths[np.nonzero(hit)[0]])), atol=1e-6)
 
 
+def test_packets_of_an_ouster_that_come_late_are_of_their_own_turn():
+    """The turns beside lost points, and the first, which a capture cuts, came."""
+    metadata = ouster.Metadata("o", (1.0, 0.0, -1.0, -2.0), (0.0,) * 4, 64, 16, 0.0, np.eye(4), "LEGACY")
+
+    def packet(number: int, first: int) -> Datagram:
+        columns = [
+            struct.pack("<QHHI", column, column, number, 0) + struct.pack("<III", 5000, 7, 9) * 4 + b"\xff" * 4
+            for column in range(first, first + 16)
+        ]
+        return Datagram(0, 7502, b"".join(columns))
+
+    packets = [packet(65534, 32), packet(65534, 48), *(packet(n, 16 * i) for n in (65535, 0, 1) for i in range(4))]
+    whole = list(ouster.turns(packets, metadata))
+    assert [len(turn["x"]) for turn in whole] == [256, 256, 256], "and half a turn before"
+    for at in (2, 6, 10):
+        packets[at], packets[at - 1] = packets[at - 1], packets[at]
+    for turn, other in zip(whole, ouster.turns(packets, metadata), strict=True):
+        for name, column in turn.items():
+            np.testing.assert_array_equal(other[name], column)
+
+
 def test_a_real_ouster_capture(shared: Path):
     """Sums over all points as `ouster-sdk` 1.0.1 computes them (XYZLut without extrinsics) from the same capture."""
     path = shared / "scans" / "other" / "OS-1-64_1024x10_fw20.pcap"

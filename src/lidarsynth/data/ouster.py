@@ -21,6 +21,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import read_json, read_text
 
 MODES = {"512x10": 512, "512x20": 512, "1024x10": 1024, "1024x20": 1024, "2048x10": 2048, "4096x5": 4096}
+LATE = 8  # packets into a turn, at most, after which one of the turn before may come
 ORIGIN = 12.163  # mm from the lidar's axis to a beam's origin where the metadata does not say: a first-generation OS1
 LIFT = 36.18  # mm from the sensor's base to the lidar's centre, the same
 
@@ -163,20 +164,29 @@ def unread_turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Un
 
 
 def _parts(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[tuple[float, Unread]]:
-    """Share of a turn and the turn of each."""
+    """Share of a turn and the turn of each. A packet that comes after the first of the next turn is of its own."""
     size, profile = packet_size(metadata), PROFILES[metadata.profile]
+    before: list[bytes] = []
     payloads: list[bytes] = []
-    columns, number = 0, None
+    ended, number = None, None
     for packet in packets:
         if len(packet.payload) != size:
             continue
-        if (frame := _frame_number(packet.payload, profile)) != number:
-            if columns:
-                yield columns / metadata.columns, partial(_decoded, metadata, payloads)
-            payloads, columns, number = [], 0, frame
+        frame = _frame_number(packet.payload, profile)
+        if frame == ended and len(payloads) <= LATE:
+            before.append(packet.payload)
+            continue
+        if frame != number:
+            yield from _turn(before, metadata)
+            before, payloads, ended, number = payloads, [], number, frame
         payloads.append(packet.payload)
-        columns += len(_columns(packet.payload, metadata))
-    if columns:
+    yield from _turn(before, metadata)
+    yield from _turn(payloads, metadata)
+
+
+def _turn(payloads: list[bytes], metadata: Metadata) -> Iterator[tuple[float, Unread]]:
+    """Share and turn, or nothing where no column was measured."""
+    if columns := sum(len(_columns(payload, metadata)) for payload in payloads):
         yield columns / metadata.columns, partial(_decoded, metadata, payloads)
 
 
