@@ -93,6 +93,14 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
     return (turn() for turn in unread_turns(packets))
 
 
+def returns(packets: Iterable[Datagram]) -> Fields:
+    """The same of all returns of some packets, as one turn. Raises FileError for what is none of a model of MODELS."""
+    pieces = [(packet, 0, 12) for packet in packets]
+    if not pieces:
+        raise FileError("expected Velodyne packets, found none")
+    return _decoded(pieces)
+
+
 def unread_turns(packets: Iterable[Datagram]) -> Iterator[Unread]:
     """The same, each decoded when it is called."""
     fault: list[FileError] = []
