@@ -128,11 +128,12 @@ _Piece = tuple[Datagram, int, int]  # a packet, the first of its blocks that are
 
 def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Unread]]:
     """Share and turn of each, from seam to seam. A packet that comes once more, as from two interfaces, is passed over;
-    one that comes after its next is of the turn that it is in."""
+    one that comes after its next is of its own turn."""
+    before: list[_Piece] = []  # of the turn that ended last, which is held until the next one has ended
     pieces: list[_Piece] = []
     recent: deque[bytes] = deque(maxlen=REPEATED)
     last: int | None = None
-    begun = swept = 0
+    begun = swept = ended = 0
     for packet in packets:
         if not is_velodyne(packet.payload) or packet.payload in recent:
             continue
@@ -140,18 +141,23 @@ def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Unre
         _model(packet.payload)
         azimuth = (_azimuths(packet.payload).astype(int) - seam) % TURN
         for first, end in _runs(azimuth):
-            late = last is not None and 0 < (last - int(azimuth[first])) % TURN < LATE
+            start = int(azimuth[first])
+            late = last is not None and 0 < (last - start) % TURN < LATE
             if last is None:
-                begun = int(azimuth[first])
-            elif not late and int(azimuth[first]) < last:  # passed the seam
-                yield swept / TURN, partial(_decoded, pieces)
-                pieces, begun = [], int(azimuth[first])
-            pieces.append((packet, first, end))
+                begun = start
+            elif not late and start < last:  # passed the seam
+                if before:
+                    yield ended / TURN, partial(_decoded, before)
+                before, ended = pieces, swept
+                pieces, begun = [], start
+            own = before if before and last is not None and late and start > last else pieces
+            own.append((packet, first, end))
             if not late:
                 last = int(azimuth[end - 1])
                 swept = last - begun
-    if pieces:
-        yield swept / TURN, partial(_decoded, pieces)
+    for share, held in ((ended, before), (swept, pieces)):
+        if held:
+            yield share / TURN, partial(_decoded, held)
 
 
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
