@@ -66,11 +66,13 @@ def ros1(folder: Path) -> Path:
     return folder / "drive.bag"
 
 
-def ros2(folder: Path, plugin: str, step: int = 10**9) -> Path:
-    from rosbags.rosbag2 import StoragePlugin, Writer
+def ros2(folder: Path, plugin: str, step: int = 10**9, packed: bool = False) -> Path:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    store = typestore("cdr")
-    with Writer(folder / plugin, version=9, storage_plugin=StoragePlugin[plugin]) as writer:
+    store, out = typestore("cdr"), Writer(folder / plugin, version=9, storage_plugin=StoragePlugin[plugin])
+    if packed:
+        out.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with out as writer:
         points = writer.add_connection("/points", POINTS, typestore=store)
         note = writer.add_connection("/note", STRING, typestore=store)
         for i in range(3):
@@ -81,11 +83,31 @@ def ros2(folder: Path, plugin: str, step: int = 10**9) -> Path:
     return folder / plugin
 
 
+def packed_mcap(folder: Path) -> Path:
+    """As `ros2 bag record -s mcap --compression-mode message --compression-format zstd`."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+    from zstandard import compress
+
+    with open(next(ros2(folder, "MCAP").glob("*.mcap")), "rb") as old, open(folder / "packed.mcap", "wb") as new:
+        writer, numbers = Writer(new), {}
+        writer.start("ros2")
+        for schema, channel, one in make_reader(old).iter_messages():
+            if schema is not None and channel.id not in numbers:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(numbers[channel.id], one.log_time, compress(one.data), one.publish_time)
+        writer.finish()
+    return folder / "packed.mcap"
+
+
 KINDS: dict[str, Callable[[Path], Path]] = {
     "ros1": ros1,
     "sqlite3": lambda folder: ros2(folder, "SQLITE3"),
     "db3 alone": lambda folder: next(ros2(folder, "SQLITE3").glob("*.db3")),
     "mcap folder": lambda folder: ros2(folder, "MCAP"),
+    "db3 of packed messages": lambda folder: next(ros2(folder, "SQLITE3", packed=True).glob("*.db3")),
+    "mcap of packed messages": packed_mcap,
     "bare mcap": lambda folder: next(ros2(folder, "MCAP").glob("*.mcap")),
 }
 

@@ -1,5 +1,6 @@
 """Captures: packets built here by the published layouts decode to the points they were built from; one real capture."""
 
+import pickle
 import struct
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from lidarsynth.data.turns import capture_turns, senders
 from lidarsynth.data.whole_turns import whole_turns
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.recognition import recognise
+from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading, inputs_of
 
 OUSTER_SDK = (3203.2061, 20918.6877, 7149.6797)  # metres, sums of x, y, z
@@ -54,6 +56,16 @@ def test_payloads_of_a_capture(kind: str, tmp_path: Path):
     assert found[0].time == (5_000_000_006 if kind == "nano" else 5_000_006_000)
     path.write_bytes(path.read_bytes()[:-9])
     assert len(list(datagrams(path))) == 1, "a record cut short ends the capture"
+
+
+@pytest.mark.parametrize(("link", "head"), [
+    (113, b"\0" * 14 + b"\x08\0"), (276, b"\x08\0" + b"\0" * 18), (101, b""), (0, b"\2\0\0\0"),
+])  # fmt: skip
+def test_captures_of_other_link_layers(link: int, head: bytes, tmp_path: Path):
+    """As of `tcpdump -i any`, which writes another one since its version 4.99."""
+    content = pcap([head + udp(b"first", 2368)[14:]])
+    (tmp_path / "c.pcap").write_bytes(content[:20] + struct.pack("<I", link) + content[24:])
+    assert [(d.port, d.payload, d.address) for d in datagrams(tmp_path / "c.pcap")] == [(2368, b"first", "10.0.0.1")]
 
 
 def test_what_is_no_capture_is_one_line(tmp_path: Path):
@@ -127,20 +139,23 @@ def test_packets_that_come_twice_or_late_make_no_turn():
     one, other = velodyne.turns(packets)
     swapped = list(packets)
     swapped[12], swapped[13] = swapped[13], swapped[12]  # 35760 to 36200, and the next one
-    for stream in ([p for p in packets for _ in range(2)], swapped):
+    ends = list(packets)
+    ends[87], ends[88] = ends[88], ends[87]  # 35760 to 36200 of the next turn, and the next one
+    for stream in ([p for p in packets for _ in range(2)], swapped, ends):
         found = list(velodyne.turns(stream))
         assert len(found) == 2
-        assert abs(len(found[0]["x"]) - len(one["x"])) <= 12 * 32
-        for name, column in other.items():
-            np.testing.assert_array_equal(found[1][name], column)
+        for turn, true in zip(found, (one, other), strict=True):
+            order, given = (np.lexsort((t["ring"], t["x"], t["y"])) for t in (turn, true))
+            for name, column in true.items():
+                np.testing.assert_array_equal(turn[name][order], column[given])
 
 
-@pytest.mark.parametrize("ends", [16000, 30000])
-def test_a_sensor_that_is_set_to_a_sector_has_turns(ends: int):
-    """From 100 degrees to less or more than half a turn on; packets go on over what is left out."""
+@pytest.mark.parametrize(("begins", "ends"), [(10000, 16000), (10000, 30000), (27000, 45000), (34000, 39000)])
+def test_a_sensor_that_is_set_to_a_sector_has_turns(begins: int, ends: int):
+    """To less or more than half a turn on, also over azimuth 0; packets go on over what is left out."""
     step, blocks = 40, []
     for _ in range(6):
-        blocks += list(range(10000, ends, step))
+        blocks += [azimuth % 36000 for azimuth in range(begins, ends, step)]
     packets = []
     for i in range(0, len(blocks) - 11, 12):
         payload = bytearray(velodyne_packet(0x22, 0, step, 5000))
@@ -150,8 +165,34 @@ def test_a_sensor_that_is_set_to_a_sector_has_turns(ends: int):
     found = list(velodyne.turns(packets))
     assert len(found) in (5, 6)
     for turn in found:
-        azimuth = np.degrees(np.arctan2(-turn["y"], turn["x"])) % 360
-        assert azimuth.min() > 99.9 and azimuth.max() < ends / 100 + 0.5
+        azimuth = (np.degrees(np.arctan2(-turn["y"], turn["x"])) - begins / 100 + 1) % 360
+        assert azimuth.min() > 0.9 and azimuth.max() < (ends - begins) / 100 + 1.5
+        assert np.all(np.diff(azimuth[::16]) > -0.1), "swept once"
+
+
+def test_captures_that_tcpdump_goes_on_in_are_captures(tmp_path: Path):
+    """Of `tcpdump -C 100 -w drive.pcap`: a folder of them was read as the first alone."""
+    for name in ("drive.pcap", "drive.pcap2", "drive.pcap10", "drive.pcapng1"):
+        (tmp_path / name).write_bytes(pcap([udp(packet.payload, 2368) for packet in spun(0, 160)]))
+    (tmp_path / "drive.pcap1.json").write_text("{}")
+    names = [item.name for item in inputs_of([tmp_path]).stream()]
+    folders = ["drive", "drive_2", "drive_10", "drive_1"]
+    assert names == [f"{folder}/{turn:06d}" for folder in folders for turn in (0, 1)]
+    assert "4 bags and captures" in str(file_lines(tmp_path, Reading()))
+
+
+def test_turns_that_are_passed_over_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As of a shard, or of a page that goes back to one; to another process go packets."""
+    path = tmp_path / "c.pcap"
+    path.write_bytes(pcap([udp(packet.payload, 2368) for packet in spun(30000, 190)]))
+    with monkeypatch.context() as broken:
+        broken.setattr(velodyne, "decode", None)
+        _, item = inputs_of([path]).stream()
+    data = pickle.dumps(item)
+    assert len(data) < 80 * 1300, "75 packets, and no points"
+    _, other = capture_turns(path)
+    scan = pickle.loads(data).read().scan
+    np.testing.assert_array_equal(scan.xyz, np.stack([other[axis] for axis in "xyz"], axis=1))
 
 
 @pytest.mark.parametrize("kind", ["pcap", "pcapng"])
@@ -242,6 +283,27 @@ def test_ouster_packets_hold_what_was_put_in(name: str):
                                altitudes[np.nonzero(hit)[0]], atol=1e-3)  # fmt: skip
     turned = np.mod(np.arctan2(beam[:, 1], beam[:, 0]) - encoder, 2 * np.pi)
     np.testing.assert_allclose(np.cos(turned), np.cos(np.radians(azimuths[np.nonzero(hit)[0]])), atol=1e-6)
+
+
+def test_packets_of_an_ouster_that_come_late_are_of_their_own_turn():
+    """The turns beside lost points, and the first, which a capture cuts, came."""
+    metadata = ouster.Metadata("o", (1.0, 0.0, -1.0, -2.0), (0.0,) * 4, 64, 16, 0.0, np.eye(4), "LEGACY")
+
+    def packet(number: int, first: int) -> Datagram:
+        columns = [
+            struct.pack("<QHHI", column, column, number, 0) + struct.pack("<III", 5000, 7, 9) * 4 + b"\xff" * 4
+            for column in range(first, first + 16)
+        ]
+        return Datagram(0, 7502, b"".join(columns))
+
+    packets = [packet(65534, 32), packet(65534, 48), *(packet(n, 16 * i) for n in (65535, 0, 1) for i in range(4))]
+    whole = list(ouster.turns(packets, metadata))
+    assert [len(turn["x"]) for turn in whole] == [256, 256, 256], "and half a turn before"
+    for at in (2, 6, 10):
+        packets[at], packets[at - 1] = packets[at - 1], packets[at]
+    for turn, other in zip(whole, ouster.turns(packets, metadata), strict=True):
+        for name, column in turn.items():
+            np.testing.assert_array_equal(other[name], column)
 
 
 def test_a_real_ouster_capture(shared: Path):

@@ -331,12 +331,15 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
 
 
 def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
-    """The topic of points, and the others that are to be copied."""
+    """The topic of points, of packets one of its own, and the others that are to be copied."""
+    from lidarsynth.data.bag_records import PACKETS
     from lidarsynth.data.bags import open_bag
 
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
-        return topic, [other for other in bag.topics if many.keep_topics and other.name != topic]
+        others = [other for other in bag.topics if other.name != topic or other.kind == PACKETS]
+        named = topic if len(others) < len(bag.topics) else f"{topic}/points"
+        return named, others if many.keep_topics else []
 
 
 def _copy(path: Path, writer: BagWriter, topics: list[Topic]) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from lidarsynth.data.bag_errors import BROKEN, library_errors, naming, one_line
+from lidarsynth.data.capture import Datagram
+from lidarsynth.data.velodyne import returns
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
 
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
 
 Attached: TypeAlias = "Attachment | Metadata"
 POINTS = "sensor_msgs/msg/PointCloud2"
+PACKET = "velodyne_msgs/msg/VelodynePacket"
+PACKETS = "velodyne_msgs/msg/VelodyneScan"  # packets of about a turn, as velodyne_driver publishes them
+PACKED = b"\x28\xb5\x2f\xfd"  # a frame of zstd (RFC 8878); a message in CDR begins with 0
 
 
 @dataclass(frozen=True)
@@ -105,8 +110,10 @@ class Bag:
                 yield FileError(f"{self.path}: {topic}: {error}")
 
     def point_topic(self, name: str | None = None) -> str:
-        """The topic named, or the only one of points. Raises ValueError that lists those there are."""
+        """The topic named, or the only one of points, else of packets. Raises ValueError that lists those there are."""
         clouds = [topic.name for topic in self.topics if topic.kind == POINTS]
+        packets = [topic.name for topic in self.topics if topic.kind == PACKETS]
+        clouds = [*clouds, *packets] if name in packets or not clouds else clouds
         listed = ", ".join(clouds) or "none; it holds " + (
             ", ".join(sorted({t.kind for t in self.topics})) or "nothing"
         )
@@ -120,20 +127,40 @@ class Bag:
         return name
 
 
+def opened(topic: Topic, data: bytes) -> bytes:
+    """The bytes of a message, unpacked where `ros2 bag record --compression-mode message` has packed each: only the
+    metadata.yaml beside the file tells of that. What does not unpack is given as it is."""
+    if topic.encoding != "cdr" or data[:4] != PACKED:
+        return data
+    from zstandard import ZstdDecompressor, ZstdError
+
+    try:
+        return ZstdDecompressor().decompress(data)
+    except (ZstdError, MemoryError):
+        return data
+
+
 def cloud_of(message: Message) -> Cloud:
-    """The point cloud in a message of PointCloud2. Raises FileError, without the bag's path, for one that is broken."""
+    """The point cloud in a message of PointCloud2, or of packets. Raises FileError, without the bag's path, for one
+    that is broken."""
+    kind = message.topic.kind if message.topic.kind == PACKETS else POINTS
     store = typestore(message.topic.encoding)
     read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
     try:
-        points: Any = read(message.data, POINTS)
+        points: Any = read(message.data, kind)
         stamp, frame_id = points.header.stamp, points.header.frame_id
         number = points.header.seq if message.topic.encoding == "ros1" else message.sequence
         times = stamp.sec * 10**9 + stamp.nanosec, frame_id, message.time
-        return Cloud(*times, decode(points), message.published, number)
+        fields = decode(points) if kind == POINTS else returns(map(_datagram, points.packets))
+        return Cloud(*times, fields, message.published, number)
     except FileError:
         raise
     except (*BROKEN, *library_errors()) as error:
         raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {one_line(error)}") from None
+
+
+def _datagram(packet: Any) -> Datagram:
+    return Datagram(packet.stamp.sec * 10**9 + packet.stamp.nanosec, 0, packet.data.tobytes())
 
 
 _STORES: dict[str, Any] = {}  # encoding -> the types of that ROS; a second to build, so once
@@ -141,11 +168,13 @@ _STORES: dict[str, Any] = {}  # encoding -> the types of that ROS; a second to b
 
 def typestore(encoding: str) -> Any:
     """rosbags' message types of ROS 1 (`ros1`) or ROS 2 (`cdr`). Raises FileError for another encoding."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     stores = {"ros1": Stores.ROS1_NOETIC, "cdr": Stores.LATEST}
     if encoding not in stores:
         raise FileError(f"expected messages of ROS 1 or ROS 2, found the encoding {encoding!r}")
     if encoding not in _STORES:
-        _STORES[encoding] = get_typestore(stores[encoding])
+        store = _STORES[encoding] = get_typestore(stores[encoding])
+        store.register(get_types_from_msg("builtin_interfaces/Time stamp\nuint8[1206] data", PACKET))
+        store.register(get_types_from_msg(f"std_msgs/Header header\n{PACKET}[] packets", PACKETS))
     return _STORES[encoding]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming
-from lidarsynth.data.bag_records import Attached, Bag, Message, Topic
+from lidarsynth.data.bag_records import Attached, Bag, Message, Topic, opened
 from lidarsynth.data.cut_bags import Mended, mend
 from lidarsynth.data.cut_databases import has_log, read_database
 from lidarsynth.files.fields import FileError
@@ -67,7 +67,7 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
             chosen = [c for c in reader.connections if not names or c.topic in names]
             each = (part.messages(chosen, start or None) for part in parts if chosen)
             for connection, time, data in heapq.merge(*each, key=lambda message: message[1]):
-                yield Message(topics[connection.id], time, bytes(data))
+                yield Message(topics[connection.id], time, opened(topics[connection.id], bytes(data)))
 
         # rosbags counts to the nanosecond after the last message
         duration = max(reader.duration - 1, 0) / 1e9 if reader.message_count else 0.0
@@ -253,7 +253,9 @@ def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
 def _mcap_messages(part: _Part, names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
     reader = _mcap_reader(part.stream, part.indexed)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
-        yield Message(topics[channel.topic], message.log_time, message.data, message.publish_time, message.sequence)
+        topic = topics[channel.topic]
+        told = message.publish_time, message.sequence
+        yield Message(topic, message.log_time, opened(topic, message.data), *told)
 
 
 def _attached(streams: Iterable[IO[bytes]]) -> Iterator[Attached]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,13 +11,15 @@ from typing import IO, NamedTuple
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.small_file import check_regular
 
+ENDING = re.compile(r"\.pcap(ng)?\d*$", re.IGNORECASE)
 MAGIC = {b"\xd4\xc3\xb2\xa1": "<", b"\xa1\xb2\xc3\xd4": ">", b"\x4d\x3c\xb2\xa1": "<", b"\xa1\xb2\x3c\x4d": ">"}
 NANO = (b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
 INTERFACE, SIMPLE, ENHANCED = 1, 3, 6  # kinds of blocks of pcapng (draft-ietf-opsawg-pcapng)
 RESOLUTION, OFFSET = 9, 14  # if_tsresol and if_tsoffset, options of an interface
 MAX_RECORD = 1 << 18
-ETHERNET, RAW_IP, LOOPBACK, LINUX = 1, (12, 101, 228), 0, 113  # link types (the tcpdump group's list)
+ETHERNET, RAW_IP, LOOPBACK = 1, (12, 101, 228), 0  # link types (the tcpdump group's list)
+COOKED = {113: (14, 16), 276: (0, 20)}  # `tcpdump -i any`, before 4.99.0 and since: where kind and packet are
 IPV4, UDP = 0x0800, 17
 VLAN = (b"\x81\x00", b"\x88\xa8", b"\x91\x00")  # IEEE 802.1Q, 802.1ad, and what came before it
 
@@ -39,8 +42,8 @@ class Datagram(NamedTuple):
 
 
 def is_capture(path: str | Path) -> bool:
-    """Whether a path is a capture by its name."""
-    return Path(path).name.lower().endswith((".pcap", ".pcapng"))
+    """Whether a path is a capture by its name: also drive.pcap1, drive.pcap2, ..., as `tcpdump -C` goes on."""
+    return ENDING.search(Path(path).name) is not None
 
 
 def datagrams(path: str | Path) -> Iterator[Datagram]:
@@ -156,8 +159,8 @@ def _ip(frame: bytes, link: int) -> bytes:
         return frame
     if link == LOOPBACK:
         return frame[4:]
-    at = 16 if link == LINUX else 14
-    kind = frame[at - 2 : at]
+    place, at = COOKED.get(link, (12, 14))
+    kind = frame[place : place + 2]
     while kind in VLAN and link == ETHERNET:  # a tag each
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if kind == IPV4.to_bytes(2, "big") else b""

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.whole_turns import whole_turns
+from lidarsynth.data.whole_turns import Unread, whole_turns
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import read_json, read_text
 
 MODES = {"512x10": 512, "512x20": 512, "1024x10": 1024, "1024x20": 1024, "2048x10": 2048, "4096x5": 4096}
+LATE = 8  # packets into a turn, at most, after which one of the turn before may come
 ORIGIN = 12.163  # mm from the lidar's axis to a beam's origin where the metadata does not say: a first-generation OS1
 LIFT = 36.18  # mm from the sensor's base to the lidar's centre, the same
 
@@ -153,24 +155,60 @@ def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
     Row by row, in the sensor frame: x forward, y left, z up; ring = row, 0 the highest beam. A turn ends where the
     frame's number changes; packets of other sizes are passed over. Raises FileError for a profile not in PROFILES.
     """
+    return (turn() for turn in unread_turns(packets, metadata))
+
+
+def unread_turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Unread]:
+    """The same, each decoded when it is called."""
     return whole_turns(_parts(packets, metadata))
 
 
-def _parts(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[tuple[float, Fields]]:
-    """Share of a turn and points of each."""
-    size, column = packet_size(metadata), _column_size(metadata)
-    profile = PROFILES[metadata.profile]
-    turn, number = _Turn(metadata, profile), None
+def _parts(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[tuple[float, Unread]]:
+    """Share of a turn and the turn of each. A packet that comes after the first of the next turn is of its own."""
+    size, profile = packet_size(metadata), PROFILES[metadata.profile]
+    before: list[bytes] = []
+    payloads: list[bytes] = []
+    ended, number = None, None
     for packet in packets:
         if len(packet.payload) != size:
             continue
-        if (frame := _frame_number(packet.payload, profile)) != number:
-            if turn.columns:
-                yield turn.columns / metadata.columns, turn.fields()
-            turn, number = _Turn(metadata, profile), frame
-        turn.add(packet.payload, column)
-    if turn.columns:
-        yield turn.columns / metadata.columns, turn.fields()
+        frame = _frame_number(packet.payload, profile)
+        if frame == ended and len(payloads) <= LATE:
+            before.append(packet.payload)
+            continue
+        if frame != number:
+            yield from _turn(before, metadata)
+            before, payloads, ended, number = payloads, [], number, frame
+        payloads.append(packet.payload)
+    yield from _turn(before, metadata)
+    yield from _turn(payloads, metadata)
+
+
+def _turn(payloads: list[bytes], metadata: Metadata) -> Iterator[tuple[float, Unread]]:
+    """Share and turn, or nothing where no column was measured."""
+    if columns := sum(len(_columns(payload, metadata)) for payload in payloads):
+        yield columns / metadata.columns, partial(_decoded, metadata, payloads)
+
+
+def _columns(payload: bytes, metadata: Metadata) -> list[tuple[int, bytes]]:
+    """Number and bytes of each column of a packet that was measured."""
+    profile, size = PROFILES[metadata.profile], _column_size(metadata)
+    columns: list[tuple[int, bytes]] = []
+    for start in range(profile.header, profile.header + metadata.packet_columns * size, size):
+        block = payload[start : start + size]
+        where = int.from_bytes(block[8:10], "little")
+        good = block[-4:] == b"\xff\xff\xff\xff" if profile.column[1] else bool(block[10] & 1)
+        if good and where < metadata.columns:
+            columns.append((where, block))
+    return columns
+
+
+def _decoded(metadata: Metadata, payloads: list[bytes]) -> Fields:
+    """The returns of a turn."""
+    turn = _Turn(metadata)
+    for payload in payloads:
+        turn.add(payload)
+    return turn.fields()
 
 
 def _frame_number(payload: bytes, profile: Profile) -> int:
@@ -181,28 +219,22 @@ def _frame_number(payload: bytes, profile: Profile) -> int:
 class _Turn:
     """The columns of one turn as they come in, (H, W) images by name."""
 
-    def __init__(self, metadata: Metadata, profile: Profile):
-        self.metadata, self.profile, self.columns = metadata, profile, 0
+    def __init__(self, metadata: Metadata):
+        self.metadata, self.profile = metadata, PROFILES[metadata.profile]
         shape = (len(metadata.altitudes), metadata.columns)
         self.range = np.zeros(shape)
         self.seconds = np.zeros(metadata.columns)
-        self.images = {name: np.zeros(shape, kind) for name, (_, kind) in profile.fields.items()}
+        self.images = {name: np.zeros(shape, kind) for name, (_, kind) in self.profile.fields.items()}
 
-    def add(self, payload: bytes, column: int) -> None:
+    def add(self, payload: bytes) -> None:
         before, after = self.profile.column
-        for i in range(self.metadata.packet_columns):
-            block = payload[self.profile.header + i * column :][:column]
-            where = int.from_bytes(block[8:10], "little")
-            good = block[-4:] == b"\xff\xff\xff\xff" if after else bool(block[10] & 1)
-            if not good or where >= self.metadata.columns:
-                continue
+        for where, block in _columns(payload, self.metadata):
             pixels = np.frombuffer(block, np.uint8, len(block) - before - after, before).reshape(-1, self.profile.pixel)
             kind, mask, unit = self.profile.range
             self.range[:, where] = (_number(pixels, 0, kind) & mask) * unit
             for name, (at, kind) in self.profile.fields.items():
                 self.images[name][:, where] = _number(pixels, at, kind)
             self.seconds[where] = int.from_bytes(block[:8], "little") / 1e9
-            self.columns += 1
 
     def fields(self) -> Fields:
         hit = self.range > 0

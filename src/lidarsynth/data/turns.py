@@ -8,12 +8,13 @@ from pathlib import Path
 
 from lidarsynth.data import ouster, velodyne
 from lidarsynth.data.capture import Datagram, datagrams
+from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import Fields, FileError
 
 LOOKED_AT = 2000  # packets from the first of a LiDAR on: 0.2 s of the fastest sensor, so that every other one shows
 LARGE = 1000  # bytes: smaller packets are positions and inertial measurements
 Test = Callable[[Datagram], bool]
-Turns = Callable[[Iterator[Datagram]], Iterator[Fields]]
+Turns = Callable[[Iterator[Datagram]], Iterator[Unread]]
 
 
 def capture_turns(path: Path, metadata: Path | None = None, sender: str | None = None) -> Iterator[Fields]:
@@ -22,6 +23,11 @@ def capture_turns(path: Path, metadata: Path | None = None, sender: str | None =
     metadata  `.json` of an Ouster; None = the only one beside the capture
     sender    ADDRESS:PORT, of the sensor and to which its packets go; None = the only one
     """
+    return (turn() for turn in unread_turns(path, metadata, sender))
+
+
+def unread_turns(path: Path, metadata: Path | None = None, sender: str | None = None) -> Iterator[Unread]:
+    """The same, each decoded when it is called: what is only passed over costs a tenth."""
     belongs, turns = _kind(path, metadata, sender)
     listed = _listed(path, belongs)
     if sender is None and len(listed) > 1:
@@ -30,14 +36,14 @@ def capture_turns(path: Path, metadata: Path | None = None, sender: str | None =
         raise FileError(f"{path}: expected packets of a LiDAR as {sender}, found {', '.join(listed)}")
     own = (packet for packet in datagrams(path) if packet.sender == (sender or listed[0]) and belongs(packet))
     found, streamed = 0, turns(own)
-    while (fields := _next(path, streamed)) is not None:
+    while (turn := _next(path, streamed)) is not None:
         found += 1
-        yield fields
+        yield turn
     if not found:
         raise FileError(f"{path}: expected a turn of the LiDAR, found less than half of one")
 
 
-def _next(path: Path, turns: Iterator[Fields]) -> Fields | None:
+def _next(path: Path, turns: Iterator[Unread]) -> Unread | None:
     """The next turn; what is wrong with a packet is said with the capture's name."""
     try:
         return next(turns, None)
@@ -72,10 +78,10 @@ def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, 
     if not large:
         raise FileError(f"{path}: expected packets of a LiDAR, found none")
     if any(velodyne.is_velodyne(packet.payload) for packet in large):
-        return lambda packet: velodyne.is_velodyne(packet.payload), velodyne.turns
+        return lambda packet: velodyne.is_velodyne(packet.payload), velodyne.unread_turns
     described = ouster.read_metadata(metadata or _metadata_beside(path))
     size = ouster.packet_size(described)
-    return lambda packet: len(packet.payload) == size, lambda packets: ouster.turns(packets, described)
+    return lambda packet: len(packet.payload) == size, lambda packets: ouster.unread_turns(packets, described)
 
 
 def _listed(path: Path, belongs: Test) -> list[str]:

@@ -9,18 +9,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
+from itertools import chain, islice, pairwise
 
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.whole_turns import whole_turns
+from lidarsynth.data.whole_turns import Unread, until_broken, whole_turns
 from lidarsynth.files.fields import Fields, FileError
 
 SIZE = 1206  # bytes of a packet's payload
 FLAG = 0xEEFF  # of a block
 TURN = 36000  # hundredths of a degree
 LATE = 2000  # of them: two packets of the fastest spin; what lies no farther back is late, and begins no turn
+LOOKED_AT = 2000  # packets for the sector that a sensor is set to: more than a turn of any
 REPEATED = 8  # packets that are looked through for the same one
 BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("return", [("distance", "<u2"), ("light", "u1")], 32)])
 DUAL = 0x39
@@ -88,44 +90,89 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
     y left, z up; ring 0 is the highest beam. Of two returns the last is taken. Raises FileError for a model that is not
     in MODELS.
     """
-    return whole_turns(_parts(packets))
+    return (turn() for turn in unread_turns(packets))
 
 
-def _parts(packets: Iterable[Datagram]) -> Iterator[tuple[float, Fields]]:
-    """Share of a turn and points of each. A packet that comes once more, as from two interfaces, is passed over; one
-    that comes after its next is of the turn that it is in."""
-    parts: list[Fields] = []
+def returns(packets: Iterable[Datagram]) -> Fields:
+    """The same of all returns of some packets, as one turn. Raises FileError for what is none of a model of MODELS."""
+    pieces = [(packet, 0, 12) for packet in packets]
+    if not pieces:
+        raise FileError("expected Velodyne packets, found none")
+    return _decoded(pieces)
+
+
+def unread_turns(packets: Iterable[Datagram]) -> Iterator[Unread]:
+    """The same, each decoded when it is called."""
+    fault: list[FileError] = []
+    stream = until_broken(packets, fault)
+    first = list(islice(stream, LOOKED_AT))
+    return whole_turns(_parts(chain(first, stream), _seam(first)), fault)
+
+
+def _seam(packets: list[Datagram]) -> int:
+    """Where one turn ends and the next begins, hundredths of a degree: amid what a sector leaves out, else 0."""
+    own = [_azimuths(packet.payload) for packet in packets if is_velodyne(packet.payload)]
+    seen = np.unique(np.concatenate(own)).astype(int) if own else np.zeros(1, int)
+    gaps = np.diff(seen, append=seen[0] + TURN)
+    widest = int(gaps.argmax())
+    return int(seen[widest] + gaps[widest] // 2) % TURN if gaps[widest] >= LATE else 0
+
+
+def _azimuths(payload: bytes) -> np.ndarray:
+    """(12,) hundredths of a degree, of each block."""
+    return np.frombuffer(payload, BLOCK, 12)["azimuth"]
+
+
+_Piece = tuple[Datagram, int, int]  # a packet, the first of its blocks that are meant, and the one after the last
+
+
+def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Unread]]:
+    """Share and turn of each, from seam to seam. A packet that comes once more, as from two interfaces, is passed over;
+    one that comes after its next is of its own turn."""
+    before: list[_Piece] = []  # of the turn that ended last, which is held until the next one has ended
+    pieces: list[_Piece] = []
     recent: deque[bytes] = deque(maxlen=REPEATED)
     last: int | None = None
-    begun = swept = 0
+    begun = swept = ended = 0
     for packet in packets:
         if not is_velodyne(packet.payload) or packet.payload in recent:
             continue
         recent.append(packet.payload)
-        points, azimuth = decode(packet.payload, packet.time)
+        _model(packet.payload)
+        azimuth = (_azimuths(packet.payload).astype(int) - seam) % TURN
         for first, end in _runs(azimuth):
-            late = last is not None and 0 < (last - int(azimuth[first])) % TURN < LATE
+            start = int(azimuth[first])
+            late = last is not None and 0 < (last - start) % TURN < LATE
             if last is None:
-                begun = int(azimuth[first])
-            elif not late and int(azimuth[first]) < last:  # passed 0, or where a sector ends
-                yield swept / TURN, _joined(parts)
-                parts, begun = [], int(azimuth[first])
-            inside = (points["block"] >= first) & (points["block"] < end)
-            parts.append({name: points[name][inside] for name in NAMES})
+                begun = start
+            elif not late and start < last:  # passed the seam
+                if before:
+                    yield ended / TURN, partial(_decoded, before)
+                before, ended = pieces, swept
+                pieces, begun = [], start
+            own = before if before and last is not None and late and start > last else pieces
+            own.append((packet, first, end))
             if not late:
                 last = int(azimuth[end - 1])
                 swept = last - begun
-    if parts:
-        yield swept / TURN, _joined(parts)
+    for share, held in ((ended, before), (swept, pieces)):
+        if held:
+            yield share / TURN, partial(_decoded, held)
 
 
 def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
-    """Runs (first block, block after the last) of a packet, cut where the azimuth passes 0 or where a sector ends."""
-    cuts = [0, *(np.flatnonzero(np.diff(azimuth.astype(int)) <= -LATE) + 1).tolist(), len(azimuth)]
+    """Runs (first block, block after the last) of a packet, cut where the azimuth, from the seam on, falls."""
+    cuts = [0, *(np.flatnonzero(np.diff(azimuth) <= -LATE) + 1).tolist(), len(azimuth)]
     return list(pairwise(cuts))
 
 
-def _joined(parts: list[Fields]) -> Fields:
+def _decoded(pieces: list[_Piece]) -> Fields:
+    """The returns of a turn."""
+    parts: list[Fields] = []
+    for packet, first, end in pieces:
+        points, _ = decode(packet.payload, packet.time)
+        inside = (points["block"] >= first) & (points["block"] < end)
+        parts.append({name: points[name][inside] for name in NAMES})
     return {name: np.concatenate([part[name] for part in parts]) for name in NAMES}
 
 
@@ -137,10 +184,7 @@ def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
     """
     if not is_velodyne(payload):
         raise FileError(f"expected a Velodyne packet of {SIZE} bytes, found {len(payload)}")
-    if payload[1205] not in MODELS:
-        known = ", ".join(model.name for model in MODELS.values())
-        raise FileError(f"expected a packet of {known}, found the product byte {payload[1205]:#04x}")
-    model, dual = MODELS[payload[1205]], payload[1204] == DUAL
+    model, dual = _model(payload), payload[1204] == DUAL
     blocks = np.frombuffer(payload, BLOCK, 12)
     block, place = np.meshgrid(np.arange(12), np.arange(32), indexing="ij")
     micros = firing_time(model, block, place, dual)
@@ -158,6 +202,14 @@ def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
     fields = _points(model, laser[keep], azimuth[keep], distance[keep])
     fields |= {"intensity": blocks["return"]["light"][keep], "ring": row[laser[keep]], "time": seconds[keep]}
     return fields | {"block": block[keep], "azimuth": azimuth[keep]}, blocks["azimuth"]
+
+
+def _model(payload: bytes) -> Model:
+    """Which one sent a packet. Raises FileError for one that is not in MODELS."""
+    if payload[1205] not in MODELS:
+        known = ", ".join(model.name for model in MODELS.values())
+        raise FileError(f"expected a packet of {known}, found the product byte {payload[1205]:#04x}")
+    return MODELS[payload[1205]]
 
 
 def firing_time(model: Model, block: np.ndarray, place: np.ndarray, dual: bool) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bag_records import POINTS, Bag, Cloud
+from lidarsynth.data.bag_records import PACKETS, POINTS, Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
@@ -46,7 +46,7 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
     if model or path.suffix.lower() in MODELS:
         return None
     if not path.exists():
-        if path.name.lower().endswith((*READERS, *KINDS, *STREAMS)):
+        if path.name.lower().endswith((*READERS, *KINDS, *STREAMS)) or is_capture(path):
             raise FileError(f"{path}: expected a file, found no file or folder of that name")
         return None
     if path.is_dir():
@@ -141,7 +141,7 @@ def _bag(path: Path, reading: Reading) -> Lines:
             lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
-        clouds = [topic.name for topic in bag.topics if topic.kind == POINTS]
+        clouds = [topic.name for topic in bag.topics if topic.kind in (POINTS, PACKETS)]
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
         raise FileError(f"{path}: {clouds[0]}: {told[0][1]}")

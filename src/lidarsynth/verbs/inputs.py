@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -17,7 +18,8 @@ from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
 from lidarsynth.data.frames import moved
-from lidarsynth.data.turns import capture_turns
+from lidarsynth.data.turns import unread_turns
+from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import (
     PLACE,
     Fields,
@@ -144,17 +146,17 @@ class MessageInput:
 
 @dataclass(frozen=True)
 class TurnInput:
-    """A turn of a capture."""
+    """A turn of a capture, still in its packets."""
 
     name: str
     path: Path
     reading: Reading
-    fields: Fields
+    turn: Unread
 
     def read(self) -> Loaded:
         """The scan. Raises FileError that names the capture."""
         try:
-            return _loaded(*scan_from_fields(self.fields, self.reading.intensity, self.reading.rings), self.reading)
+            return _loaded(*scan_from_fields(self.turn(), self.reading.intensity, self.reading.rings), self.reading)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
 
@@ -212,7 +214,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
     count: int | None = len(files)
     each = list(dict.fromkeys(streams))
-    folders = dict(zip(each, _unlike([path.stem for path in each], each), strict=True))
+    folders = dict(zip(each, _unlike([_folder(path) for path in each], each), strict=True))
     cut: list[str] = []
     for path in streams:
         more = _stream_count(path, reading, cut)
@@ -291,6 +293,12 @@ def _names(expanded: list[Path]) -> Iterator[tuple[str, Path]]:
     return iter(zip(_unlike([stem(path) for path in files], files), files, strict=True))
 
 
+def _folder(path: Path) -> str:
+    """Where the results of a bag or capture belong: its stem, of drive.pcap2 drive_2."""
+    number = re.sub(r"\D", "", path.suffix) if is_capture(path) else ""
+    return f"{path.stem}_{number}" if number else path.stem
+
+
 def _unlike(stems: list[str], files: list[Path]) -> list[str]:
     """The stems, or, where any is there twice, all with the folders above their files. Raises ValueError where these
     do not tell them apart."""
@@ -322,8 +330,8 @@ def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
 
 
 def _capture_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
-    for number, fields in enumerate(capture_turns(path, reading.metadata, reading.topic)):
-        yield TurnInput(f"{folder}/{number:06d}", path, reading, fields)
+    for number, turn in enumerate(unread_turns(path, reading.metadata, reading.topic)):
+        yield TurnInput(f"{folder}/{number:06d}", path, reading, turn)
 
 
 def _loaded(scan: Scan, dropped: int, reading: Reading) -> Loaded:
