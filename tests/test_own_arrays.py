@@ -129,3 +129,10 @@ def test_ranges_beyond_the_limits_of_their_sensor_are_told():
 def test_points_in_another_frame_are_told():
     xyz = street("hdl-64e-kitti").to_scan().xyz
     assert told([xyz[:, [1, 2, 0]]], "y up instead of z") and not told([xyz], "sensor's frame")
+
+
+def test_points_that_are_shares_of_a_limit_are_told_and_say_why_rows_are_none():
+    report = ls.evaluate([points(image) / [80, 80, 80, 1] for image in STREETS], REAL)
+    assert any("expected metres, not shares of a limit" in note for note in report.warnings)
+    for result in report.results[:2]:
+        assert result.value is None and result.reason == "no point of the samples lies within the bird's eye gate"

@@ -100,13 +100,13 @@ def unused_sensor(named: str | Sensor | None, images: ImageSet | None, own: Sens
 
 
 def unlike_metres(sides: Sides) -> tuple[str, ...]:
-    """A note where the images of a side, by the first and the last, have ranges as they come out of a network, or
-    beyond the limits of their own sensor."""
+    """A note where the images or points of a side, by the first and the last, have ranges as they come out of a
+    network, or images beyond the limits of their own sensor."""
     notes = []
     for side, images in sides.items():
         taken = [images.item(i) for i in {0, len(images) - 1}] if images else []
         some = [item for item in taken if isinstance(item, RangeImage) and item.mask.any()]
-        farthest = max((float(item.range.max()) for item in some), default=0)
+        farthest = max(map(_farthest, taken), default=0)
         beyond = max(map(_beyond, some), default=0)
         if 0 < farthest <= METRES:
             notes.append(f"ranges of {side} are {farthest:.2f} m at most: expected metres, not shares of a limit")
@@ -115,6 +115,13 @@ def unlike_metres(sides: Sides) -> tuple[str, ...]:
             notes.append(f"{beyond:.0%} of the returns of {side} are outside {sensor.min_range:g} to "
                          f"{sensor.max_range:g} m, the limits of {sensor.name}: expected metres")  # fmt: skip
     return tuple(notes)
+
+
+def _farthest(item: Item) -> float:
+    """The largest range of an image or of points; 0 of what has none, and of tensors, which tell their code."""
+    if isinstance(item, RangeImage):
+        return float(item.range[item.mask].max(initial=0))
+    return float(np.linalg.norm(item.xyz, axis=1).max(initial=0)) if isinstance(item, Scan) else 0.0
 
 
 def _beyond(image: RangeImage) -> float:
