@@ -18,6 +18,7 @@ from lidarsynth.streets.hdl64e import own_car
 
 METRES = 1.5  # no outdoor scan ends so near
 BEYOND = 0.05  # share of an image's returns outside its sensor's limits, of which a note is made
+APART = 0.25  # share of the columns with points beside which none has any: of 111 real scans 0, of half the columns 1
 LOOKED_AT = 8  # scans or tensors of a set, at least and from everywhere, whether all are of one sensor
 GRID = "R2DM's grid is hdl-64e"
 TURNS = {
@@ -128,6 +129,23 @@ def _beyond(image: RangeImage) -> float:
     """The share of an image's returns outside its sensor's limits, which count."""
     far = image.range[image.mask]
     return float(((far < image.sensor.min_range) | (far > image.sensor.max_range)).mean())
+
+
+def columns_apart(sides: Sides, drawn: Sensor, projection: str) -> tuple[str, ...]:
+    """A note where the points of one side alone, by some scans, are of fewer columns than the images that they are
+    drawn into, so that columns stay empty between them."""
+    apart = [side for side, images in sides.items() if images and _apart_by(images, drawn, projection) > APART]
+    if len(apart) != 1:
+        return ()
+    return (f"points of {apart[0]} leave columns empty between them in the images of {drawn.width} columns that they "
+            "are drawn into: as images (.npz, generate --format npz) they keep their own",)  # fmt: skip
+
+
+def _apart_by(images: ImageSet, drawn: Sensor, projection: str) -> float:
+    """The share of the columns with points beside which none has any, of some scans; 0 of what is no scan."""
+    scans = [i for i in _numbers(images) if isinstance(images.item(i), Scan)]
+    hits = [images.image(i, drawn, projection, resize=True).mask.any(axis=0) for i in scans]
+    return float(np.median([(hit & ~np.roll(hit, -1)).sum() / max(1, hit.sum()) for hit in hits])) if hits else 0.0
 
 
 def upside_down(sides: Sides, drawn: Sensor, projection: str) -> tuple[str, ...]:
