@@ -214,6 +214,10 @@ def test_broken_scans_are_skipped_named_and_counted(tmp_path: Path, capsys: pyte
     before = state(folder)
     main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical"])
     assert state(folder) == before and "nothing is new: 68 images" in capsys.readouterr().out
+    shard = folder / "0000064.npy"
+    shard.write_bytes(before[shard.name][:-1] + bytes([before[shard.name][-1] ^ 1]))
+    main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical", "--check"])
+    assert state(folder) == before and "wrote 68 images" in capsys.readouterr().out  # what was mended is said
 
 
 def test_scans_that_changed_are_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
