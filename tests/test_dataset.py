@@ -327,6 +327,11 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: name(i + 7)))
     with pytest.raises(ValueError, match=r"expected a cache folder with index.json, found No such file"):
         CachedImages(tmp_path / "nowhere")
+    (tmp_path / "scans").mkdir()
+    with pytest.raises(
+        ValueError, match=r"scans: expected a cache folder .*, found a folder without; `lidarsynth data`"
+    ):
+        CachedImages(tmp_path / "scans")
 
 
 def test_images_of_another_shape_than_the_sensor_s_are_refused(tmp_path: Path):
