@@ -329,7 +329,7 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         CachedImages(tmp_path / "nowhere")
     (tmp_path / "scans").mkdir()
     with pytest.raises(
-        ValueError, match=r"scans: expected a cache folder .*, found a folder without; `lidarsynth data`"
+        ValueError, match=r"scans: expected a cache .*, found a folder without; `lidarsynth data` makes"
     ):
         CachedImages(tmp_path / "scans")
 
