@@ -214,6 +214,10 @@ def test_broken_scans_are_skipped_named_and_counted(tmp_path: Path, capsys: pyte
     before = state(folder)
     main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical"])
     assert state(folder) == before and "nothing is new: 68 images" in capsys.readouterr().out
+    shard = folder / "0000064.npy"
+    shard.write_bytes(before[shard.name][:-1] + bytes([before[shard.name][-1] ^ 1]))
+    main(["data", "kitti", str(tmp_path), str(folder), "--projection", "spherical", "--check"])
+    assert state(folder) == before and "wrote 68 images" in capsys.readouterr().out  # what was mended is said
 
 
 def test_scans_that_changed_are_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -323,6 +327,11 @@ def test_a_folder_of_other_images_is_left_alone(tmp_path: Path):
         list(write_cache(tmp_path, image, 10, SENSOR, WHAT, lambda i: name(i + 7)))
     with pytest.raises(ValueError, match=r"expected a cache folder with index.json, found No such file"):
         CachedImages(tmp_path / "nowhere")
+    (tmp_path / "scans").mkdir()
+    with pytest.raises(
+        ValueError, match=r"scans: expected a cache .*, found a folder without; `lidarsynth data` makes"
+    ):
+        CachedImages(tmp_path / "scans")
 
 
 def test_images_of_another_shape_than_the_sensor_s_are_refused(tmp_path: Path):

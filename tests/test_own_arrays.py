@@ -129,3 +129,20 @@ def test_ranges_beyond_the_limits_of_their_sensor_are_told():
 def test_points_in_another_frame_are_told():
     xyz = street("hdl-64e-kitti").to_scan().xyz
     assert told([xyz[:, [1, 2, 0]]], "y up instead of z") and not told([xyz], "sensor's frame")
+
+
+def test_points_that_are_shares_of_a_limit_are_told_and_say_why_rows_are_none():
+    report = ls.evaluate([points(image) / [80, 80, 80, 1] for image in STREETS], REAL)
+    assert any("expected metres, not shares of a limit" in note for note in report.warnings)
+    for result in report.results[:2]:
+        assert result.value is None and result.reason == "no point of the samples lies within the bird's eye gate"
+
+
+def test_points_of_fewer_columns_than_the_images_they_are_drawn_into_are_told():
+    """Half of the columns would be empty, which no other number than an FRD that is too large says."""
+    half = SENSOR.resized(width=SENSOR.width // 2)
+    narrow = [ls.RangeImage(i.range[:, 1::2], i.reflectance[:, 1::2], i.mask[:, 1::2], half) for i in STREETS]
+    clouds = [points(image) for image in narrow]
+    assert told(clouds, "points of samples leave columns empty")
+    for given in (narrow, [points(image) for image in STREETS]):
+        assert not told(given, "columns empty")

@@ -168,7 +168,7 @@ def test_the_verb_evaluates_offline(street: RangeImage, tmp_path: Path, capsys: 
     assert all(row["value"] is not None and row["value"] > 0 for row in found["values"].values() if row["unit"] != "m")
     assert found["definition"] == DEFINITION and found["hashes"]["rangenet"] == WEIGHTS
     main(["evaluate", str(folders["dark"]), *words])
-    assert "the samples have no reflectance, which rangenet needs" in capsys.readouterr().out
+    assert "the samples have no return with a reflectance, which rangenet needs" in capsys.readouterr().out
 
 
 def test_statistics_of_another_set_of_weights_are_not_compared(network: StreetFeatures, street: RangeImage):

@@ -309,6 +309,11 @@ def test_resolve_takes_the_sensor_of_the_images(cache: Path, tmp_path: Path):
         resolve("tiny", ("steps",))
     with pytest.raises(ValueError, match="no_such"):
         resolve("tiny", ("training.no_such=1",))
+    for word, knows in (("tiny", "true"), ("tiny-gan", "false")):  # trained as before, and the record said otherwise
+        assert resolve(word, (f"data.reflectance={knows}",)) == preset(word)
+        other = "false" if knows == "true" else "true"
+        with pytest.raises(ValueError, match=f"data.reflectance: expected {knows}, .* of {word} .*, found {other}"):
+            resolve(word, (f"data.reflectance={other}",))
 
 
 @pytest.mark.parametrize(

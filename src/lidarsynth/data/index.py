@@ -25,7 +25,9 @@ def read_index(folder: str | Path) -> dict[str, Any]:
     try:
         index = read_json(path, LARGEST_INDEX)
     except OSError as error:
-        raise ValueError(f"{folder}: expected a cache folder with {INDEX}, found {error.strerror}") from None
+        lacks = isinstance(error, FileNotFoundError) and Path(folder).is_dir()
+        found = "a folder without; `lidarsynth data` makes a cache of scans" if lacks else error.strerror
+        raise ValueError(f"{folder}: expected a cache folder with {INDEX}, found {found}") from None
     _check(index, path)
     return index
 

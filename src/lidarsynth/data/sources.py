@@ -295,9 +295,15 @@ def _processes(workers: int | None) -> int:
 
 
 def shards(folder: str | Path) -> dict[str, Any]:
-    """Checksums of the shards of a cache, by its index; {} where it is not begun."""
-    index = read_index(folder) if (Path(folder) / INDEX).is_file() else {"shards": {}}
-    return {name: entry.get("sha256") for name, entry in index["shards"].items()}
+    """Checksums of the shards of a cache, by its index, and when their files were written, None of one that is gone, so
+    that what was mended is seen too; {} where it is not begun."""
+    folder = Path(folder)
+    index = read_index(folder) if (folder / INDEX).is_file() else {"shards": {}}
+    files = {name: folder / name for name in index["shards"]}
+    return {
+        name: (entry.get("sha256"), files[name].stat().st_mtime_ns if files[name].is_file() else None)
+        for name, entry in index["shards"].items()
+    }
 
 
 def summary(folder: str | Path) -> str:

@@ -17,6 +17,7 @@ from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
 from lidarsynth.evaluation.image_sets import ImageSet, Numbered, image_set, is_numbered, resized
 from lidarsynth.evaluation.notes import (
+    columns_apart,
     one_set,
     other_frames,
     tensors_taken,
@@ -129,7 +130,7 @@ class _Run:
         if self.protocol.clouds:
             return told
         drawing = drawn, self.projection(drawn)
-        return told + upside_down(sides, *drawing) + turned_images(sides, *drawing)
+        return told + columns_apart(sides, *drawing) + upside_down(sides, *drawing) + turned_images(sides, *drawing)
 
     def projection(self, sensor: Sensor) -> str:
         """Of points: the protocol's into images of its own sensor; by rings into those that published programs take."""

@@ -38,12 +38,21 @@ def _kernel(row: Row, samples: Statistics, real: Statistics, seed: int) -> float
 
 def _bev_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
     assert samples.protocol.bev
+    _check_gate(samples, real)
     return gaussian_mmd(filled_scans(samples), filled_scans(real), samples.protocol.bev.width)
 
 
 def _bev_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
     assert samples.bev and real.bev
+    _check_gate(samples, real)
     return jensen_shannon_distance(samples.bev.pooled, real.bev.pooled)
+
+
+def _check_gate(samples: Statistics, real: Statistics) -> None:
+    """Raises ValueError where a side has no point to count from above."""
+    for side, name in ((samples, "samples"), (real, "reference")):
+        if not side.bev or not side.bev.pooled.any():
+            raise ValueError(f"no point of the {name} lies within the bird's eye gate")
 
 
 def filled_scans(statistics: Statistics) -> Tensor:

@@ -18,6 +18,7 @@ from lidarsynth.streets.hdl64e import own_car
 
 METRES = 1.5  # no outdoor scan ends so near
 BEYOND = 0.05  # share of an image's returns outside its sensor's limits, of which a note is made
+APART = 0.25  # share of the columns with points beside which none has any: of 111 real scans 0, of half the columns 1
 LOOKED_AT = 8  # scans or tensors of a set, at least and from everywhere, whether all are of one sensor
 GRID = "R2DM's grid is hdl-64e"
 TURNS = {
@@ -100,13 +101,13 @@ def unused_sensor(named: str | Sensor | None, images: ImageSet | None, own: Sens
 
 
 def unlike_metres(sides: Sides) -> tuple[str, ...]:
-    """A note where the images of a side, by the first and the last, have ranges as they come out of a network, or
-    beyond the limits of their own sensor."""
+    """A note where the images or points of a side, by the first and the last, have ranges as they come out of a
+    network, or images beyond the limits of their own sensor."""
     notes = []
     for side, images in sides.items():
         taken = [images.item(i) for i in {0, len(images) - 1}] if images else []
         some = [item for item in taken if isinstance(item, RangeImage) and item.mask.any()]
-        farthest = max((float(item.range.max()) for item in some), default=0)
+        farthest = max(map(_farthest, taken), default=0)
         beyond = max(map(_beyond, some), default=0)
         if 0 < farthest <= METRES:
             notes.append(f"ranges of {side} are {farthest:.2f} m at most: expected metres, not shares of a limit")
@@ -117,10 +118,34 @@ def unlike_metres(sides: Sides) -> tuple[str, ...]:
     return tuple(notes)
 
 
+def _farthest(item: Item) -> float:
+    """The largest range of an image or of points; 0 of what has none, and of tensors, which tell their code."""
+    if isinstance(item, RangeImage):
+        return float(item.range[item.mask].max(initial=0))
+    return float(np.linalg.norm(item.xyz, axis=1).max(initial=0)) if isinstance(item, Scan) else 0.0
+
+
 def _beyond(image: RangeImage) -> float:
     """The share of an image's returns outside its sensor's limits, which count."""
     far = image.range[image.mask]
     return float(((far < image.sensor.min_range) | (far > image.sensor.max_range)).mean())
+
+
+def columns_apart(sides: Sides, drawn: Sensor, projection: str) -> tuple[str, ...]:
+    """A note where the points of one side alone, by some scans, are of fewer columns than the images that they are
+    drawn into, so that columns stay empty between them."""
+    apart = [side for side, images in sides.items() if images and _apart_by(images, drawn, projection) > APART]
+    if len(apart) != 1:
+        return ()
+    return (f"points of {apart[0]} leave columns empty between them in the images of {drawn.width} columns that they "
+            "are drawn into: as images (.npz, generate --format npz) they keep their own",)  # fmt: skip
+
+
+def _apart_by(images: ImageSet, drawn: Sensor, projection: str) -> float:
+    """The share of the columns with points beside which none has any, of some scans; 0 of what is no scan."""
+    scans = [i for i in _numbers(images) if isinstance(images.item(i), Scan)]
+    hits = [images.image(i, drawn, projection, resize=True).mask.any(axis=0) for i in scans]
+    return float(np.median([(hit & ~np.roll(hit, -1)).sum() / max(1, hit.sum()) for hit in hits])) if hits else 0.0
 
 
 def upside_down(sides: Sides, drawn: Sensor, projection: str) -> tuple[str, ...]:

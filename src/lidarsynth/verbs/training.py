@@ -61,6 +61,10 @@ def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str |
             chosen[path] = text
     experiment = with_fields(preset(name), chosen)
     check_words(experiment)
+    knows = preset(name).data.reflectance  # said of the network, which does not follow it
+    if (found := experiment.data.reflectance) != knows:
+        raise ValueError(f"data.reflectance: expected {json.dumps(knows)}, as the network of {name} has it, found "
+                         f"{json.dumps(found)}")  # fmt: skip
     return experiment if data is None else _for_images(experiment, data, set(chosen))
 
 
