@@ -1,6 +1,7 @@
 """Bags written by their libraries' own writers, in other layouts than ours, read as they are and come back whole."""
 
 import errno
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -164,6 +165,16 @@ def test_what_is_no_bag_is_one_line(name: str, tmp_path: Path):
     (tmp_path / "cut.bag").write_bytes(whole[:5000])  # within the first message
     with pytest.raises(FileError, match=r"cut.bag: expected a bag"), open_bag(tmp_path / "cut.bag") as bag:
         list(bag.clouds("/points"))
+
+
+def test_databases_that_rosbags_reads_with_sqlite_are_refused_in_one_line(tmp_path: Path, monkeypatch):
+    def broken(self):
+        raise sqlite3.DatabaseError("file is not a database")  # rosbags 0.11.0, which has no apsw
+
+    monkeypatch.setattr("rosbags.rosbag2.Reader.open", broken)
+    (tmp_path / "a.db3").write_bytes(b"not a bag at all" * 10)
+    with pytest.raises(FileError, match=r"a.db3: expected a bag"), open_bag(tmp_path / "a.db3"):
+        pass
 
 
 def test_one_of_the_sensors_of_a_topic_is_read_and_its_points_stay(tmp_path: Path):

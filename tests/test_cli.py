@@ -12,10 +12,11 @@ from collections.abc import Callable
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
+import tyro
 from broken import BROKEN
 from forked import Forked
 from networks import trained
@@ -571,6 +572,17 @@ def test_bad_words_are_one_line_and_leave_nothing(
     given = [word.replace("TINY", str(tiny)).replace("SCAN", str(scan)) for word in words.split()]
     refused(run(*given), said)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_names_are_told_as_python_310_describes_parameters(monkeypatch: pytest.MonkeyPatch):
+    def verb(cache=None, sensor_in=None): ...
+
+    verb.__annotations__ = {
+        "cache": tyro.conf.Positional[str | None] | None,
+        "sensor_in": Annotated[str | None, tyro.conf.arg(name="from")] | None,
+    }
+    assert parsing._options(verb) == {"--cache": "--cache", "--sensor-in": "--from", "--from": "--from"}
+    assert parsing._plain_words(verb) == ["CACHE"]
 
 
 def test_a_folder_in_the_way_is_refused_before_the_work(run: Run, scan: Path, tmp_path: Path):

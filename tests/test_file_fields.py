@@ -66,6 +66,8 @@ def test_single_intensities_above_a_scale_do_not_change_it():
     np.testing.assert_allclose(reflectance_from(np.append(whole, whole * 200)).max(), whole.max() * 200 / 65535)
     with pytest.raises(FileError, match="expected an intensity of 0-1"):
         reflectance_from(np.append(values, np.float32(2)), "unit")
+    with pytest.raises(FileError, match="found -30 to 0; --intensity none takes it for 0"):
+        reflectance_from(np.linspace(-30, 0, 9, dtype=np.float32))
 
 
 def test_nuscenes_files_that_someone_scaled_stay_so(tmp_path: Path):
@@ -179,7 +181,9 @@ def test_float32_holds_what_a_turn_may_hold_and_maps_are_told(tmp_path: Path):
             read(tmp_path / "utm.npy")
     table[:, :3] = np.random.default_rng(0).normal(0, 20_000, (9, 3))
     np.save(tmp_path / "mm.npy", table)
-    with pytest.raises(FileError, match=r"at most 10000, found a coordinate of .*: are they millimetres\?$"):
+    with pytest.raises(
+        FileError, match=r"at most 10000, found a coordinate of .*: are they centimetres or millimetres\?$"
+    ):
         read(tmp_path / "mm.npy")
 
 

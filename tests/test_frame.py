@@ -196,6 +196,34 @@ def test_a_sensor_of_as_many_beams_or_more_that_lie_elsewhere_is_another_one(oth
     assert misfit(turn, own) is None, "a unit's beams are a little off the table's"
 
 
+def rosette(wide: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths and elevations, in degrees, of 24,000 rays of a sensor that does not spin and looks ahead."""
+    turn = np.linspace(0, 80 * np.pi, 24_000)
+    flower = np.cos(3.63 * turn)
+    return wide * flower * np.cos(1.01 * turn), high * flower * np.sin(1.01 * turn) - 4
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_flat_ground_is_no_beams_seen_from_near_its_level(seed: int):
+    azimuth, elevation = rosette(60, 12.5)
+    walls = np.repeat(np.random.default_rng(seed).uniform(5, 25, 64), 8)[((azimuth / 180 + 1) * 256).astype(int) % 512]
+    (a, b), (c, d) = ((np.cos(angle), np.sin(angle)) for angle in np.radians([azimuth, elevation]))
+    rays = np.stack([c * a, c * b, d], 1)
+    distance = np.minimum(walls / c, np.where(d < 0, -1.9 / np.minimum(d, -1e-9), np.inf))
+    assert check_frame(Scan((rays * distance[:, None])[distance < 60].astype(np.float32))).faults == ()
+
+
+@pytest.mark.parametrize("seed", [3, 11])
+def test_what_looks_ahead_and_does_not_spin_is_not_taken_for_turned(seed: int):
+    dense = Sensor("dense", tuple(np.linspace(14, -26, 300).tolist()), width=2048, max_range=150.0)
+    azimuth, elevation = rosette(35, 35)
+    inside = (elevation < 14) & (elevation > -26)
+    row, column = ((14 - elevation) / 40 * 299).round().astype(int), ((1 - azimuth / 180) * 1024).astype(int) % 2048
+    image = SyntheticStreets(seed, 1, dense).image(0)
+    order = row[inside], column[inside]
+    assert check_frame(Scan(dense.points(image.range)[order][image.mask[order]])).faults == ()
+
+
 def test_points_on_no_beams_have_no_stand():
     assert stand_of_beams(np.random.default_rng(0).normal(0, 10, (9000, 3))) is None
 

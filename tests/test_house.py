@@ -220,6 +220,16 @@ def test_code_of_others_is_never_loaded(path: Path):
 
 
 @of_every(CODE)
+def test_text_names_its_encoding(path: Path):
+    for name, node in calls(path):
+        method, words = name.rpartition(".")[2], {k.arg for k in node.keywords}
+        modes = {a.value for a in node.args if isinstance(a, ast.Constant)} & {"r", "w", "a", "x", "r+", "w+", "a+"}
+        whole = method in {"read_text", "write_text"} and name != method  # read_text alone is our own, of UTF-8
+        text = whole or (method == "open" and modes and name != "archive.open")  # the last of a zip, in bytes
+        assert not text or "encoding" in words, f"{short(path)}:{node.lineno}: Windows and LC_ALL=C have their own"
+
+
+@of_every(CODE)
 def test_no_duck_typing_hidden_signatures_or_global_randomness(path: Path):
     for name, node in calls(path):
         assert name != "hasattr", f"{short(path)}:{node.lineno}: hasattr"

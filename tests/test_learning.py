@@ -110,6 +110,21 @@ def test_a_sensor_below_the_ground_has_no_mount():
     assert why.startswith("expected the sensor above the ground, found it 0.12 m below")
 
 
+def test_what_lies_as_near_as_no_sensor_is_mounted_is_no_ground():
+    few = replace(SENSORS["vlp-16"], name="few", elevations=(0.8, 0.0, -0.8, -1.6))
+    for scan in seen(few, 1):
+        learned = learn_sensor([scan], "own")
+        assert learned.sensor.mount == 1.73 and "found it 0." in str(learned.afloat)
+
+
+def test_elevations_that_crowd_where_no_beams_are_are_no_sensor():
+    scan = turn(SENSORS["hdl-32e"])
+    rare = scan[(scan.ring % 16 == 8) | (np.arange(len(scan)) % 5 == 0)]
+    mixed = replace(rare, ring=None)[np.random.default_rng(0).permutation(len(rare))]
+    with pytest.raises(ValueError, match=r"found 32 crowds, .* and 30 of fewer than 200 points, as of .*\(Livox\)"):
+        learn_sensor([mixed], "own")
+
+
 def test_smeared_and_missing_beams_are_told():
     clean = turn(SENSORS["hdl-32e"])
     far = np.linalg.norm(clean.xyz, axis=1)

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from forked import Forked
+from torch import nn
 
 from lidarsynth.cli import terminal
 from lidarsynth.cli.main import main
@@ -27,6 +29,7 @@ from lidarsynth.experiment.record import Experiment, from_dict, with_fields
 from lidarsynth.files.lock import LOCK, only_writer
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.memory import check_memory
 from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.training import checkpoint
 from lidarsynth.training.checkpoint import STATE, checkpoints, damage_of
@@ -203,6 +206,28 @@ def test_a_model_that_cannot_fit_is_refused_before_it_is_built():
         ValueError, match=r"expected a network that fits into \d+ GiB of memory, found weights of [\d,]+ GiB"
     ):
         build_network(huge)
+
+
+def test_a_system_that_does_not_tell_its_memory_refuses_no_network(monkeypatch):
+    monkeypatch.delattr("os.sysconf_names")
+    check_memory(with_fields(preset("r2dm-h"), {"model.base_channels": 8192}), nn.Module)
+
+
+def test_training_needs_no_links_and_files_to_be_kept_are_open_to_write(cache, tmp_path, monkeypatch):
+    def refuse(*words):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    def fsync(file):
+        kept.append(file)
+        assert fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY  # Windows: Bad file descriptor
+
+    kept = []
+    monkeypatch.setattr(Path, "symlink_to", refuse)  # exFAT, Google Drive, Windows
+    monkeypatch.setattr("os.fsync", fsync)
+    list(run(tiny(2), cache, tmp_path / "out", options=QUIET))
+    assert [damage_of(saved) for saved in checkpoints(tmp_path / "out")] == [""] and kept
+    list(run(tiny(4), cache, tmp_path / "out", options=QUIET))
+    assert [saved.name[-1] for saved in checkpoints(tmp_path / "out")] == ["2", "4"]
 
 
 def test_weights_with_nan_are_refused_and_results_with_nan_name_the_model(tmp_path):

@@ -4,9 +4,12 @@ import base64
 import gzip
 import http.client
 import json
+import os
 import re
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import weakref
 from collections.abc import Iterator
@@ -31,6 +34,7 @@ from lidarsynth.verbs.placement import read_transform
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.colouring import colourings
 from lidarsynth.viewer.packing import Shown, packed
+from lidarsynth.viewer.page import page
 from lidarsynth.viewer.pairs import compared
 from lidarsynth.viewer.rows import rows_of
 from lidarsynth.viewer.series import Stream, series_of
@@ -424,6 +428,14 @@ def test_a_file_to_send(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     write(hostile, turn())
     main(["view", str(hostile), "--out", str(path)])
     assert "<script>alert" not in path.read_text()
+
+
+def test_the_page_is_the_same_in_every_locale():
+    program = "import json; from lidarsynth.viewer.page import page; print(json.dumps(page({}, 'nonce')))"
+    bare = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run([sys.executable, "-c", program], env=os.environ | bare, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == page({}, "nonce")
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

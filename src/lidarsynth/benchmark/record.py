@@ -109,7 +109,7 @@ def record_of(
 def processor() -> str:
     """What the processor calls itself, or its kind."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines() if sys.platform == "linux" else []
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines() if sys.platform == "linux" else []
     except OSError:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial, wraps
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Union, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Union, cast, get_args, get_type_hints
 
 import tyro
 
@@ -85,7 +85,13 @@ def _later(verb: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 def _plain_words(verb: Callable[..., None] | None) -> list[str]:
     """The arguments of a verb that stand without an option's name, such as ROOT."""
     hints = get_type_hints(verb, include_extras=True).items() if verb else ()
-    return [name.upper() for name, hint in hints if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
+    return [name.upper() for name, hint in hints if tyro.conf.Positional in _marks(hint)]
+
+
+def _marks(hint: Any) -> tuple[Any, ...]:
+    """What `Annotated` says of a parameter; Python 3.10 wraps it as an Optional where the default is None."""
+    told = (getattr(one, "__metadata__", ()) for one in (hint, *get_args(hint)))
+    return next(filter(None, told), ())
 
 
 def _options(described: Any) -> dict[str, str]:
@@ -94,9 +100,7 @@ def _options(described: Any) -> dict[str, str]:
     if described is None:
         return options
     for name, hint in get_type_hints(described, include_extras=True).items():
-        called = [
-            word for part in getattr(hint, "__metadata__", ()) if (word := getattr(part, "name", None)) is not None
-        ]
+        called = [word for part in _marks(hint) if (word := getattr(part, "name", None)) is not None]
         if called == [""]:
             options |= _options(hint.__origin__)
         elif name != "return":

@@ -169,7 +169,7 @@ def answer(verb: Callable[[], object]) -> None:
     Raises SystemExit: 2 for what cannot be done, 130 for Ctrl-C, 143 for SIGTERM, 141 where nobody reads stdout.
     """
     if sys.stderr is None:  # closed by who started us, as 2>&- does
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for as long as the process lasts
+        sys.stderr = open(os.devnull, "w", encoding="utf-8", errors="replace")  # noqa: SIM115, for as long as the process lasts
     if isinstance(sys.stdout, io.TextIOWrapper):
         codecs.register_error("lidarsynth", _sayable)
         sys.stdout.reconfigure(errors="lidarsynth")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,9 +25,9 @@ def library_errors() -> tuple[type[Exception], ...]:
     from rosbags.serde import SerdeError
     from rosbags.typesys import TypesysError
 
-    known = McapError, Error1, Error2, SerdeError, TypesysError, zstandard.ZstdError
+    known = sqlite3.Error, McapError, Error1, Error2, SerdeError, TypesysError, zstandard.ZstdError
     try:
-        from apsw import Error as SqlError  # with which rosbags reads databases, in some of its versions
+        from apsw import Error as SqlError  # with which rosbags reads databases, in others of its versions
     except ImportError:
         return known
     return (*known, SqlError)

@@ -117,7 +117,7 @@ def write_index(folder: Path, index: dict[str, Any]) -> None:
     texts = {INDEX: "{\n" + ",\n".join(head) + "\n}\n", REPORT: json.dumps(report(index), indent=1) + "\n"}
     for name, text in texts.items():
         with resumable_file(folder / name, len(text)) as scratch:
-            scratch.write_text(text)
+            scratch.write_text(text, encoding="utf-8")
 
 
 def report(index: dict[str, Any]) -> dict[str, Any]:

@@ -384,7 +384,7 @@ def check_out(out: Path) -> None:
         raise ValueError(f"{out}: expected the name of a file that ends in .json, "
                          f"found {'a folder' if out.is_dir() else repr(out.name[-20:])}")  # fmt: skip
     page = out.with_suffix(".md")
-    if page.exists() and (not page.is_file() or DEFINITIONS not in page.read_text("utf-8", "replace")):
+    if page.exists() and (not page.is_file() or DEFINITIONS not in page.read_text(encoding="utf-8", errors="replace")):
         raise ValueError(f"{out}: expected a name beside whose .md nothing is lost, found {page}, which is no report")
     out.parent.mkdir(parents=True, exist_ok=True)
     if not os.access(out.parent, os.W_OK | os.X_OK):

@@ -40,7 +40,7 @@ def save(
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in own.items()}
     weights |= packed({k: v.cpu() for k, v in own.items() if k not in exact}, bytewise)
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
-        record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n")
+        record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n", encoding="utf-8")
         file.write_bytes(serialized(weights))  # save_file would hide it from other users
     return folder
 

@@ -124,7 +124,7 @@ def _why_far(xyz: np.ndarray, far: float) -> str:
     away, wide = np.abs(xyz).min(axis=0), xyz.max(axis=0).astype(np.float64) - xyz.min(axis=0)
     if far < EARTH and (away > np.maximum(wide, MAX_METRES)).any():
         return ", as of a map: subtract where the sensor stood first"
-    return ": are they millimetres?" if far < 1000 * MAX_METRES else ""
+    return ": are they centimetres or millimetres?" if far < 1000 * MAX_METRES else ""
 
 
 def dropped_points(count: int) -> str:
@@ -197,7 +197,8 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
             values, high = np.minimum(values, limit), limit
     limit = SCALES[intensity]
     if low < 0 or high > limit:
-        raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}")
+        way = "; --intensity none takes it for 0" if low < 0 else ""  # as of decibels
+        raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}{way}")
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
 
 

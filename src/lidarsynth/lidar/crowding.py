@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from lidarsynth.lidar.cones import onto_z
-from lidarsynth.lidar.ground import leaning, normal, plane
+from lidarsynth.lidar.ground import leaning, lowest_plane, normal, plane
 
 FAR = 12.0  # metres, or half the points where fewer are as far: nearer ones show the carrier's motion in a turn most
 POINTS, FEW = 8_000, 3_000  # of a scan are enough; to look for a tilt
@@ -51,7 +51,10 @@ def stand_of_beams(xyz: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float] |
     axis, crowding = _leaning(points, road)
     if max(crowding, contrast[best]) < max(CROWDED, CLEARLY * here):
         return None
-    return (axis, 0.0) if crowding > contrast[best] else (up, float(heights[best]))
+    if crowding > contrast[best]:
+        return axis, 0.0
+    under = (found := lowest_plane(xyz)) is not None and heights[best] < LOW - found[0]
+    return None if under else (up, float(heights[best]))  # flat ground crowds, seen from near its level
 
 
 @dataclass(frozen=True)

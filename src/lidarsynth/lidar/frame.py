@@ -108,7 +108,9 @@ def _upright(scan: Scan) -> tuple[str, Turned]:
     for axis in "zyx":
         points = turned(scan, np.array(AXES["+" + axis][0]), BESIDE if axis == "z" else (0.0,))
         about[axis] = points
-        if points.cones is not None and points.cones.residual < CLEARLY * residual:
+        if points.cones is None or not (points.told or _sees_ground(scan, axis)):
+            continue
+        if points.cones.residual < CLEARLY * residual:
             best, residual = axis, points.cones.residual
             if residual < CLEAR:
                 break
@@ -119,6 +121,13 @@ def _upright(scan: Scan) -> tuple[str, Turned]:
     level = max(shares, key=lambda axis: shares[axis])
     clear = shares[level] > max(0.6, UPSIDE * shares["+z"]) and shares["+z"] < 1 / 3
     return (level, turned(scan, np.array(AXES[level][0]))) if clear else ("+z", about["z"])
+
+
+def _sees_ground(scan: Scan, axis: str) -> bool:
+    """Whether as much ground lies along an axis as along z: about any other one the elevations of points that lie on no
+    beams, as of a sensor that looks ahead and does not spin, crowd into rings by chance."""
+    along, upright = (max(_shares(scan, sign + one) for sign in "+-") for one in (axis, "z"))
+    return along >= upright
 
 
 def _side(scan: Scan, axis: str, points: Turned) -> str:

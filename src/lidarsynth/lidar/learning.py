@@ -11,7 +11,7 @@ from lidarsynth.lidar.blocked import blocked_runs
 from lidarsynth.lidar.columns import azimuth_step
 from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
-from lidarsynth.lidar.ground import is_above, lowest_plane
+from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.recognition import EVERYWHERE, layers, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
@@ -65,7 +65,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     the neighbours' where its own points cannot tell it. Rings of one beam are one row. Columns come from the azimuths'
     steps, mount and tilt from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what
     never returned in five scans or more, of several places. Raises ValueError without rings, with too few points, or
-    where most beams are wider than SMEARED.
+    where most beams are wider than SMEARED, or where most of what elevations crowd into are none.
     """
     kept, left, split = _alike(scans)
     points = _pooled(kept)
@@ -81,6 +81,8 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
     merged = len(points) - missing - len(rings)
     _check_sharp(rings, merged, kept[0][0], guessed)
+    if guessed:
+        _check_guessed(rings, merged, missing)
     kept = [(scan, row_of[ring]) for scan, ring in kept]
     width = max(round(2 * np.pi / float(np.median(steps))), 4)
     seen = _seen(kept, width, len(rings))
@@ -123,6 +125,10 @@ def _standing(
         low, high = np.quantile(heights, [0.1, 0.9])
         why = f"expected the ground as far below in most scans, found it {low:.2f} to {high:.2f} m below"
         return Sensor.mount, Sensor.tilt, why
+    if 0 <= height < LOWEST:
+        why = f"expected the ground {LOWEST} m below or more, found it {height:.2f} m below, as of few beams that do " \
+              "not meet it"  # fmt: skip
+        return Sensor.mount, Sensor.tilt, why
     if height < 0:
         why = f"expected the sensor above the ground, found it {-height:.2f} m below, as of points in another frame"
         return Sensor.mount, Sensor.tilt, why
@@ -136,6 +142,17 @@ def _guessed(scan: Scan) -> bool:
 
 def _named(known: str) -> str:
     return f"it is a scan of {known}: --sensor {known}"
+
+
+def _check_guessed(rings: list[Ring], merged: int, missing: int) -> None:
+    """Raises ValueError where most of what elevations crowd into are no beams: wide, in pieces, of too few points."""
+    wide, count = sum(ring.residual > SMEARED for ring in rings), len(rings) + merged + missing
+    if 2 * (wide + merged + missing) <= count:
+        return
+    raise ValueError(f"expected elevations that show beams, found {count} crowds, {wide} wider than {SMEARED} degrees, "
+                     f"{merged} in pieces and {missing} of fewer than {FEWEST} points, as of a sensor that does not "
+                     "spin (Livox), which no model here knows, or in another frame: give scans with rings, as the "
+                     "sensor sent them")  # fmt: skip
 
 
 def _check_sharp(rings: list[Ring], merged: int, scan: Scan, guessed: bool) -> None:

@@ -25,7 +25,7 @@ def whole_file(path: str | Path, durable: bool = False) -> Iterator[Path]:
     try:
         yield scratch
         if durable:
-            with scratch.open("rb") as file:
+            with scratch.open("r+b") as file:  # Windows puts on the disk what can be written only
                 os.fsync(file.fileno())
         os.replace(scratch, path)
     except OSError as error:

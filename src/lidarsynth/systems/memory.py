@@ -18,7 +18,8 @@ def check_memory(experiment: Experiment, build: Callable[[], nn.Module]) -> None
     """
     model, group = experiment.model, experiment.adversarial
     widest = max(model.base_channels * max(model.channel_multipliers, default=1), group.max_channels if group else 0)
-    if (widest <= 2048 and sum(model.num_residual_blocks) <= 64) or "SC_PHYS_PAGES" not in os.sysconf_names:
+    told = getattr(os, "sysconf_names", ())  # Windows has none
+    if (widest <= 2048 and sum(model.num_residual_blocks) <= 64) or "SC_PHYS_PAGES" not in told:
         return
     with torch.device("meta"):  # shapes without numbers
         network = build()

@@ -3,7 +3,7 @@
     out/experiment.json, model.safetensors     the newest averaged weights: `lidarsynth generate --model out`
     out/checkpoints/step-00001000/             the same two files as of that step, and state.pt: everything of the run;
                                                checksums.json, the SHA-256 of each: a flipped byte is found
-    out/checkpoints/latest                     link to the newest
+    out/checkpoints/latest                     link to the newest, where the disk has links
     out/start.json                             what the run began with: which images, from which weights
 
 Nothing of the random generators or of the data order has to be kept: both follow from the step (`training.randomness`).
@@ -16,6 +16,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -124,9 +125,10 @@ def _save_checkpoint(out: Path, experiment: Experiment, run: Run, keep: int) -> 
     if not home.exists():
         _appear(home, lambda folder: _write(folder, experiment, run))
     link = home.parent / f"{SCRATCH}{LATEST}"
-    link.unlink(missing_ok=True)
-    link.symlink_to(home.name)
-    os.replace(link, home.parent / LATEST)
+    with suppress(OSError):  # exFAT, Google Drive and Windows may have no links, and no run needs this one
+        link.unlink(missing_ok=True)
+        link.symlink_to(home.name)
+        os.replace(link, home.parent / LATEST)
     save(out, experiment, run.ema)
     for old in checkpoints(out)[: -max(1, keep)]:
         # renamed first, so that no half-deleted folder looks like a checkpoint

@@ -95,10 +95,10 @@ def _row(progress: Progress, columns: Sequence[str]) -> str:
 
 def _continue_table(path: Path, step: int, columns: Sequence[str]):
     """The open table with the rows up to `step`."""
-    lines = path.read_text(errors="replace").splitlines()[1:] if path.exists() else []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()[1:] if path.exists() else []
     kept = [line for line in lines if line.count(",") == len(columns) - 1 and _step_of(line) <= step]
     write_whole(path, "\n".join([",".join(columns), *kept]) + "\n")
-    return path.open("a")
+    return path.open("a", encoding="utf-8")
 
 
 def _step_of(line: str) -> float:

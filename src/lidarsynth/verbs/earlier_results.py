@@ -33,7 +33,7 @@ def made_rows(path: Path, report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The rows of scans that were made: those of the report at `path`, then those of its journal, which are later.
     Lines that a kill has torn are passed over."""
     journal, rows = journal_path(path), list(report.get("scans", ()))
-    for line in journal.read_text(errors="replace").splitlines() if journal.is_file() else ():
+    for line in journal.read_text(encoding="utf-8", errors="replace").splitlines() if journal.is_file() else ():
         with suppress(ValueError):
             rows.append(json.loads(line))
     return [row for row in rows if isinstance(row, dict) and row.keys() >= NEEDED and "error" not in row]

@@ -37,16 +37,18 @@ def settings_of(first: Shown, title: str) -> dict[str, Any]:
 
 def page(settings: dict[str, Any], nonce: str, policy: str = LIVE, scans: str = "") -> str:
     """The page; `settings` reach the script as JSON that cannot end its element."""
-    script = "\n".join((STATIC / name).read_text() for name in SCRIPTS)
+    script = "\n".join((STATIC / name).read_text(encoding="utf-8") for name in SCRIPTS)
     parts = {
         "POLICY": policy.format(nonce),
         "NONCE": nonce,
-        "STYLE": (STATIC / "style.css").read_text(),
+        "STYLE": (STATIC / "style.css").read_text(encoding="utf-8"),
         "SCANS": scans,
         "SETTINGS": json.dumps(settings, allow_nan=False).replace("<", "\\u003c"),
         "SCRIPT": f'"use strict";\n{script}',
     }
-    pieces = (STATIC / "page.html").read_text().split("%%")  # text, name, text, ...: what is put in is not looked at
+    pieces = (
+        (STATIC / "page.html").read_text(encoding="utf-8").split("%%")
+    )  # text, name, text, ...: what is put in is not looked at
     return "".join(parts[piece] if place % 2 else piece for place, piece in enumerate(pieces))
 
 

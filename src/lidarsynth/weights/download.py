@@ -84,7 +84,7 @@ def _check_sum(content: Path, path: Path) -> None:
 
 def _receive(url: str, file: BinaryIO, origin: Path) -> Iterator[tuple[int, int | None]]:
     """Continue `file` to the end of `url`; from the start where it is not of that file, or the server cannot."""
-    told = origin.read_text().splitlines() if origin.is_file() else []
+    told = origin.read_text(encoding="utf-8").splitlines() if origin.is_file() else []
     tag = told[1] if len(told) == 2 and told[0] == url else ""
     # The last byte is asked for again, so that a complete file is answered like any other.
     start = max(file.seek(0, os.SEEK_END) - 1, 0) if told[:1] == [url] else 0
@@ -93,7 +93,7 @@ def _receive(url: str, file: BinaryIO, origin: Path) -> Iterator[tuple[int, int 
         now = reply.headers["ETag"] or reply.headers["Last-Modified"] or ""
         if done and tag and now and now != tag:
             raise ConnectionError("another file than the one that was begun; delete the .part file")
-        origin.write_text(f"{url}\n{now}\n")
+        origin.write_text(f"{url}\n{now}\n", encoding="utf-8")
         file.seek(done)
         yield done, total
         while chunk := reply.read(1 << 20):
