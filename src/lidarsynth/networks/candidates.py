@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lidarsynth.networks.exporting import is_exporting
 from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.networks.running import last_known
 
@@ -93,7 +94,7 @@ def _codes(metres: Tensor, around: _Around, rays: Rays, bend: float) -> Tensor:
     sides = torch.where(found, encode_range(wall), cross)
     grounds = torch.where(usable, encode_range(ground.clamp(0.1, 250.0)), plane)
     nearest = torch.where(around.some, encode_range(metres.flatten()[around.nearest]), sides[2])
-    if torch.compiler.is_exporting() or bool((found[2] & found[3]).any()):
+    if is_exporting() or bool((found[2] & found[3]).any()):
         flat = _one_surface(metres, around, bend)  # there all that is taken over from the side would make steps
         sides = torch.cat([sides[:2], torch.where(flat, beside, sides[2:])])
         nearest = torch.where(flat, beside, nearest)
@@ -133,7 +134,7 @@ def _mean(values: Tensor, found: Tensor, distance: Tensor, other: Tensor) -> Ten
 def _laid(values: Tensor, known: Tensor, where: Tensor, place: Tensor) -> Tensor:
     """(B, C, H, W): values (C, N) at their places, and `known` (B, 1, H, W) in all channels `where` it is known."""
     shape = (len(values), len(known), *known.shape[2:])
-    if torch.compiler.is_exporting():  # there all pixels are places
+    if is_exporting():  # there all pixels are places
         return torch.where(where, known, values.view(shape).transpose(0, 1))
     whole = known.transpose(0, 1).expand(shape).flatten(1)
     return whole.index_copy(1, place, values).view(shape).transpose(0, 1)
@@ -141,7 +142,7 @@ def _laid(values: Tensor, known: Tensor, where: Tensor, place: Tensor) -> Tensor
 
 def _same(lit: Tensor, returned: Tensor) -> bool:
     """Whether all known returns are lit; an exported network cannot ask."""
-    return lit is returned or (not torch.compiler.is_exporting() and torch.equal(lit, returned))
+    return lit is returned or (not is_exporting() and torch.equal(lit, returned))
 
 
 def _nearest(known: Tensor) -> _Around:
@@ -149,7 +150,7 @@ def _nearest(known: Tensor) -> _Around:
     height, width = known.shape[2:]
     sides = _sides(known[:, 0])
     every = torch.arange(known.numel(), device=known.device)
-    place = every if torch.compiler.is_exporting() else every[~known.flatten()]
+    place = every if is_exporting() else every[~known.flatten()]
     row, column, up, down, left, right = (part.flatten()[place] for part in sides)
     found = torch.stack([up >= 0, down < height, left >= -width, right < 2 * width])
     distance = torch.stack([row - up, down - row, column - left, right - column])

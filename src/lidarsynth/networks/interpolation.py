@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarsynth.networks.exporting import is_exporting
 from lidarsynth.networks.running import last_known
 
 METHODS = ("nearest", "bilinear", "bicubic")
@@ -24,7 +25,7 @@ def fill_in(known: Tensor, mask: Tensor) -> Tensor:
     """
     known, mask = _check(known, mask)
     filled, seen = _fill_cross(known, mask)
-    if not torch.compiler.is_exporting() and bool((seen | ~mask.flatten(2).any(2)[:, :, None, None]).all()):
+    if not is_exporting() and bool((seen | ~mask.flatten(2).any(2)[:, :, None, None]).all()):
         return filled
     return _fill_cross(filled, seen)[0]
 
@@ -213,7 +214,7 @@ def _nearest(known: Tensor, mask: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     best, best_value = distance, value
     empty = ~mask.flatten(2).any(2)[:, :, None, None]
     for shift in range(1, min(radius, width // 2) + 1):
-        if not torch.compiler.is_exporting() and not bool(((best > shift**2) & ~empty).any()):
+        if not is_exporting() and not bool(((best > shift**2) & ~empty).any()):
             break  # an exported network cannot ask; further shifts change nothing
         for signed in (shift, -shift):
             candidate = distance.roll(signed, 3) + shift**2

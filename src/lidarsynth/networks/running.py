@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from lidarsynth.networks.exporting import is_exporting
+
 LONGEST = 4096  # columns of an exported network whose number of columns is open
 
 
@@ -14,7 +16,7 @@ def last_known(place: Tensor, dim: int) -> Tensor:
 
     place  integers: where a place is known, its number along `dim`, else -1
     """
-    return counted(place, dim) if torch.compiler.is_exporting() else place.cummax(dim).values
+    return counted(place, dim) if is_exporting() else place.cummax(dim).values
 
 
 def counted(place: Tensor, dim: int) -> Tensor:
