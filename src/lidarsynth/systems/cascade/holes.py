@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ from lidarsynth.systems.cascade.layout import RaysOf, detailed, one_thread, to_d
 from lidarsynth.systems.cascade.surfaces import straightened
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.scan_model import OnStep
+
+SMOOTH, APART = 0.15, 4  # natural logarithm of 1 / metres of two pixels of a plane; lines from one to the next
 
 
 class Told(NamedTuple):
@@ -113,3 +116,45 @@ def _placed(
     for part, new in zip(whole, (np.where(metres > farthest, 0, metres), reflectance, True), strict=True):
         part[grid] = np.where(inside, new, part[grid])
     return whole
+
+
+def with_planes(told: Told, known: np.ndarray, slopes: np.ndarray) -> Told:
+    """What is told, with what lies between the columns and beams that were drawn in a hole, where the two next ones are
+    of one plane or nothing. Where all beams were drawn, it is left to the fill; told every second beam and column of a
+    hole alone, that made rings that stray by a part of their distance.
+
+    known   (H, W) bool, what was told before anything was drawn
+    slopes  (H,) tangents of the beams' elevations
+    """
+    drawn = told.known & ~known
+    rows, columns = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
+    if len(rows) < 2 or len(columns) < 2 or np.median(np.diff(rows)) == 1:
+        return told
+    level = np.hypot(1, slopes)[:, None].astype(np.float32)  # metres along a beam for each above the ground
+    whole = Told(*(part.copy() for part in told))
+    whole.metres[:] = level * _inverse(told.metres)
+    _bridge(Told(*(part.T for part in whole)), columns, np.arange(told.known.shape[1]))
+    _bridge(whole, rows, slopes)
+    whole.metres[:] = np.where(whole.known & ~told.known, level * _inverse(whole.metres), told.metres)
+    return whole
+
+
+def _bridge(told: Told, lines: np.ndarray, places: np.ndarray) -> None:
+    """Fill in lines (H, W) between each two of those at `lines`, where both are told: in 1 / metres, by the places."""
+    for first, last in pairwise(lines):
+        if last - first > APART:
+            continue
+        both = told.known[first] & told.known[last]
+        near, far = told.metres[first], told.metres[last]
+        none = both & (near == 0) & (far == 0)
+        plane = (near > 0) & (far > 0) & (np.abs(np.log(np.maximum(near, 1e-6) / np.maximum(far, 1e-6))) < SMOOTH)
+        for line in range(first + 1, last):
+            share = np.float32((places[line] - places[first]) / (places[last] - places[first]))
+            new = ~told.known[line] & (none | both & plane)
+            for part in (told.metres, told.reflectance):
+                part[line] = np.where(new, (1 - share) * part[first] + share * part[last], part[line])
+            told.known[line] |= new
+
+
+def _inverse(values: np.ndarray) -> np.ndarray:
+    return np.where(values > 0, 1 / np.maximum(values, 1e-6), 0)

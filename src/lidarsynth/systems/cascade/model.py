@@ -29,7 +29,7 @@ from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.edges import with_edges
 from lidarsynth.systems.cascade.floating import settled
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
-from lidarsynth.systems.cascade.holes import Told, with_holes_drawn
+from lidarsynth.systems.cascade.holes import Told, with_holes_drawn, with_planes
 from lidarsynth.systems.cascade.images import (
     GENERATED,
     SPECKLE,
@@ -183,7 +183,8 @@ class CascadeModel(AnySensorModel):
             grid_of(self.sensor)  # refuses those that are smaller
             dim, rays_at = own.response.unevenness(own.sensor), partial(own._grid_rays, count=1)
             parts = Told(metres, reflectance, told), own.sensor, dim, rays_at, rng, how, on_step
-            metres, reflectance, told = with_holes_drawn(self.network, *parts)
+            slopes = np.tan(np.radians(np.asarray(own.sensor.elevations)))
+            metres, reflectance, told = with_planes(with_holes_drawn(self.network, *parts), known, slopes)
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
