@@ -41,8 +41,11 @@ format: $(STAMP)
 fuzz: $(STAMP)
 	$(BIN)/python tests/fuzz.py --minutes $(MINUTES) --seed $(SEED)
 
+# Those alone that need neither scans nor a model of yours.
+BENCHMARKS := $(filter-out $(foreach name,any_sensor frames realise learn_columns learn_drawn learn_judge,benchmarks/$(name).py),\
+                $(sort $(wildcard benchmarks/*.py)))
 bench: $(STAMP)
-	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+	for script in $(BENCHMARKS); do $(BIN)/python $$script || exit 1; done
 
 # The package as others get it, tried on every Python from 3.10 to 3.13 that is at hand: by its name, of pyenv or of uv.
 # TORCH= leaves torch out and tries what does without it: the help of every verb, the reading of a scan.

@@ -180,6 +180,8 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="a .png to write instead of the table")
     parser.add_argument("--inversion", help="a GAN beside it: DUSty v2, trained on scans of the sensor")
     args = parser.parse_args()
+    if args.streets < 1 and args.real is None:
+        parser.error("expected --streets COUNT or --real FOLDER, found neither")
     torch.set_num_threads(1)
     sensor = get_sensor(args.sensor)
     model = load(args.model).into(sensor)

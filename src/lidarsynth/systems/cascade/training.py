@@ -126,7 +126,7 @@ class CoarseObjective(nn.Module):
             rng = sample_rng(batch.crops.seeds[0], 2, 0)
             whole = known_grid(metres, reflectance)
             judged = torch.randperm(COLUMNS, generator=rng)[: COLUMNS // 2].to(rays.device)
-            draft = self._draft(x_0, eps, rays, standing, rng)
+            draft = self.draft(x_0, eps, rays, standing, rng)
             losses["columns"] = self.columns(whole, rays, draft, judged, spoilt(whole, rng)).sum(1)
         if self.between is not None:
             whole, rays = known_grid(batch.finer.metres, batch.finer.reflectance), batch.finer.rays
@@ -140,7 +140,7 @@ class CoarseObjective(nn.Module):
         return losses
 
     @torch.no_grad()
-    def _draft(self, x_0: Tensor, eps: Tensor, rays: Tensor, standing: Tensor, rng: torch.Generator) -> Tensor:
+    def draft(self, x_0: Tensor, eps: Tensor, rays: Tensor, standing: Tensor, rng: torch.Generator) -> Tensor:
         """(b, 7, 16, 128) drafts that become x_0, of any of the times that columns learn."""
         low, high = LEARNED
         t = (low + (high - low) * torch.rand(len(x_0), generator=rng)).to(x_0)
