@@ -212,7 +212,7 @@ def test_rows_that_need_reflectance_are_not_computed(model: GanModel):
         for kind in ("rangenet", "pointnet"):
             statistics.add_features(kind, np.random.default_rng(0).random((3, 4)), [True] * 3)
     results = {result.name: result for result in results_of(*sides)}
-    assert str(results["FRD"]) == "N/A" and "have no reflectance" in results["FRD"].reason
+    assert str(results["FRD"]) == "N/A" and "have no return with a reflectance" in results["FRD"].reason
     assert results["FPD"].value is not None and results["JSD x1e2"].value is not None
     pairs = Pairs(R2DM_UPSAMPLING)
     pairs.update([model.complete(real[0], steps=1)], [real[0]])
