@@ -664,7 +664,8 @@ def test_files_and_streets_have_as_many_columns_as_the_sensor(tmp_path: Path):
     without_intensity(tmp_path / "scans/0.pcd", SENSORS["pandar64"])
     list(prepare("files", tmp_path / "scans", tmp_path / "files", sensor="pandar64", intensity="none"))
     list(prepare("synthetic", tmp_path / "streets", None, sensor="pandar64", count=1))
-    for folder in ("files", "streets"):
+    list(cache_synthetic(tmp_path / "python", 1, "pandar64"))
+    for folder in ("files", "streets", "python"):
         assert CachedImages(tmp_path / folder).sensor.width == 1800
 
 

@@ -108,8 +108,8 @@ def prepare(
             if given is not None:
                 raise ValueError(f"expected {word} with a data set, found it with synthetic, whose scans are cast")
         spec = SYNTHETIC if sensor is None else sensor
-        wide, many = _width(width, spec, None), 1000 if count is None else count
-        return cache_synthetic(folder or root, many, spec, wide, seed, workers, check, apart, inside)
+        many = 1000 if count is None else count
+        return cache_synthetic(folder or root, many, spec, width, seed, workers, check, apart, inside)
     if apart or inside:
         word = "--apart" if apart else "--inside"
         raise ValueError(f"expected {word} with synthetic, whose worlds are drawn, found it with {name}")
@@ -169,7 +169,7 @@ def cache_synthetic(
     folder: str | Path,
     count: int,
     sensor: str = SYNTHETIC,
-    width: int = 1024,
+    width: int | None = None,
     seed: int = 0,
     workers: int | None = 0,
     check: bool = False,
@@ -178,6 +178,7 @@ def cache_synthetic(
 ) -> Iterator[tuple[int, int]]:
     """Cast `count` synthetic streets into a cache; yields (images stored, images in all). Rest as `cache_source`.
 
+    width   columns; None = as many as the sensor has
     apart   a world for each of them, for sets that are compared; else sixteen places in each, many times faster
     inside  of buildings, not of streets (`streets.interiors`), the sensor `mount` above the floor
     A cache that tells no edition of its streets, as those of before 2026-11-26, is gone on with where it begins as
@@ -186,7 +187,7 @@ def cache_synthetic(
     from lidarsynth.streets.interiors import buildings
     from lidarsynth.streets.reader import SyntheticStreets
 
-    spec = _sensor(sensor, width)
+    spec = _sensor(sensor, _width(width, sensor, None))
     worlds = buildings(seed, spec) if inside else None
     streets = SyntheticStreets(seed=seed, length=count, sensor=spec, apart=apart, worlds=worlds)
     source = {"name": "synthetic", "seed": seed} | ({"apart": True} if apart else {})

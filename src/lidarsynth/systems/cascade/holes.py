@@ -130,7 +130,7 @@ def with_planes(told: Told, known: np.ndarray, slopes: np.ndarray) -> Told:
     rows, columns = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
     if len(rows) < 2 or len(columns) < 2 or np.median(np.diff(rows)) == 1:
         return told
-    level = np.hypot(1, slopes)[:, None].astype(np.float32)  # metres along a beam for each above the ground
+    level = np.hypot(1, slopes)[:, None].astype(np.float32)  # metres along a beam for each along the ground
     whole = Told(*(part.copy() for part in told))
     whole.metres[:] = level * _inverse(told.metres)
     _bridge(Told(*(part.T for part in whole)), columns, np.arange(told.known.shape[1]))
@@ -157,4 +157,5 @@ def _bridge(told: Told, lines: np.ndarray, places: np.ndarray) -> None:
 
 
 def _inverse(values: np.ndarray) -> np.ndarray:
+    """1 / values of any shape, 0 of what is none."""
     return np.where(values > 0, 1 / np.maximum(values, 1e-6), 0)
