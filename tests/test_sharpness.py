@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.evaluation.measures import MEASURES
 from lidarsynth.evaluation.protocols import STREET_2
 from lidarsynth.evaluation.report import warnings_of
@@ -46,6 +47,15 @@ def test_noise_makes_ground_and_walls_as_thick_as_it_is():
     # not all of it is across the line.
     assert 0.01 < median(noisy.counts["walls"]) < 0.15
     assert all(counts.sum() > 100 for counts in clean.counts.values())
+
+
+def test_ranges_count_as_caches_keep_them(tmp_path: Path):
+    far = replace(SENSOR, max_range=200.0)  # a cache of it has steps of 4 mm
+    image = replace(street(0.001), sensor=far)
+    list(write_cache(tmp_path / "cache", lambda _: image, 1, far, {"dataset": "street"}))
+    kept = CachedImages(tmp_path / "cache")[0]
+    first, second = counted(image).counts, counted(kept).counts
+    assert (kept.range != image.range).any() and all((first[kind] == second[kind]).all() for kind in KINDS)
 
 
 def test_two_halves_merge_into_the_whole():

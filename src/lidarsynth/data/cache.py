@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.index import MOVED, RANGE_STEP, close_index, open_index, resumable_file, stored_step, write_index
+from lidarsynth.data.index import MOVED, close_index, open_index, resumable_file, stored_step, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.files.lock import only_writer
+from lidarsynth.lidar.depth import RANGE_STEP, range_step
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 
@@ -32,11 +32,6 @@ def record_type(sensor: Sensor) -> np.dtype:
     """One stored image: range in the index's steps, reflectance in steps of 1/255, SemanticKITTI class or NO_LABEL."""
     shape = (sensor.height, sensor.width)
     return np.dtype([("range", "<u2", shape), ("reflectance", "u1", shape), ("label", "u1", shape)])
-
-
-def range_step(sensor: Sensor) -> float:
-    """Metres per stored unit for this sensor: 2 mm, or as many whole millimetres as its furthest range needs."""
-    return max(RANGE_STEP, math.ceil(sensor.max_range / 65.535) / 1000)
 
 
 def pack(image: RangeImage, step: float = RANGE_STEP) -> np.ndarray:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lidarsynth.data.cache import (
     NO_LABEL,
-    RANGE_STEP,
     SHARD,
     npy_header,
     pack,
@@ -28,7 +27,7 @@ from lidarsynth.lidar.depth import encode
 from lidarsynth.lidar.scan import RangeImage
 
 __all__ = [
-    "INDEX", "RANGE_STEP", "REPORT", "SHARD", "CachedImages", "SeveralCaches", "pack", "read_index", "record_type",
+    "INDEX", "REPORT", "SHARD", "CachedImages", "SeveralCaches", "pack", "read_index", "record_type",
     "verify", "write_cache",
 ]  # fmt: skip
 

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lidarsynth.lidar.depth import RANGE_STEP
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import sweep, whole_file
 
-RANGE_STEP = 0.002  # metres per unit of the stored uint16, 0 = nothing returned; of sensors that see beyond 131 m more
 INDEX, REPORT = "index.json", "report.json"
 PLACE = ("root", "missing")  # of a source: where it lies on this disk, not what it is
 MOVED = "moved"  # of an opened index: that the source lies elsewhere than when it was written
