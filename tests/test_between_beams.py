@@ -200,6 +200,24 @@ def test_the_ground_goes_on_as_ground_however_far_apart_beams_are_and_nothing_is
     np.testing.assert_allclose(decode_range(found.code)[0, 0].numpy(), road[4], rtol=0.02)
 
 
+def test_kerbs_run_along_the_street_beyond_the_last_beam():
+    """3 m to each side the ground is 15 cm higher, and brighter: the last ring is on the road where the one above it is
+    not any more."""
+    sensor = Sensor("far apart", (1.0, -6.0, -11.3, -15.6, -25.0), 512, mount=1.8)
+    told = grid_rays(sensor, np.zeros((5, 512), bool), np.arange(5), np.arange(512))[0][None]
+    _, side, down = np.moveaxis(sensor.directions(), -1, 0)
+    road, walk = (height / np.maximum(-down, 1e-3) for height in (1.8, 1.65))
+    on_walk = np.abs(walk * side) > 3
+    metres = np.where(down > 0, 20, np.where(on_walk, walk, road))
+    grid = known_grid(
+        torch.from_numpy(metres).float()[None], torch.from_numpy(np.where(on_walk, 0.5, 0.2)).float()[None]
+    )
+    found = beyond(Grid(*(part[:, :4] for part in grid)), told[:, :, :4], told[:, :, 4:], (-1, -2))
+    off = np.abs(decode_range(found.code)[0, 0].numpy() - metres[4])
+    assert on_walk[4].mean() + 0.1 < on_walk[3].mean() and (off < 0.02).mean() > 0.97
+    assert ((found.shade[0, 0].numpy() > 0.35) == on_walk[4]).mean() > 0.97
+
+
 def test_taller_grids_of_training_have_each_beam_with_its_own_rays():
     sensor = Sensor("any", tuple(np.linspace(6, -24, 64).tolist()), 1024, 0.5, 120.0, mount=1.8)
     metres = np.repeat(np.arange(1.0, 65)[:, None], 1024, 1)

@@ -252,23 +252,41 @@ def _whole(grid: Grid, rows: np.ndarray, columns: np.ndarray, rays_of: RaysOf, h
 def beyond(grid: Grid, rays: Tensor, new: Tensor, side: tuple[int, int]) -> Grid:
     """Beams of rays (B, 8, E, C) beyond those at `side` of a grid and its rays, the next one and the one behind it.
 
-    Where the next one is of the ground, as high as that; else on the plane of both where they are of one, or upright on
-    the next one, down to flat ground. What returns there, returns.
+    Where the next one is of the ground, as high as that, or as the ground is that it meets as far to the side, for
+    kerbs run along the street; else on the plane of both where they are of one, or upright on the next one, down to
+    flat ground. What returns there, returns.
     """
     told = nearness(grid.code, grid.returned, rays), (rays[:, 0] / 3).tan()
     (near, near2), (slope, slope2) = ([part[:, i, None] for i in side] for part in told)
-    steep, flat = (new[:, 0] / 3).tan(), 1 / (decode_range(new[:, 1] / 2) * levelled(new))
+    steep, flat, level = (new[:, 0] / 3).tan(), _of_flat_ground(new), _of_flat_ground(rays)[:, side[0], None]
     far = near + (near - near2) * (steep - slope) / (slope - slope2)
     plane = (near2 > 0) & ((near / near2.clamp_min(1e-6)).log().abs() < SMOOTH) & (far > 0.3 * near)
     far = torch.where(plane, far, near)
     far = torch.where(steep < 0, torch.maximum(far, flat), far)
-    off = decode_range(grid.code).clamp_min(0.1).log() - decode_range(rays[:, 1] / 2).log()
-    ground = (off[:, side[0], None].abs() < LEVEL) & (slope < 0) & (steep < 0)
-    far = torch.where(ground, near * steep / slope.clamp_max(-1e-6), far)
+    ground = (near > 0) & ((near / level).clamp_min(1e-6).log().abs() < LEVEL) & (slope < 0)
+    aside, lower = _as_far_aside(level / flat, rays[:, 4:6, side[0]]), near / level
+    shade = grid.shade[:, side[0], None].expand_as(far)
+    on, there, reads = (part.expand_as(far).gather(2, aside) for part in (ground, lower, shade))
+    far = torch.where(ground & (steep < 0), flat * torch.where(on, there, lower), far)
+    shade = torch.where(ground & (steep < 0) & on, reads, shade)
     metres = 1 / (far.clamp_min(1e-4) * levelled(new))
     back = grid.returned[:, side[0], None] & (new[:, 6] < 0.5)
     code = torch.where(back, encode_range(metres), 0)
-    return Grid(code, grid.shade[:, side[0], None] * back, back)
+    return Grid(code, shade * back, back)
+
+
+def _of_flat_ground(rays: Tensor) -> Tensor:
+    """(B, R, C) 1 / metres along the ground to where rays (B, 8, R, C) meet it, were it flat."""
+    return 1 / (decode_range(rays[:, 1] / 2) * levelled(rays))
+
+
+def _as_far_aside(nearer: Tensor, azimuth: Tensor) -> Tensor:
+    """(B, E, C) columns in which a ring meets the ground as far to the side, and as much ahead or behind, as each of
+    these (B, 2, C), sine and cosine of the azimuth, does on a ring `nearer` (B, E, C) times as near."""
+    sine, cosine = (part[:, None] for part in azimuth.unbind(1))
+    sine = (nearer * sine).clamp(-1, 1)
+    ahead = (1 - sine**2).sqrt().copysign(cosine)
+    return (sine[..., None] * azimuth[:, 0, None, None] + ahead[..., None] * azimuth[:, 1, None, None]).argmax(-1)
 
 
 def _straight(grid: Grid, rows: np.ndarray, sensor: Sensor) -> Grid:
