@@ -116,7 +116,7 @@ def test_streams_hold_one_batch(model):
         ({"n": 0}, "expected n, steps and batch_size of at least 1, found 0, 32, 4"),
         ({"steps": 0}, "of at least 1, found 1, 0, 4"),
         ({"batch_size": -1}, "of at least 1, found 1, 32, -1"),
-        ({"sampler": "euler"}, "expected a sampler of ddpm, ddim, dpmpp-2m, heun, langevin, found 'euler'"),
+        ({"sampler": "euler"}, "of ddpm, ddim, dpmpp-2m, sde-dpmpp-2m, heun, langevin, found 'euler'"),
     ],
 )
 def test_generation_refuses_what_it_cannot_do(model, options, message):

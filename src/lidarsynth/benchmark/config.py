@@ -43,7 +43,7 @@ class GenerationMethod:
     held_out: str | None = None  # the same, of real scans: how near the real ones are to each other
     noise: bool = False  # what sampling starts from
     steps: int | tuple[int, ...] | None = None  # None = the model's own
-    sampler: str | None = None  # ddpm | ddim | dpmpp-2m | heun | columns; None = the model's own
+    sampler: str | None = None  # ddpm | ddim | dpmpp-2m | sde-dpmpp-2m | heun | columns; None = the model's own
     count: int | None = None  # scans to make, if other than the benchmark's
     published: str | None = None  # row of the published table
 

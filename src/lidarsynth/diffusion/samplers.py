@@ -8,6 +8,7 @@ A step has the signature `step(denoiser, x_t, t, s, rng, previous) -> (x_s, x_0_
 | ddpm | ancestral sampling (Ho et al. 2020; R2DM) | 1 | - |
 | ddim | DDIM (Song et al. 2021); Euler's step when the schedule is `flow` | 1 | 1 |
 | dpmpp-2m | DPM-Solver++(2M) (Lu et al. 2022) | 1 | 2 |
+| sde-dpmpp-2m | SDE-DPM-Solver++(2M) (Lu et al. 2022): `ddpm` with the estimate of the line before | 1 | 2 |
 | heun | Heun's method, exponential form (Hochbruck & Ostermann 2010) | 2 | 2 |
 """
 
@@ -158,11 +159,16 @@ def ddpm(
     It is DDIM with eta = 1 in other words, and other roundings: these are R2DM's. Noise comes with the last step too.
     """
     x_0_hat = denoiser(x_t, t)
-    log_snr_t, alpha_t, _ = denoiser.schedule.at(t, x_t)
-    log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
+    return _drawn(denoiser.schedule, x_t, x_0_hat, t, s, rng), x_0_hat
+
+
+def _drawn(schedule: Schedule, x_t: Tensor, x_0_hat: Tensor, t: Tensor, s: Tensor, rng: Rng) -> Tensor:
+    """A draw from q(x_s | x_t, x_0 = x_0_hat)."""
+    log_snr_t, alpha_t, _ = schedule.at(t, x_t)
+    log_snr_s, alpha_s, sigma_s = schedule.at(s, x_t)
     c = -torch.expm1(log_snr_t - log_snr_s)  # 1 - snr_t / snr_s
     mean = alpha_s * (x_t * (1 - c) / alpha_t + c * x_0_hat)
-    return mean + sigma_s * c.sqrt() * noise_like(x_t, rng), x_0_hat
+    return mean + sigma_s * c.sqrt() * noise_like(x_t, rng)
 
 
 def ddim(
@@ -198,13 +204,30 @@ def dpmpp_2m(
     x_0_hat = denoiser(x_t, t)
     log_snr_t, _, sigma_t = denoiser.schedule.at(t, x_t)
     log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
-    h = log_snr_s - log_snr_t
-    estimate = x_0_hat
-    if previous is not None:
-        h_previous = log_snr_t - denoiser.schedule.at(previous.t, x_t)[0]
-        weight = torch.where(s.view_as(h) > 0, h / (2 * h_previous), 0)
-        estimate = x_0_hat + weight * (x_0_hat - previous.x_0_hat)
-    return sigma_s / sigma_t * x_t - alpha_s * torch.expm1(-h / 2) * estimate, x_0_hat
+    estimate = _ahead(denoiser.schedule, x_t, x_0_hat, t, s, previous)
+    return sigma_s / sigma_t * x_t - alpha_s * torch.expm1((log_snr_t - log_snr_s) / 2) * estimate, x_0_hat
+
+
+def sde_dpmpp_2m(
+    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
+) -> tuple[Tensor, Tensor]:
+    """SDE-DPM-Solver++(2M) (Lu et al. 2022, algorithm 4): `ddpm`, on the line of `dpmpp_2m`.
+
+    Fresh noise at each step takes off what the network's errors have made of those before, which a deterministic step
+    keeps.
+    """
+    x_0_hat = denoiser(x_t, t)
+    estimate = _ahead(denoiser.schedule, x_t, x_0_hat, t, s, previous)
+    return _drawn(denoiser.schedule, x_t, estimate, t, s, rng), x_0_hat
+
+
+def _ahead(schedule: Schedule, x_t: Tensor, x_0_hat: Tensor, t: Tensor, s: Tensor, previous: State | None) -> Tensor:
+    """x_0 half a step ahead, on the line through this and the previous estimate over log_snr."""
+    if previous is None:
+        return x_0_hat
+    log_snr, before, after = (schedule.at(time, x_t)[0] for time in (t, previous.t, s))
+    weight = torch.where(s.view_as(log_snr) > 0, (after - log_snr) / (2 * (log_snr - before)), 0)
+    return x_0_hat + weight * (x_0_hat - previous.x_0_hat)
 
 
 def heun(
@@ -230,5 +253,6 @@ STEPS: dict[str, Step] = {
     "ddpm": ddpm,
     "ddim": ddim,
     "dpmpp-2m": dpmpp_2m,
+    "sde-dpmpp-2m": sde_dpmpp_2m,
     "heun": heun,
 }

@@ -32,6 +32,7 @@ from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightene
 STEPS_DEFAULT = 16
 # Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
 DRAFT, DRAFT_STEPS = 0.53, 8
+DRAFTING = "sde-dpmpp-2m"  # its sampler: a deterministic one keeps what is wrong at first, and has few near walls
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 LEVEL = 0.15  # natural logarithm of the range of flat ground by which a return on the ground may be nearer or farther
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
@@ -81,7 +82,7 @@ def draft(network: Cascade, rays: Tensor, standing: Tensor, rng: list[torch.Gene
 
     x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
     *_, last = sample(
-        velocity(network, rays, guided=True), x_1, STEPS["dpmpp-2m"], DRAFT_STEPS, rng, partial(to_draft, t=t)
+        velocity(network, rays, guided=True), x_1, STEPS[DRAFTING], DRAFT_STEPS, rng, partial(to_draft, t=t)
     )
     return drafted(network.coarse, last.x_s, last.s, rays, standing)
 

@@ -134,7 +134,7 @@ class CascadeModel(AnySensorModel):
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
 
-        sampler  of the grid: columns | ddpm | ddim | dpmpp-2m | heun; default columns, dpmpp-2m where steps are given
+        sampler  of the grid: columns, or one of diffusion; default columns, dpmpp-2m where steps are given
         steps    of diffusion, default 16; the fill takes one more
         Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """

@@ -72,7 +72,7 @@ class LidarModel(ScanModel):
 
         steps    network evaluations per scan (twice as many for `heun`; for `langevin` at most as many, in whole noise
                  levels); default 32, or 1161 for `langevin`: 232 levels x 5 and a final denoising
-        sampler  ddpm | ddim | dpmpp-2m | heun | langevin; default ddpm, or langevin after score matching
+        sampler  ddpm | ddim | dpmpp-2m | sde-dpmpp-2m | heun | langevin; default ddpm, or langevin after score matching
 
         Raises ValueError for an unknown sampler or counts below 1, or below 11 for `langevin`.
         """
