@@ -69,7 +69,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     """Do the job with every scan, say what came of it, and return the results, after those of scans that were there
     already, as far as reports tell them. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
-    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream
+    from lidarsynth.verbs.expansion import is_stream
+    from lidarsynth.verbs.inputs import Reading, inputs_of
     from lidarsynth.verbs.placement import parse_rings, read_transform
 
     if many.workers < 0:

@@ -26,7 +26,8 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict, get_sensor
-from lidarsynth.verbs.inputs import Reading, has_scans, is_stream
+from lidarsynth.verbs.expansion import has_scans, is_stream
+from lidarsynth.verbs.inputs import Reading
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 from lidarsynth.verbs.viewpoint import viewpoint_note

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import glob
-import os
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Protocol
 
@@ -16,7 +12,6 @@ import numpy as np
 from lidarsynth.data.bag_records import Message, cloud_of
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
 from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import unread_turns
 from lidarsynth.data.whole_turns import Unread
@@ -29,16 +24,14 @@ from lidarsynth.files.fields import (
     scan_from_fields,
     written_names,
 )
-from lidarsynth.files.formats import READERS, marks_left_out, read_with_report, sensor_in
+from lidarsynth.files.formats import marks_left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.verbs.earlier_results import EarlierResults, earlier_results
-
-NAMED = 3  # files of a pattern that are no scans
-MAGIC = "*?["  # of patterns
+from lidarsynth.verbs.earlier_results import earlier_results
+from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders
 
 
 @dataclass(frozen=True)
@@ -202,7 +195,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     reading = reading or Reading()
     if not paths:
         raise ValueError("expected one scan or more, found none")
-    expanded, below = _all_expanded(paths, earlier_results(out))
+    expanded, below = all_expanded(paths, earlier_results(out))
     if not expanded:
         raise ValueError(f"{out}: expected scans to read, found only what lies in this output folder; name another")
     streams = [path for path in expanded if is_stream(path)]
@@ -210,11 +203,10 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
         raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
     if reading.metadata is not None and not any(map(is_capture, streams)):
         raise ValueError(f"expected a capture for --metadata {reading.metadata}, found none")
-    files = [FileInput(name, path, reading) for name, path in _names(expanded)]
-    single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
+    files = [FileInput(name, path, reading) for name, path in scan_names(expanded)]
+    single = len(files) == 1 and not streams and not (len(paths) == 1 and is_folder(paths[0]))
     count: int | None = len(files)
-    each = list(dict.fromkeys(streams))
-    folders = dict(zip(each, _unlike([_folder(path) for path in each], each), strict=True))
+    folders = stream_folders(streams)
     cut: list[str] = []
     for path in streams:
         more = _stream_count(path, reading, cut)
@@ -231,85 +223,10 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
                     raise
                 yield BrokenInput(folders[path], path, str(error))  # the others go on
 
-    folders_given = [path for path in paths if path.is_dir() and not is_bag(path) and not _is_scan(path)]
-    inside = [p for folder in folders_given for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams]
+    inside = [
+        p for folder in filter(is_folder, paths) for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams
+    ]
     return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below)
-
-
-def is_stream(path: Path) -> bool:
-    """Whether a path holds many scans one after the other: a bag or a capture."""
-    return is_bag(path) or is_capture(path)
-
-
-def _all_expanded(paths: Sequence[Path], earlier: EarlierResults | None) -> tuple[list[Path], tuple[Path, ...]]:
-    """What the paths stand for, without results of earlier runs, and scans as `Inputs.below`."""
-    parts = [_expanded(path, earlier) for path in paths]
-    found, below = ([path for part in parts for path in part[side]] for side in (0, 1))
-    if earlier is not None:
-        streams = {path for path in found if is_stream(path)}
-        scans, _ = earlier.parted([path for path in found if path not in streams], list(streams), None)
-        kept = streams.union(scans)
-        found = [path for path in found if path in kept]
-    return found, tuple(below)
-
-
-def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], list[Path]]:
-    """The path, the files of a folder, or those that a glob finds; bags in a folder come too. Beside them, scans as
-    `Inputs.below`."""
-    if not path.exists() and any(c in str(path) for c in MAGIC):
-        found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        scans, streams = [p for p in found if _is_scan(p)], sorted(filter(is_stream, found), key=by_number)
-        if not (scans or streams):
-            others = ", ".join(p.name for p in found[:NAMED]) + (", ..." if found[NAMED:] else "")
-            raise ValueError(f"{path}: expected scans, bags or captures of this pattern, found {others or 'none'}")
-        fixed = Path(*takewhile(lambda part: not any(c in part for c in MAGIC), path.parts))
-        scans, below = earlier.parted(scans, streams, fixed) if earlier else (scans, [])
-        return scans + streams, below
-    if path.is_dir() and not is_bag(path) and not _is_scan(path):
-        streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
-        scans = scans_below(path) if streams else scan_files(path)
-        scans, below = earlier.parted(scans, streams, path) if earlier else (scans, [])
-        return scans or streams, below
-    if not (path.exists() or _is_scan(path) or is_stream(path)):
-        raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
-    return [path], []
-
-
-def _is_scan(path: Path) -> bool:
-    return path.name.lower().endswith(tuple(READERS))
-
-
-def has_scans(folder: Path) -> bool:
-    """Whether a folder holds a scan file, at any depth."""
-    try:
-        return bool(scan_files(folder))
-    except ValueError:
-        return False
-
-
-def _names(expanded: list[Path]) -> Iterator[tuple[str, Path]]:
-    """(name, path) of each scan file: its stem, with the folders above it as far as names repeat without them."""
-    files = [path for path in expanded if not is_stream(path)]
-    return iter(zip(_unlike([stem(path) for path in files], files), files, strict=True))
-
-
-def _folder(path: Path) -> str:
-    """Where the results of a bag or capture belong: its stem, of drive.pcap2 drive_2."""
-    number = re.sub(r"\D", "", path.suffix) if is_capture(path) else ""
-    return f"{path.stem}_{number}" if number else path.stem
-
-
-def _unlike(stems: list[str], files: list[Path]) -> list[str]:
-    """The stems, or, where any is there twice, all with the folders above their files. Raises ValueError where these
-    do not tell them apart."""
-    if len(set(stems)) == len(stems):
-        return stems
-    root = Path(os.path.commonpath([path.absolute().parent for path in files]))
-    names = [str(path.absolute().parent.relative_to(root) / one) for path, one in zip(files, stems, strict=True)]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        one, other = [path for name, path in zip(names, files, strict=True) if name == twice[0]][:2]
-        raise ValueError(f"expected scans of different names, found two named {twice[0]}: {one} and {other}")
-    return names
 
 
 def _stream_count(path: Path, reading: Reading, cut: list[str]) -> int | None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from lidarsynth.data.capture import is_capture
 from lidarsynth.lidar.plural import plural
-from lidarsynth.verbs.inputs import Reading, is_stream
+from lidarsynth.verbs.expansion import is_stream
+from lidarsynth.verbs.inputs import Reading
 from lidarsynth.viewer.page import Entry
 from lidarsynth.viewer.series import Files, Series, series_of
 
