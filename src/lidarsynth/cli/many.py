@@ -34,7 +34,7 @@ class Many:
         arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
     ] = None
     keep_topics: Annotated[bool, arg(help="copy all other topics, attachments and metadata into the new bag.")] = False
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture, or packets in a bag.")] = None
     transform: Annotated[
         str | None,
         arg(
@@ -333,12 +333,12 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
 
 def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
     """The topic of points, of packets one of its own, and the others that are to be copied."""
-    from lidarsynth.data.bag_records import PACKETS
+    from lidarsynth.data.bag_records import OF_PACKETS
     from lidarsynth.data.bags import open_bag
 
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
-        others = [other for other in bag.topics if other.name != topic or other.kind == PACKETS]
+        others = [other for other in bag.topics if other.name != topic or other.kind in OF_PACKETS]
         named = topic if len(others) < len(bag.topics) else f"{topic}/points"
         return named, others if many.keep_topics else []
 

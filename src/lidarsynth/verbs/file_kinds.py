@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bag_records import PACKETS, POINTS, Bag, Cloud
+from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files
@@ -142,7 +142,7 @@ def _bag(path: Path, reading: Reading) -> Lines:
             lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
-        clouds = [topic.name for topic in bag.topics if topic.kind in (POINTS, PACKETS)]
+        clouds = bag.scan_topics()
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
         raise FileError(f"{path}: {clouds[0]}: {told[0][1]}")

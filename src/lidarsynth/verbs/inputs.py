@@ -11,10 +11,9 @@ import numpy as np
 
 from lidarsynth.data.bag_records import Message, cloud_of
 from lidarsynth.data.bags import is_bag, open_bag
-from lidarsynth.data.capture import is_capture
 from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import unread_turns
-from lidarsynth.data.whole_turns import Unread
+from lidarsynth.data.whole_turns import TimedTurn, Unread
 from lidarsynth.files.fields import (
     PLACE,
     Fields,
@@ -40,7 +39,8 @@ class Reading:
 
     intensity  scale, as in `files.formats.read_with_report`
     topic      of a bag, or ADDRESS:PORT of a sensor in a capture; None = the only one
-    metadata   `.json` of an Ouster capture; None = the only one beside it
+    metadata   `.json` of the Ouster of a capture, or of packets in a bag; None = what the bag tells, or the only one
+               beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
@@ -115,12 +115,12 @@ class FileInput:
 
 @dataclass(frozen=True)
 class MessageInput:
-    """A point cloud in a bag, still in its bytes."""
+    """A point cloud in a bag, still in its bytes: a message, or a turn of an Ouster's packets."""
 
     name: str
     path: Path
     reading: Reading
-    message: Message
+    message: Message | TimedTurn
 
     def read(self) -> Loaded:
         """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
@@ -201,16 +201,19 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     streams = [path for path in expanded if is_stream(path)]
     if reading.topic is not None and not streams:
         raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
-    if reading.metadata is not None and not any(map(is_capture, streams)):
-        raise ValueError(f"expected a capture for --metadata {reading.metadata}, found none")
     files = [FileInput(name, path, reading) for name, path in scan_names(expanded)]
     single = len(files) == 1 and not streams and not (len(paths) == 1 and is_folder(paths[0]))
     count: int | None = len(files)
     folders = stream_folders(streams)
     cut: list[str] = []
+    packets = False
     for path in streams:
-        more = _stream_count(path, reading, cut)
-        count = None if more is None or count is None else count + more
+        more, of_packets = _stream_count(path, reading, cut)
+        count, packets = None if more is None or count is None else count + more, packets or of_packets
+    if reading.metadata is not None and not packets:
+        raise ValueError(
+            f"expected a capture, or a bag of an Ouster's packets, for --metadata {reading.metadata}, found none"
+        )
 
     def stream() -> Iterator[Input]:
         yield from files
@@ -229,21 +232,22 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below)
 
 
-def _stream_count(path: Path, reading: Reading, cut: list[str]) -> int | None:
-    """Scans of a bag, or None where only reading tells; `cut` gets what is to be said of it."""
+def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | None, bool]:
+    """Scans of a bag, or None where only reading tells, and whether it, or a capture, holds packets that metadata may
+    be of; `cut` gets what is to be said of it."""
     if not is_bag(path):
-        return None
+        return None, True
     with open_bag(path) as bag:
         name = bag.point_topic(reading.topic)
         cut += bag.cut
-        return sum(topic.count for topic in bag.topics if topic.name == name) or None
+        return bag.count_of(name), bag.of_ouster(name)
 
 
 def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
-        for number, message in enumerate(bag.messages(frozenset([topic]))):
-            yield MessageInput(f"{folder}/{number:06d}", path, reading, message)
+        for number, scan in enumerate(bag.scans(topic, reading.metadata)):
+            yield MessageInput(f"{folder}/{number:06d}", path, reading, scan)
 
 
 def _capture_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:

@@ -12,6 +12,7 @@ from typing import Protocol
 from lidarsynth.data.bags import is_bag, open_bag
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import moved
+from lidarsynth.data.whole_turns import TimedTurn
 from lidarsynth.files.fields import dropped_points
 from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of
 from lidarsynth.viewer.beside import read_shown
@@ -128,12 +129,12 @@ def _scans_only(path: Path) -> list[Path]:
 def _bag(path: Path, reading: Reading) -> Stream:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
-        count, cut = sum(t.count for t in bag.topics if t.name == topic) or None, bag.cut
+        count, cut = bag.count_of(topic), bag.cut
 
     def open_at(mark: int, number: int) -> Iterator[tuple[int, Input]]:
         with open_bag(path) as bag:
-            for message in bag.messages(frozenset([topic]), mark):
-                name = f"{topic} {message.time / 1e9:.3f} s"
-                yield message.time, MessageInput(name, path, reading, message)
+            for scan in bag.scans(topic, reading.metadata, mark):
+                name = f"{topic} {scan.time / 1e9:.3f} s"
+                yield 0 if isinstance(scan, TimedTurn) else scan.time, MessageInput(name, path, reading, scan)
 
     return Stream(open_at, count, cut)
