@@ -281,7 +281,8 @@ def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):
     words = [str(tmp_path / "in"), "--sensor", "hdl-32e", "--no-picture", "--out", str(tmp_path / "o")]
     main(["project", *words])
     said = capsys.readouterr()
-    assert "1 bag or capture beside scan files was passed over: drive.bag" in said.err and "1 scan in" in said.out
+    passed = f"1 bag or capture beside scan files was passed over: {tmp_path / 'in' / 'drive.bag'};"
+    assert passed in said.err and "1 scan in" in said.out
     write(tmp_path / "in" / "c.pcd", ringed(scan))
     (tmp_path / "in" / "b.pcd").write_bytes(b"no points")
     main(["sensor", str(tmp_path / "in"), "--out", str(tmp_path / "s.toml"), "--no-picture"])

@@ -365,6 +365,28 @@ def test_parts_without_metadata_are_read_by_their_numbers(tmp_path: Path):
         assert [item.name for item in inputs_of(paths).stream()] == [f"drive_{n}/000000" for n in (1, 2, 10)]
 
 
+def test_bags_in_subfolders_are_found_as_scans_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A week of drives, a folder for each day, one with a bag of ROS 2, which is a folder that holds others."""
+    days = [tmp_path / "week" / f"day_{day}" for day in (2, 10, 11)]
+    for day, kind in zip(days, ("ros1", "mcap folder", "sqlite3"), strict=True):
+        day.mkdir(parents=True)
+        KINDS[kind](day)
+    clouds_at(days[1] / "drive.mcap", [100])
+    bags = [days[0] / "drive.bag", days[1] / "MCAP", days[1] / "drive.mcap", days[2] / "SQLITE3"]
+    names = ["day_2/drive"] * 3 + ["day_10/MCAP"] * 3 + ["day_10/drive"] + ["day_11/SQLITE3"] * 3
+    for path in (tmp_path / "week", tmp_path / "week" / "**"):
+        inputs = inputs_of([path])
+        assert [item.path for item in inputs.stream()] == [*bags[:1] * 3, *bags[1:2] * 3, bags[2], *bags[3:] * 3]
+        assert [item.name.rpartition("/")[0] for item in inputs.stream()] == names and inputs.count == 10
+    main(["info", str(tmp_path / "week")])
+    listed = ", ".join(str(path.relative_to(tmp_path / "week")) for path in bags)
+    assert (said := capsys.readouterr().out).count(listed) == 1 and "folder of 4 bags and captures" in said
+    assert len(series_of([tmp_path / "week"], Reading())[9].scan) == len(full_scan())
+    np.save(days[0] / "a.npy", np.ones((9, 4), np.float32))
+    inputs = inputs_of([tmp_path / "week"])
+    assert inputs.count == 1 and list(inputs.passed) == bags
+
+
 @pytest.mark.parametrize("ending", [".mcap", ".db3", ".bag"])
 @pytest.mark.parametrize("kind", ["mcap folder", "sqlite3"])
 def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, ending: str, tmp_path: Path):

@@ -80,7 +80,7 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     reading = Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings)
     inputs = inputs_of(paths, reading, out)
     if inputs.passed:
-        named = ", ".join(path.name for path in inputs.passed[:NAMED])
+        named = ", ".join(map(str, inputs.passed[:NAMED])) + (", ..." if inputs.passed[NAMED:] else "")
         count = len(inputs.passed)
         what = "bag or capture" if count == 1 else "bags or captures"
         warn(f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them")

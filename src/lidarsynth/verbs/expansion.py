@@ -24,6 +24,17 @@ def is_stream(path: Path) -> bool:
     return is_bag(path) or is_capture(path)
 
 
+def streams_below(folder: Path) -> list[Path]:
+    """The bags and captures under a folder, at any depth, 2 before 10; a folder that is a bag is one, whatever it
+    holds."""
+    found: list[Path] = []
+    for here, folders, files in os.walk(folder):
+        bags = {name for name in folders if is_bag(Path(here, name))}
+        folders[:] = [name for name in folders if name not in bags]
+        found += filter(is_stream, (Path(here, name) for name in (*bags, *files)))
+    return sorted(found, key=by_number)
+
+
 def all_expanded(paths: Sequence[Path], earlier: EarlierResults | None) -> tuple[list[Path], tuple[Path, ...]]:
     """What the paths stand for, without results of earlier runs, and scans as `Inputs.below`."""
     parts = [_expanded(path, earlier) for path in paths]
@@ -37,11 +48,12 @@ def all_expanded(paths: Sequence[Path], earlier: EarlierResults | None) -> tuple
 
 
 def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], list[Path]]:
-    """The path, the files of a folder, or those that a glob finds; bags in a folder come too. Beside them, scans as
-    `Inputs.below`."""
+    """The path, the files of a folder, or those that a glob finds; of a folder without scans its bags and captures.
+    Beside them, scans as `Inputs.below`."""
     if not path.exists() and any(c in str(path) for c in MAGIC):
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        scans, streams = [p for p in found if is_scan(p)], sorted(filter(is_stream, found), key=by_number)
+        scans, bags = [p for p in found if is_scan(p)], {p for p in found if p.is_dir() and is_bag(p)}
+        streams = sorted((p for p in found if is_stream(p) and p.parent not in bags), key=by_number)
         if not (scans or streams):
             others = ", ".join(p.name for p in found[:NAMED]) + (", ..." if found[NAMED:] else "")
             raise ValueError(f"{path}: expected scans, bags or captures of this pattern, found {others or 'none'}")
@@ -49,7 +61,7 @@ def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], l
         scans, below = earlier.parted(scans, streams, fixed) if earlier else (scans, [])
         return scans + streams, below
     if is_folder(path):
-        streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
+        streams = streams_below(path)
         scans = scans_below(path) if streams else scan_files(path)
         scans, below = earlier.parted(scans, streams, path) if earlier else (scans, [])
         return scans or streams, below

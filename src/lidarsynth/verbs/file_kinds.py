@@ -12,7 +12,7 @@ import numpy as np
 from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import by_number, scan_files
+from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import moved
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
@@ -26,7 +26,7 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict, get_sensor
-from lidarsynth.verbs.expansion import has_scans, is_stream
+from lidarsynth.verbs.expansion import has_scans, streams_below
 from lidarsynth.verbs.inputs import Reading
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
@@ -197,13 +197,13 @@ def _cache(path: Path) -> Lines:
 def _folder(path: Path, reading: Reading) -> Lines:
     """A folder of scans, or of bags and captures: what it holds, what else, and the first scan."""
     files = scan_files(path) if has_scans(path) else []
-    streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
+    streams = streams_below(path)
     if not files and not streams:
         raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
     if not files and reading.moves:
         raise FileError(f"{path}: expected a scan to move or take rings of, found bags and captures: name one of them")
     if not files:
-        listed = ", ".join(p.name for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
+        listed = ", ".join(str(p.relative_to(path)) for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
         kind = f"folder of {len(streams)} bags and captures" if streams[1:] else "folder of a bag or capture"
         return {"kind": kind, "files": listed}
     lines = {"kind": "folder of scans", "scans": _counted(None, files)}

@@ -30,7 +30,7 @@ from lidarsynth.lidar.marks import MARKS
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.verbs.earlier_results import earlier_results
-from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders
+from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders, streams_below
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Inputs:
     count    how many there are, or None where only reading tells (captures)
     stream   gives them; from the start each time
     streams  whether bags or captures are among them
-    passed   bags and captures that lie in a folder beside its scan files, which alone are read
+    passed   bags and captures in a folder of scan files, which alone are read
     below    scans below the output folder that are not read, though no report there tells of them
     cut      what is to be said, a line each, of bags that end early
     """
@@ -226,9 +226,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
                     raise
                 yield BrokenInput(folders[path], path, str(error))  # the others go on
 
-    inside = [
-        p for folder in filter(is_folder, paths) for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams
-    ]
+    inside = [p for folder in filter(is_folder, paths) for p in streams_below(folder) if p not in streams]
     return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below)
 
 
