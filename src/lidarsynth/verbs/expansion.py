@@ -72,12 +72,12 @@ def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], l
 
 def is_folder(path: Path) -> bool:
     """Whether a path is a folder of scans, bags or captures: of any kind but a bag."""
-    return path.is_dir() and not is_bag(path) and not is_scan(path)
+    return path.is_dir() and not is_bag(path)
 
 
 def is_scan(path: Path) -> bool:
-    """Whether a path is a scan file by its name."""
-    return path.name.lower().endswith(tuple(READERS))
+    """Whether a path is a scan file by its name. A folder is none."""
+    return path.name.lower().endswith(tuple(READERS)) and not path.is_dir()
 
 
 def has_scans(folder: Path) -> bool:

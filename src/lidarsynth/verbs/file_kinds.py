@@ -57,7 +57,7 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
             return _bag(path, reading)
         if not (path / INDEX).exists():
             return _folder(path, reading)
-    if path.name.lower().endswith(tuple(READERS)):
+    if path.name.lower().endswith(tuple(READERS)) and not path.is_dir():
         placed = {} if reading.moves or (note := viewpoint_note(path)) is None else {"viewpoint": note}
         return _image(path) | _scan_file(path, reading) | placed
     if is_bag(path):
