@@ -338,8 +338,9 @@ def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
 
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
-        others = [other for other in bag.topics if other.name != topic or other.kind in OF_PACKETS]
-        named = topic if len(others) < len(bag.topics) else f"{topic}/points"
+        kind = bag.kind_of(topic)
+        others = [one for one in bag.topics if (one.name, one.kind) != (topic, kind) or kind in OF_PACKETS]
+        named = f"{topic}/points" if kind in OF_PACKETS else topic
         return named, others if many.keep_topics else []
 
 
@@ -347,8 +348,10 @@ def _copy(path: Path, writer: BagWriter, topics: list[Topic]) -> None:
     from lidarsynth.data.bags import open_bag
 
     with open_bag(path) as bag:
+        kept = {(topic.name, topic.kind) for topic in topics}
         for message in bag.messages(frozenset(topic.name for topic in topics)) if topics else ():
-            writer.copy(message)
+            if (message.topic.name, message.topic.kind) in kept:  # a topic may be of several types
+                writer.copy(message)
         left = [record.name for record in bag.attached() if not writer.attach(record)]
     if left:
         warn(f"{writer.path}: expected a .mcap for attachments and metadata, found a .bag, which holds none: "

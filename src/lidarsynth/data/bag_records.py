@@ -34,7 +34,7 @@ PACKED = b"\x28\xb5\x2f\xfd"  # a frame of zstd (RFC 8878); a message in CDR beg
 
 @dataclass(frozen=True)
 class Topic:
-    """What one connection of a bag carries.
+    """What one connection of a bag carries: messages of one type; a name may have several.
 
     name      such as /points
     kind      message type in ROS 2's style, such as sensor_msgs/msg/PointCloud2, or the schema's name
@@ -117,15 +117,27 @@ class Bag:
         metadata  `.json` of the Ouster; None = what the bag tells of it, else the only one beside the bag
         Raises FileError for a broken bag, where nothing tells of an Ouster, and for packets of another.
         """
-        return self._turns(topic, metadata) if self.of_ouster(topic) else self.messages(frozenset([topic]), start)
+        return self._turns(topic, metadata) if self.of_ouster(topic) else self._messages(topic, start)
 
     def count_of(self, topic: str) -> int | None:
         """How many scans a topic holds, or None where only reading tells."""
-        return sum(one.count for one in self.topics if one.name == topic and one.kind not in OUSTER) or None
+        kind = self.kind_of(topic)
+        counts = [one.count for one in self.topics if (one.name, one.kind) == (topic, kind)]
+        return None if kind in OUSTER else sum(counts) or None
 
     def of_ouster(self, topic: str) -> bool:
         """Whether a topic is of an Ouster's packets, which make turns only with its metadata."""
-        return any(one.name == topic and one.kind in OUSTER for one in self.topics)
+        return self.kind_of(topic) in OUSTER
+
+    def kind_of(self, topic: str) -> str:
+        """The type of a topic's messages; of several that which is read: points, else packets."""
+        kinds = [one.kind for one in self.topics if one.name == topic]
+        return next((kind for kind in (POINTS, *OF_PACKETS, *kinds) if kind in kinds), "")
+
+    def _messages(self, topic: str, start: int = 0, kind: str | None = None) -> Iterator[Message]:
+        """Those of a topic that are of one type; None = that which is read."""
+        kind = self.kind_of(topic) if kind is None else kind
+        return (message for message in self.messages(frozenset([topic]), start) if message.topic.kind == kind)
 
     def _turns(self, topic: str, metadata: Path | None) -> Iterator[TimedTurn]:
         described = self._metadata(topic) if metadata is None else ouster.read_metadata(metadata)
@@ -145,7 +157,7 @@ class Bag:
 
     def _packets(self, topic: str, size: int) -> Iterator[Datagram]:
         """The packets of a topic; the driver's older versions put one byte more after those of `size`."""
-        for message in self.messages(frozenset([topic])):
+        for message in self._messages(topic):
             try:
                 payload = _deserialized(message, message.topic.kind).buf.tobytes()
             except (*BROKEN, *library_errors()) as error:
@@ -155,7 +167,7 @@ class Bag:
 
     def _metadata(self, topic: str) -> ouster.Metadata:
         """What tells of the Ouster whose packets a topic holds: the topic of metadata beside it, else the only one."""
-        strings = [self._first(one.name) for one in self.topics if one.kind == STRING]
+        strings = [self._first(one) for one in self.topics if one.kind == STRING]
         told = {one.topic.name: one for one in strings if one is not None and ouster.KEY.encode() in one.data}
         beside = f"{topic.rpartition('/')[0]}/metadata"
         own = [beside] if beside in told else sorted(told)
@@ -171,8 +183,8 @@ class Bag:
             raise FileError(f"{where}: expected Ouster metadata, found: {one_line(error)}") from None
         return ouster.parse_metadata(text, where, self.path.stem)
 
-    def _first(self, topic: str) -> Message | None:
-        return next(self.messages(frozenset([topic])), None)
+    def _first(self, topic: Topic) -> Message | None:
+        return next(self._messages(topic.name, kind=topic.kind), None)
 
     def clouds(self, topic: str, metadata: Path | None = None) -> Iterator[Cloud | FileError]:
         """The point clouds of a topic, as `scans`, one at a time; a broken one comes as its error, and the next
@@ -185,7 +197,7 @@ class Bag:
 
     def point_topic(self, name: str | None = None) -> str:
         """The topic named, or the only one of points, else of packets. Raises ValueError that lists those there are."""
-        clouds = [topic.name for topic in self.topics if topic.kind == POINTS]
+        clouds = list(dict.fromkeys(topic.name for topic in self.topics if topic.kind == POINTS))
         packets = [topic.name for topic in self.topics if self._of_lidar(topic)]
         clouds = [*clouds, *packets] if name in packets or not clouds else clouds
         listed = ", ".join(clouds) or "none; it holds " + (
@@ -202,11 +214,12 @@ class Bag:
 
     def scan_topics(self) -> list[str]:
         """Topics that hold scans: points, or packets of a LiDAR."""
-        return [one.name for one in self.topics if one.kind == POINTS or self._of_lidar(one)]
+        found = [one.name for one in self.topics if one.kind == POINTS or self._of_lidar(one)]
+        return list(dict.fromkeys(found))
 
     def _of_lidar(self, topic: Topic) -> bool:
         """Whether a topic is of a LiDAR's packets: those of an Ouster's inertial sensor are small."""
-        first = self._first(topic.name) if topic.kind in OUSTER else None
+        first = self._first(topic) if topic.kind in OUSTER else None
         return topic.kind == PACKETS or (first is not None and len(first.data) > LARGE)
 
 

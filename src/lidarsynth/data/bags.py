@@ -71,7 +71,7 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
 
         # rosbags counts to the nanosecond after the last message
         duration = max(reader.duration - 1, 0) / 1e9 if reader.message_count else 0.0
-        yield Bag(path, _by_name(topics.values()), duration, messages, cut)
+        yield Bag(path, _together(topics.values()), duration, messages, cut)
 
 
 def _ros2(path: Path) -> tuple[Any, tuple[str, ...]]:
@@ -116,14 +116,18 @@ def _ros1(path: Path) -> tuple[Any, tuple[str, ...]]:
         return reader, (mended.words(),)
 
 
-def _by_name(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """One of each name, with the messages of all: a topic has a connection for each node that published it, and so
-    one more where a driver was started anew."""
-    found: dict[str, Topic] = {}
+def _together(topics: Iterable[Topic]) -> tuple[Topic, ...]:
+    """One of each name and type, with the messages of all: a topic has a connection for each node that published it,
+    and so one more where a driver was started anew."""
+    found: dict[tuple[str, str, str], Topic] = {}
     for topic in topics:
-        before = found.get(topic.name)
-        found[topic.name] = topic if before is None else replace(before, count=before.count + topic.count)
+        before = found.get(_key(topic))
+        found[_key(topic)] = topic if before is None else replace(before, count=before.count + topic.count)
     return tuple(found.values())
+
+
+def _key(topic: Topic) -> tuple[str, str, str]:
+    return topic.name, topic.kind, topic.encoding
 
 
 def _files_of(reader: Any) -> list[Any]:
@@ -170,7 +174,7 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
             raise FileError(mended[files[0]].words())
         streams = [stack.enter_context(mended.get(file, file).open("rb")) for file in files]
         parts = sorted(map(_mcap_part, streams), key=lambda part: part.first)
-        topics = {topic.name: topic for topic in _by_name(topic for part in parts for topic in part.topics)}
+        topics = {_key(topic): topic for topic in _together(one for part in parts for one in part.topics.values())}
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             for together in _overlapping(parts):
@@ -184,11 +188,11 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
 
 class _Part(NamedTuple):
-    """An open MCAP file: its topics, the times of its first and last message (nanoseconds), 0 where it has none, and
-    whether it is read by its index."""
+    """An open MCAP file: its topics by channel, the times of its first and last message (nanoseconds), 0 where it has
+    none, and whether it is read by its index."""
 
     stream: IO[bytes]
-    topics: tuple[Topic, ...]
+    topics: dict[int, Topic]
     first: int
     last: int
     indexed: bool
@@ -214,17 +218,17 @@ def _mcap_part(stream: IO[bytes]) -> _Part:
     s = None if summary is None else summary.statistics
     if summary is not None and s is not None and _tells_of(summary, s.channel_message_counts):
         counts = s.channel_message_counts
-        topics = [
-            _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
+        topics = {
+            number: _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
             for number, channel in summary.channels.items()
-        ]
-        return _Part(stream, tuple(topics), s.message_start_time, s.message_end_time, True)
+        }
+        return _Part(stream, topics, s.message_start_time, s.message_end_time, True)
     seen: dict[int, list[Any]] = {}
     times = [0, 0]
     for schema, channel, message in _mcap_reader(stream, summary is None).iter_messages(log_time_order=False):
         times = [min(times[0] or message.log_time, message.log_time), max(times[1], message.log_time)]
         seen.setdefault(channel.id, [channel, schema, 0])[2] += 1
-    topics = tuple(_mcap_topic(*found) for found in seen.values())
+    topics = {number: _mcap_topic(*found) for number, found in seen.items()}
     return _Part(stream, topics, times[0], times[1], summary is None or _tells_of(summary, seen))
 
 
@@ -250,10 +254,12 @@ def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
     return Topic(channel.topic, kind, channel.message_encoding, text, count, offered=tuple(channel.metadata.items()))
 
 
-def _mcap_messages(part: _Part, names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
+def _mcap_messages(
+    part: _Part, names: frozenset[str], topics: dict[tuple[str, str, str], Topic], start: int
+) -> Iterator[Message]:
     reader = _mcap_reader(part.stream, part.indexed)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
-        topic = topics[channel.topic]
+        topic = topics[_key(part.topics[channel.id])]
         told = message.publish_time, message.sequence
         yield Message(topic, message.log_time, opened(topic, message.data), *told)
 

@@ -136,10 +136,12 @@ def _stands(height: float, nose: float, left: float) -> str:
 
 def _bag(path: Path, reading: Reading) -> Lines:
     with open_bag(path) as bag:
-        lines = {"kind": f"bag of {bag.seconds:.1f} s, {plural(len(bag.topics), 'topic')}"}
+        names = {topic.name for topic in bag.topics}
+        lines = {"kind": f"bag of {bag.seconds:.1f} s, {plural(len(names), 'topic')}"}
         for topic in bag.topics:
             rate = f", {(topic.count - 1) / bag.seconds:.1f} a second" if bag.seconds > 0 and topic.count > 1 else ""
-            lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
+            told = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
+            lines[topic.name] = f"{lines[topic.name]}; {told}" if topic.name in lines else told
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
         clouds = bag.scan_topics()
