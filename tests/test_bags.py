@@ -397,6 +397,19 @@ def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, endin
     assert not is_bag(path) and len(list(inputs_of([path], Reading()).stream())) == 3
 
 
+@pytest.mark.parametrize(
+    "told", ["", "name: a set of scans\n"], ids=["of a recording that was killed", "of a data set"]
+)
+def test_a_folder_is_no_bag_by_another_metadata_file(told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = KINDS["mcap folder"](tmp_path)
+    (folder / "metadata.yaml").write_text(told)
+    assert len(list(inputs_of([folder]).stream())) == 3
+    np.save(folder / "a.npy", np.ones((9, 4), np.float32))
+    assert [item.name for item in inputs_of([folder]).stream()] == ["a"]
+    main(["info", str(folder)])
+    assert "folder of scans" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("kind", [".bag", ".mcap", "SQLITE3", "MCAP", "alone"])
 def test_messages_of_one_stamp_have_no_rate(kind: str, tmp_path: Path):
     if kind.startswith("."):

@@ -22,13 +22,25 @@ from lidarsynth.data.cut_databases import has_log, read_database
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.small_file import check_regular
 
+METADATA, KEY = "metadata.yaml", b"rosbag2_bagfile_information"  # of a folder that is a ROS 2 bag, which it begins with
+LOOKED_AT = 4096  # bytes of it
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `rosbag record` leaves
 
 
 def is_bag(path: str | Path) -> bool:
     """Whether a path is a bag by its name, or a folder, of any name, that holds a ROS 2 bag."""
     path = Path(path)
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.name.lower().endswith(SUFFIXES)
+    return _tells_of_a_bag(path / METADATA) if path.is_dir() else path.name.lower().endswith(SUFFIXES)
+
+
+def _tells_of_a_bag(path: Path) -> bool:
+    """Whether a file is the metadata of a ROS 2 bag: data sets have others of that name, and a killed recording may
+    have none that tells."""
+    if not path.is_file():
+        return False
+    with suppress(OSError), path.open("rb") as file:
+        return KEY in file.read(LOOKED_AT)
+    return False
 
 
 @contextmanager
