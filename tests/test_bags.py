@@ -387,6 +387,34 @@ def test_bags_in_subfolders_are_found_as_scans_are(tmp_path: Path, capsys: pytes
     assert inputs.count == 1 and list(inputs.passed) == bags
 
 
+def test_one_bag_that_cannot_be_read_does_not_end_a_week(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Of no bytes, of none of a bag, without a topic of points, or of two."""
+    week = tmp_path / "week"
+    week.mkdir()
+    clouds_at(week / "a.mcap", [100, 101])
+    (week / "b.bag").write_bytes(b"not a bag at all" * 10)
+    (week / "c.db3").write_bytes(b"")
+    with write_bag(week / "d.mcap") as writer:
+        writer.put(Message(Topic("/note", STRING, "cdr", ("ros2msg", b"string data\n"), 0), 5, b"\0\1\0\0\1\0\0\0\0"))
+    with write_bag(week / "e.mcap") as writer:
+        for topic in ("/front", "/rear"):
+            writer.write_cloud(topic, Cloud(0, "lidar", 5, {axis: np.ones(3, np.float32) for axis in "xyz"}))
+    clouds_at(week / "f.bag", [100])
+    inputs = inputs_of([week])
+    assert [item.name for item in inputs.stream()] == ["a/000000", "a/000001", *"bcde", "f/000000"]
+    assert inputs.count == 7
+    words = ["--model", "bilinear", "--sensor", "vlp-16", "--no-picture", "--out"]
+    main(["complete", str(week), *words, str(tmp_path / "o")])
+    said = capsys.readouterr()
+    assert "3 scans in" in said.out and "4 failed: b, c, d, e" in said.out
+    assert all(name in said.err for name in ("b.bag: expected", "c.db3", "d.mcap: expected", "e.mcap: expected"))
+    for name, words in (("b.bag", "File magic"), ("e.mcap", "or --topic, found /front, /rear")):
+        with pytest.raises(ValueError, match=words):
+            inputs_of([week / name])
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(week / "b.bag"), str(week / "d.mcap"), "--out", str(tmp_path / "p")])
+
+
 @pytest.mark.parametrize("ending", [".mcap", ".db3", ".bag"])
 @pytest.mark.parametrize("kind", ["mcap folder", "sqlite3"])
 def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, ending: str, tmp_path: Path):

@@ -156,7 +156,7 @@ class TurnInput:
 
 @dataclass(frozen=True)
 class BrokenInput:
-    """What is left of a bag or capture from where it is broken."""
+    """What is left of a bag or capture from where it is broken; all of it where nothing tells what is to be read."""
 
     name: str
     path: Path
@@ -208,7 +208,12 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     cut: list[str] = []
     packets = False
     for path in streams:
-        more, of_packets = _stream_count(path, reading, cut)
+        try:
+            more, of_packets = _stream_count(path, reading, cut)
+        except ValueError:
+            if len(expanded) == 1:
+                raise
+            more, of_packets = 1, True  # told in its place, and the others go on
         count, packets = None if more is None or count is None else count + more, packets or of_packets
     if reading.metadata is not None and not packets:
         raise ValueError(
@@ -221,7 +226,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
             try:
                 inputs = _bag_inputs if is_bag(path) else _capture_inputs
                 yield from inputs(path, reading, folders[path])
-            except FileError as error:
+            except ValueError as error:
                 if len(expanded) == 1:
                     raise
                 yield BrokenInput(folders[path], path, str(error))  # the others go on
