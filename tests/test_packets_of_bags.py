@@ -187,7 +187,7 @@ def test_turns_of_an_ouster_go_into_a_bag(suffix: str, tmp_path: Path):
 
 def test_packets_of_an_ouster_without_metadata_ask_for_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = ouster_drive(tmp_path / "in.bag", {"/os1_node": ouster_packets(2)}, described=None)
-    asks = "in.bag: expected --metadata FILE.json of the Ouster, or one in or beside the bag, found none"
+    asks = "in.bag: expected --metadata FILE.json of the Ouster, or one in or beside the bag, or a bag"
     for words in (["complete", str(path), "--out", str(tmp_path / "o")], ["info", str(path)]):
         with pytest.raises(SystemExit, match="2"):
             main(words)
@@ -199,6 +199,20 @@ def test_packets_of_an_ouster_without_metadata_ask_for_it(tmp_path: Path, capsys
     assert len(list(inputs_of([path], Reading(metadata=told)).stream())) == 2
     told.rename(tmp_path / "os.json")
     assert len(list(inputs_of([path]).stream())) == 2, "that beside it"
+
+
+def test_the_parts_of_a_split_recording_take_the_metadata_of_the_first(tmp_path: Path):
+    """ROS 1 repeats no latched message in the parts."""
+    first = ouster_drive(tmp_path / "run_0.bag", {"/ouster": ouster_packets(2)})
+    other = ouster_drive(tmp_path / "run_1.bag", {"/ouster": ouster_packets(3)}, described=None)
+    with pytest.raises(FileError, match="a bag as --metadata that holds it"):
+        list(inputs_of([other]).stream())
+    items = list(inputs_of([tmp_path], Reading(metadata=first)).stream())
+    assert [item.name for item in items] == [f"run_0/{n:06d}" for n in (0, 1)] + [f"run_1/{n:06d}" for n in range(3)]
+    assert len(items[4].read().scan) == BEAMS * COLUMNS
+    assert len(series_of([other], Reading(metadata=first))[2].scan) == BEAMS * COLUMNS
+    with pytest.raises(FileError, match=r"run_1.bag: expected --metadata FILE.json"):
+        list(inputs_of([other], Reading(metadata=other)).stream())
 
 
 def test_metadata_is_of_packets_and_not_of_points(tmp_path: Path):

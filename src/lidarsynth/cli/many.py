@@ -34,7 +34,7 @@ class Many:
         arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
     ] = None
     keep_topics: Annotated[bool, arg(help="copy all other topics, attachments and metadata into the new bag.")] = False
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture, or packets in a bag.")] = None
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture or packets in a bag.")] = None
     transform: Annotated[
         str | None,
         arg(

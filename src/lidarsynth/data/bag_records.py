@@ -28,6 +28,7 @@ OUSTER = (  # a packet each, as ouster_ros publishes them; of its inertial senso
 OF_PACKETS = (PACKETS, *OUSTER)
 STRING = "std_msgs/msg/String"  # as which it publishes the metadata
 LARGE = 1000  # bytes: smaller packets are inertial measurements
+ASKED = "in or beside the bag, or a bag as --metadata that holds it (the first of a split recording)"
 FRAME = "os_sensor"  # the driver's name of the frame that an Ouster's points are in
 PACKED = b"\x28\xb5\x2f\xfd"  # a frame of zstd (RFC 8878); a message in CDR begins with 0
 
@@ -110,11 +111,13 @@ class Bag:
         with naming(self.path):
             yield from self.source(names, start)
 
-    def scans(self, topic: str, metadata: Path | None = None, start: int = 0) -> Iterator[Message | TimedTurn]:
+    def scans(
+        self, topic: str, metadata: ouster.Metadata | None = None, start: int = 0
+    ) -> Iterator[Message | TimedTurn]:
         """The scans of a topic, still in their bytes: messages, from `start` (nanoseconds) on, or, of an Ouster's
         packets, all turns (`whole_turns`).
 
-        metadata  `.json` of the Ouster; None = what the bag tells of it, else the only one beside the bag
+        metadata  of the Ouster; None = as `metadata_of`
         Raises FileError for a broken bag, where nothing tells of an Ouster, and for packets of another.
         """
         return self._turns(topic, metadata) if self.of_ouster(topic) else self._messages(topic, start)
@@ -139,8 +142,8 @@ class Bag:
         kind = self.kind_of(topic) if kind is None else kind
         return (message for message in self.messages(frozenset([topic]), start) if message.topic.kind == kind)
 
-    def _turns(self, topic: str, metadata: Path | None) -> Iterator[TimedTurn]:
-        described = self._metadata(topic) if metadata is None else ouster.read_metadata(metadata)
+    def _turns(self, topic: str, metadata: ouster.Metadata | None) -> Iterator[TimedTurn]:
+        described = metadata or self.metadata_of(topic)
         try:
             size = ouster.packet_size(described)
         except FileError as error:
@@ -165,14 +168,15 @@ class Bag:
                                 f"{one_line(error)}") from None  # fmt: skip
             yield Datagram(message.time, 0, payload[:size] if len(payload) == size + 1 else payload)
 
-    def _metadata(self, topic: str) -> ouster.Metadata:
-        """What tells of the Ouster whose packets a topic holds: the topic of metadata beside it, else the only one."""
+    def metadata_of(self, topic: str) -> ouster.Metadata:
+        """What tells of the Ouster whose packets a topic holds: the topic of metadata beside it, else the only one in
+        the bag, else the only `.json` beside the bag. Raises FileError where none does."""
         strings = [self._first(one) for one in self.topics if one.kind == STRING]
         told = {one.topic.name: one for one in strings if one is not None and ouster.KEY.encode() in one.data}
         beside = f"{topic.rpartition('/')[0]}/metadata"
         own = [beside] if beside in told else sorted(told)
         if not own:
-            return ouster.read_metadata(ouster.metadata_beside(self.path, "in or beside the bag"))
+            return ouster.read_metadata(ouster.metadata_beside(self.path, ASKED))
         if len(own) > 1:
             raise FileError(f"{self.path}: expected --metadata FILE.json of the Ouster of {topic}, found in the bag "
                             f"that of several: {', '.join(own)}")  # fmt: skip
@@ -186,7 +190,7 @@ class Bag:
     def _first(self, topic: Topic) -> Message | None:
         return next(self._messages(topic.name, kind=topic.kind), None)
 
-    def clouds(self, topic: str, metadata: Path | None = None) -> Iterator[Cloud | FileError]:
+    def clouds(self, topic: str, metadata: ouster.Metadata | None = None) -> Iterator[Cloud | FileError]:
         """The point clouds of a topic, as `scans`, one at a time; a broken one comes as its error, and the next
         follow."""
         for scan in self.scans(topic, metadata):

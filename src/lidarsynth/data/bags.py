@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+from lidarsynth.data import ouster
 from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming
 from lidarsynth.data.bag_records import Attached, Bag, Message, Topic, opened
 from lidarsynth.data.cut_bags import Mended, mend
@@ -64,6 +65,18 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         yield bag
     finally:
         opened.close()
+
+
+def metadata_from(path: Path | None, bag: Bag, topic: str) -> ouster.Metadata | None:
+    """The metadata of the Ouster whose packets a topic of a bag holds, in a `.json` file, or in another bag, on the
+    topic beside one of that name: of a recording that ROS 1 has split the first alone may hold it. None for no file,
+    and for a topic of something else. Raises FileError."""
+    if path is None or not bag.of_ouster(topic):
+        return None
+    if not is_bag(path):
+        return ouster.read_metadata(path)
+    with open_bag(path) as other:
+        return other.metadata_of(topic)
 
 
 def _rosbags(path: Path) -> Generator[Bag, None, None]:

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarsynth.data.bag_records import Message, cloud_of
-from lidarsynth.data.bags import is_bag, open_bag
+from lidarsynth.data.bags import is_bag, metadata_from, open_bag
 from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import unread_turns
 from lidarsynth.data.whole_turns import TimedTurn, Unread
@@ -39,8 +39,8 @@ class Reading:
 
     intensity  scale, as in `files.formats.read_with_report`
     topic      of a bag, or ADDRESS:PORT of a sensor in a capture; None = the only one
-    metadata   `.json` of the Ouster of a capture, or of packets in a bag; None = what the bag tells, or the only one
-               beside it
+    metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; None =
+               what the bag tells, or the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
@@ -249,7 +249,7 @@ def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | N
 def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
-        for number, scan in enumerate(bag.scans(topic, reading.metadata)):
+        for number, scan in enumerate(bag.scans(topic, metadata_from(reading.metadata, bag, topic))):
             yield MessageInput(f"{folder}/{number:06d}", path, reading, scan)
 
 

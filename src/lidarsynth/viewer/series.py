@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from lidarsynth.data.bags import is_bag, open_bag
+from lidarsynth.data.bags import is_bag, metadata_from, open_bag
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import moved
 from lidarsynth.data.whole_turns import TimedTurn
@@ -133,7 +133,7 @@ def _bag(path: Path, reading: Reading) -> Stream:
 
     def open_at(mark: int, number: int) -> Iterator[tuple[int, Input]]:
         with open_bag(path) as bag:
-            for scan in bag.scans(topic, reading.metadata, mark):
+            for scan in bag.scans(topic, metadata_from(reading.metadata, bag, topic), mark):
                 name = f"{topic} {scan.time / 1e9:.3f} s"
                 yield 0 if isinstance(scan, TimedTurn) else scan.time, MessageInput(name, path, reading, scan)
 
