@@ -303,6 +303,9 @@ def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):
     said = capsys.readouterr()
     passed = f"1 bag or capture beside scan files was passed over: {tmp_path / 'in' / 'drive.bag'};"
     assert passed in said.err and "1 scan in" in said.out
+    for verb, out in (("view", "v.html"), ("sensor", "s.toml")):
+        main([verb, str(tmp_path / "in"), "--out", str(tmp_path / out)])
+        assert passed in capsys.readouterr().err
     write(tmp_path / "in" / "c.pcd", ringed(scan))
     (tmp_path / "in" / "b.pcd").write_bytes(b"no points")
     main(["sensor", str(tmp_path / "in"), "--out", str(tmp_path / "s.toml"), "--no-picture"])

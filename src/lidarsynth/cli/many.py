@@ -79,17 +79,12 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     rings = parse_rings(many.rings)
     reading = Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings)
     inputs = inputs_of(paths, reading, out)
-    if inputs.passed:
-        named = ", ".join(map(str, inputs.passed[:NAMED])) + (", ..." if inputs.passed[NAMED:] else "")
-        count = len(inputs.passed)
-        what = "bag or capture" if count == 1 else "bags or captures"
-        warn(f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them")
     if inputs.below:
         names = ", ".join(path.name for path in inputs.below[:NAMED]) + (", ..." if inputs.below[NAMED:] else "")
         count = len(inputs.below)
         warn(f"{plural(count, 'scan')} below {out}, where results go, {was(count)} passed over: {names}; name them to "
              "read them")  # fmt: skip
-    for line in inputs.cut:
+    for line in inputs.words:
         warn(line)
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):

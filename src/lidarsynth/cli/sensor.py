@@ -51,7 +51,7 @@ def sensor(
     moved: list[str] = []
     how = Reading(intensity, topic, metadata, read_transform(transform, None, axes), rings=parse_rings(rings))
     inputs = inputs_of(scans, how)
-    for line in inputs.cut:
+    for line in inputs.words:
         warn(line)
     learned = learn(inputs, out.stem, broken, moved)
     if broken:

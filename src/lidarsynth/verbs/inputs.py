@@ -27,10 +27,13 @@ from lidarsynth.files.formats import marks_left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
+from lidarsynth.lidar.plural import was
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.verbs.earlier_results import earlier_results
 from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders, streams_below
+
+NAMED = 5  # bags and captures that are passed over
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,16 @@ class Inputs:
     passed: tuple[Path, ...] = ()
     cut: tuple[str, ...] = ()
     below: tuple[Path, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What is to be said of `passed` and `cut`, a line each."""
+        if not self.passed:
+            return self.cut
+        count, what = len(self.passed), "bags or captures" if self.passed[1:] else "bag or capture"
+        named = ", ".join(map(str, self.passed[:NAMED])) + (", ..." if self.passed[NAMED:] else "")
+        line = f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them"
+        return (line, *self.cut)
 
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path | None = None) -> Inputs:

@@ -51,7 +51,7 @@ def _by_name(scans: Files, partners: Files) -> Files:
     if not all(name in place for name in scans.names):
         return partners
     order = [place[name] for name in scans.names]
-    return Files(scans.names, [partners.paths[i] for i in order], partners.reading)
+    return Files(scans.names, [partners.paths[i] for i in order], partners.reading, partners.cut)
 
 
 def entries(series: Mapping[str, Series], broken: list[str]) -> Iterator[Entry]:

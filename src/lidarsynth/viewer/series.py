@@ -25,7 +25,7 @@ class Series(Protocol):
     """Scans by number: `series[i] -> Shown`, IndexError behind the last; ValueError where that scan is broken.
 
     names  of those known so far; count: how many there are, or None where only reading tells
-    cut    what is to be said, a line each, of bags that end early
+    cut    what is to be said, a line each, of bags that end early, and of bags and captures that are passed over
     """
 
     @property
@@ -40,9 +40,8 @@ class Series(Protocol):
 class Files:
     """Scan files, with what lies beside them."""
 
-    def __init__(self, names: Sequence[str], paths: Sequence[Path], reading: Reading):
-        self.names, self.paths, self.reading = list(names), list(paths), reading
-        self.cut: Sequence[str] = ()
+    def __init__(self, names: Sequence[str], paths: Sequence[Path], reading: Reading, cut: Sequence[str] = ()):
+        self.names, self.paths, self.reading, self.cut = list(names), list(paths), reading, cut
 
     @property
     def count(self) -> int:
@@ -112,7 +111,7 @@ def series_of(paths: Sequence[Path], reading: Reading) -> Series:
         if not isinstance(item, FileInput):  # of a capture, or of one bag of several
             return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count, inputs.cut)
         files.append(item)
-    return Files([item.name for item in files], [item.path for item in files], reading)
+    return Files([item.name for item in files], [item.path for item in files], reading, inputs.words)
 
 
 def _scans_only(path: Path) -> list[Path]:
