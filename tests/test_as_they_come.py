@@ -17,7 +17,9 @@ from lidarsynth.files.fields import scan_from_fields, seconds_from
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.verbs.inputs import Reading, inputs_of
 from lidarsynth.verbs.learned_sensor import sensor_toml
+from lidarsynth.viewer.series import series_of
 
 Capture = pytest.CaptureFixture[str]
 
@@ -274,6 +276,24 @@ def test_padding_of_a_pcd_may_come_twice(tmp_path: Path):
     assert len(read(tmp_path / "a.pcd")) == 100 and not read(tmp_path / "a.pcd").extra
 
 
+@pytest.mark.parametrize("ending", [".pcap", ".pcap2", ".pcapng", ".bag", ".mcap", ".db3", ".ply", ".pcd.bin", ".npz"])
+def test_a_folder_is_a_folder_whatever_its_name_ends_in(ending: str, scan: Scan, tmp_path: Path, capsys: Capture):
+    """Named itself, or found in another, of scans or of bags."""
+    folders = tmp_path / f"scans{ending}", tmp_path / "all" / f"bags{ending}"
+    for folder in folders:
+        folder.mkdir(parents=True)
+    write(folders[0] / "a.pcd", scan)
+    bag(folders[1] / "drive.bag", scan, 1)
+    for path, name in ((folders[0], "a"), (folders[1], "drive/000000"), (tmp_path / "all", "drive/000000")):
+        inputs = inputs_of([path])
+        assert [item.name for item in inputs.stream()] == [name] and not inputs.single and not inputs.passed
+        assert len(series_of([path], Reading())[0].scan) == len(scan)
+        main(["info", str(path)])
+        assert "folder of" in capsys.readouterr().out
+    assert [item.name for item in inputs_of([tmp_path]).stream()] == ["a"]
+    assert inputs_of([tmp_path]).passed == (folders[1] / "drive.bag",)
+
+
 def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):
     (tmp_path / "in").mkdir()
     write(tmp_path / "in" / "a.pcd", scan)
@@ -281,7 +301,11 @@ def test_what_is_not_read_is_told(scan: Scan, tmp_path: Path, capsys: Capture):
     words = [str(tmp_path / "in"), "--sensor", "hdl-32e", "--no-picture", "--out", str(tmp_path / "o")]
     main(["project", *words])
     said = capsys.readouterr()
-    assert "1 bag or capture beside scan files was passed over: drive.bag" in said.err and "1 scan in" in said.out
+    passed = f"1 bag or capture beside scan files was passed over: {tmp_path / 'in' / 'drive.bag'};"
+    assert passed in said.err and "1 scan in" in said.out
+    for verb, out in (("view", "v.html"), ("sensor", "s.toml")):
+        main([verb, str(tmp_path / "in"), "--out", str(tmp_path / out)])
+        assert passed in capsys.readouterr().err
     write(tmp_path / "in" / "c.pcd", ringed(scan))
     (tmp_path / "in" / "b.pcd").write_bytes(b"no points")
     main(["sensor", str(tmp_path / "in"), "--out", str(tmp_path / "s.toml"), "--no-picture"])

@@ -12,6 +12,8 @@ from lidarsynth.data.bag_records import POINTS, Cloud, Message, Topic, typestore
 from lidarsynth.data.bag_writer import message_of, points_topic, write_bag
 from lidarsynth.data.bags import open_bag
 from lidarsynth.files.fields import FileError
+from lidarsynth.verbs.file_kinds import file_lines
+from lidarsynth.verbs.inputs import Reading
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
 pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
@@ -157,6 +159,46 @@ def test_a_bit_that_a_disk_lost_is_no_point(tmp_path: Path):
     (tmp_path / "bad.mcap").write_bytes(bad)
     with open_bag(tmp_path / "bad.mcap") as bag, pytest.raises(FileError, match=r"bad.mcap: expected a bag .*crc"):
         list(bag.clouds("/points"))
+
+
+@pytest.mark.parametrize("notes_first", [True, False])
+@pytest.mark.parametrize("by", ["library", ".mcap", ".mcap without its end", ".bag"])
+def test_a_topic_of_two_types_is_read_and_copied_by_them(by: str, notes_first: bool, tmp_path: Path):
+    """The notes were taken for broken clouds, or the clouds not found, and the types of copies exchanged."""
+    from mcap.writer import Writer
+
+    path, out = tmp_path / f"in{by[:5] if by[0] == '.' else '.mcap'}", tmp_path / "out.mcap"
+    encoding = "ros1" if by == ".bag" else "cdr"
+    digest, kind = (SUM, "ros1msg") if by == ".bag" else ("", "ros2msg")
+    note = Topic("/points", STRING, encoding, (kind, b"string data\n"), 0, digest), NOTE[:4] + b"hi"
+    around = np.radians(np.arange(0, 360, 0.5, dtype=np.float32))
+    scan = {"x": 9 * np.cos(around), "y": 9 * np.sin(around), "z": 0 * around, "intensity": 0 * around}
+    cloud = points_topic("/points", encoding), message_of(Cloud(0, "lidar", 0, scan), encoding)
+    pairs = [note, cloud] if notes_first else [cloud, note]
+    if by == "library":
+        with open(path, "wb") as file:
+            writer = Writer(file)
+            writer.start("ros2")
+            channels = [writer.register_channel("/points", "cdr", writer.register_schema(topic.kind, *topic.schema))
+                        for topic, _ in pairs]  # fmt: skip
+            for number in range(6):
+                writer.add_message(channels[number % 2], number + 1, pairs[number % 2][1], number + 1)
+            writer.finish()
+    else:
+        with write_bag(path) as bag:
+            for number in range(6):
+                bag.put(Message(pairs[number % 2][0], number + 1, pairs[number % 2][1]))
+    if by == ".mcap without its end":
+        path.write_bytes(path.read_bytes()[:-9])
+    words = ["--keep-topics", "--model", "bilinear", "--sensor", "vlp-16"]
+    main(["complete", str(path), "--out", str(out), *words])
+    for file, types in ((path, {STRING: 3, POINTS: 3}), (out, {STRING: 3, POINTS: 3})):
+        with open_bag(file) as found:
+            assert {topic.kind: topic.count for topic in found.topics} == types and found.point_topic() == "/points"
+            assert all(isinstance(one, Cloud) for one in found.clouds("/points"))
+            assert [m.data for m in found.messages() if m.topic.kind == STRING] == [note[1]] * 3
+        lines = file_lines(file, Reading())
+        assert lines is not None and all(f"{kind}, 3 messages" in lines["/points"] for kind in types)
 
 
 def numbered(path: Path) -> Path:

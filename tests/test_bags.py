@@ -365,6 +365,56 @@ def test_parts_without_metadata_are_read_by_their_numbers(tmp_path: Path):
         assert [item.name for item in inputs_of(paths).stream()] == [f"drive_{n}/000000" for n in (1, 2, 10)]
 
 
+def test_bags_in_subfolders_are_found_as_scans_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A week of drives, a folder for each day, one with a bag of ROS 2, which is a folder that holds others."""
+    days = [tmp_path / "week" / f"day_{day}" for day in (2, 10, 11)]
+    for day, kind in zip(days, ("ros1", "mcap folder", "sqlite3"), strict=True):
+        day.mkdir(parents=True)
+        KINDS[kind](day)
+    clouds_at(days[1] / "drive.mcap", [100])
+    bags = [days[0] / "drive.bag", days[1] / "MCAP", days[1] / "drive.mcap", days[2] / "SQLITE3"]
+    names = ["day_2/drive"] * 3 + ["day_10/MCAP"] * 3 + ["day_10/drive"] + ["day_11/SQLITE3"] * 3
+    for path in (tmp_path / "week", tmp_path / "week" / "**"):
+        inputs = inputs_of([path])
+        assert [item.path for item in inputs.stream()] == [*bags[:1] * 3, *bags[1:2] * 3, bags[2], *bags[3:] * 3]
+        assert [item.name.rpartition("/")[0] for item in inputs.stream()] == names and inputs.count == 10
+    main(["info", str(tmp_path / "week")])
+    listed = ", ".join(str(path.relative_to(tmp_path / "week")) for path in bags)
+    assert (said := capsys.readouterr().out).count(listed) == 1 and "folder of 4 bags and captures" in said
+    assert len(series_of([tmp_path / "week"], Reading())[9].scan) == len(full_scan())
+    np.save(days[0] / "a.npy", np.ones((9, 4), np.float32))
+    inputs = inputs_of([tmp_path / "week"])
+    assert inputs.count == 1 and list(inputs.passed) == bags
+
+
+def test_one_bag_that_cannot_be_read_does_not_end_a_week(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Of no bytes, of none of a bag, without a topic of points, or of two."""
+    week = tmp_path / "week"
+    week.mkdir()
+    clouds_at(week / "a.mcap", [100, 101])
+    (week / "b.bag").write_bytes(b"not a bag at all" * 10)
+    (week / "c.db3").write_bytes(b"")
+    with write_bag(week / "d.mcap") as writer:
+        writer.put(Message(Topic("/note", STRING, "cdr", ("ros2msg", b"string data\n"), 0), 5, b"\0\1\0\0\1\0\0\0\0"))
+    with write_bag(week / "e.mcap") as writer:
+        for topic in ("/front", "/rear"):
+            writer.write_cloud(topic, Cloud(0, "lidar", 5, {axis: np.ones(3, np.float32) for axis in "xyz"}))
+    clouds_at(week / "f.bag", [100])
+    inputs = inputs_of([week])
+    assert [item.name for item in inputs.stream()] == ["a/000000", "a/000001", *"bcde", "f/000000"]
+    assert inputs.count == 7
+    words = ["--model", "bilinear", "--sensor", "vlp-16", "--no-picture", "--out"]
+    main(["complete", str(week), *words, str(tmp_path / "o")])
+    said = capsys.readouterr()
+    assert "3 scans in" in said.out and "4 failed: b, c, d, e" in said.out
+    assert all(name in said.err for name in ("b.bag: expected", "c.db3", "d.mcap: expected", "e.mcap: expected"))
+    for name, words in (("b.bag", "File magic"), ("e.mcap", "or --topic, found /front, /rear")):
+        with pytest.raises(ValueError, match=words):
+            inputs_of([week / name])
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(week / "b.bag"), str(week / "d.mcap"), "--out", str(tmp_path / "p")])
+
+
 @pytest.mark.parametrize("ending", [".mcap", ".db3", ".bag"])
 @pytest.mark.parametrize("kind", ["mcap folder", "sqlite3"])
 def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, ending: str, tmp_path: Path):
@@ -373,6 +423,19 @@ def test_a_folder_is_a_bag_by_what_it_holds_and_not_by_its_name(kind: str, endin
     assert [item.name for item in inputs_of([path], Reading()).stream()] == [f"drive/{n:06d}" for n in range(3)]
     (path / "metadata.yaml").unlink()  # as of a recording that was killed
     assert not is_bag(path) and len(list(inputs_of([path], Reading()).stream())) == 3
+
+
+@pytest.mark.parametrize(
+    "told", ["", "name: a set of scans\n"], ids=["of a recording that was killed", "of a data set"]
+)
+def test_a_folder_is_no_bag_by_another_metadata_file(told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = KINDS["mcap folder"](tmp_path)
+    (folder / "metadata.yaml").write_text(told)
+    assert len(list(inputs_of([folder]).stream())) == 3
+    np.save(folder / "a.npy", np.ones((9, 4), np.float32))
+    assert [item.name for item in inputs_of([folder]).stream()] == ["a"]
+    main(["info", str(folder)])
+    assert "folder of scans" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", [".bag", ".mcap", "SQLITE3", "MCAP", "alone"])

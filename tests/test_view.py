@@ -489,7 +489,7 @@ def test_a_topic_is_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         with pytest.raises(SystemExit, match="2"):
             main([verb, str(tmp_path / "a.pcd"), "--metadata", str(tmp_path / "o.json"), *more])
         said = capsys.readouterr().err
-        assert "o.json" in said and (verb == "sensor" or "expected a capture for --metadata" in said)
+        assert "o.json" in said and (verb == "sensor" or "a bag of an Ouster's packets, for --metadata" in said)
     for one, other in (("a.pcd", "a.mcap"), ("a.mcap", "a.pcd")):
         series = compared([tmp_path / one], tmp_path / other, Reading(topic="/points"))
         assert [scans[0].scan.xyz.shape[1] for scans in series.values()] == [3, 3]

@@ -34,7 +34,7 @@ class Many:
         arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
     ] = None
     keep_topics: Annotated[bool, arg(help="copy all other topics, attachments and metadata into the new bag.")] = False
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture.")] = None
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture or packets in a bag.")] = None
     transform: Annotated[
         str | None,
         arg(
@@ -69,7 +69,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     """Do the job with every scan, say what came of it, and return the results, after those of scans that were there
     already, as far as reports tell them. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
-    from lidarsynth.verbs.inputs import Reading, inputs_of, is_stream
+    from lidarsynth.verbs.expansion import is_stream
+    from lidarsynth.verbs.inputs import Reading, inputs_of
     from lidarsynth.verbs.placement import parse_rings, read_transform
 
     if many.workers < 0:
@@ -78,17 +79,12 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     rings = parse_rings(many.rings)
     reading = Reading(intensity, many.topic, many.metadata, transform, job.verb == "realise", rings)
     inputs = inputs_of(paths, reading, out)
-    if inputs.passed:
-        named = ", ".join(path.name for path in inputs.passed[:NAMED])
-        count = len(inputs.passed)
-        what = "bag or capture" if count == 1 else "bags or captures"
-        warn(f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them")
     if inputs.below:
         names = ", ".join(path.name for path in inputs.below[:NAMED]) + (", ..." if inputs.below[NAMED:] else "")
         count = len(inputs.below)
         warn(f"{plural(count, 'scan')} below {out}, where results go, {was(count)} passed over: {names}; name them to "
              "read them")  # fmt: skip
-    for line in inputs.cut:
+    for line in inputs.words:
         warn(line)
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
@@ -332,13 +328,14 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
 
 def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
     """The topic of points, of packets one of its own, and the others that are to be copied."""
-    from lidarsynth.data.bag_records import PACKETS
+    from lidarsynth.data.bag_records import OF_PACKETS
     from lidarsynth.data.bags import open_bag
 
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
-        others = [other for other in bag.topics if other.name != topic or other.kind == PACKETS]
-        named = topic if len(others) < len(bag.topics) else f"{topic}/points"
+        kind = bag.kind_of(topic)
+        others = [one for one in bag.topics if (one.name, one.kind) != (topic, kind) or kind in OF_PACKETS]
+        named = f"{topic}/points" if kind in OF_PACKETS else topic
         return named, others if many.keep_topics else []
 
 
@@ -346,8 +343,10 @@ def _copy(path: Path, writer: BagWriter, topics: list[Topic]) -> None:
     from lidarsynth.data.bags import open_bag
 
     with open_bag(path) as bag:
+        kept = {(topic.name, topic.kind) for topic in topics}
         for message in bag.messages(frozenset(topic.name for topic in topics)) if topics else ():
-            writer.copy(message)
+            if (message.topic.name, message.topic.kind) in kept:  # a topic may be of several types
+                writer.copy(message)
         left = [record.name for record in bag.attached() if not writer.attach(record)]
     if left:
         warn(f"{writer.path}: expected a .mcap for attachments and metadata, found a .bag, which holds none: "

@@ -23,7 +23,7 @@ def sensor(
     topic: Annotated[
         str | None, arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture.")
     ] = None,
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster capture: it tells all beams.")] = None,
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster: it tells all beams.")] = None,
     rings: Rings = None,
     transform: Annotated[
         str | None, arg(metavar="T", help="brings points into the sensor's frame, as of complete; later verbs take it.")
@@ -51,7 +51,7 @@ def sensor(
     moved: list[str] = []
     how = Reading(intensity, topic, metadata, read_transform(transform, None, axes), rings=parse_rings(rings))
     inputs = inputs_of(scans, how)
-    for line in inputs.cut:
+    for line in inputs.words:
         warn(line)
     learned = learn(inputs, out.stem, broken, moved)
     if broken:

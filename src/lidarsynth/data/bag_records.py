@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from lidarsynth.data import ouster
 from lidarsynth.data.bag_errors import BROKEN, library_errors, naming, one_line
 from lidarsynth.data.capture import Datagram
 from lidarsynth.data.velodyne import returns
+from lidarsynth.data.whole_turns import TimedTurn
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.files.point_cloud2 import decode
 
@@ -20,12 +22,20 @@ Attached: TypeAlias = "Attachment | Metadata"
 POINTS = "sensor_msgs/msg/PointCloud2"
 PACKET = "velodyne_msgs/msg/VelodynePacket"
 PACKETS = "velodyne_msgs/msg/VelodyneScan"  # packets of about a turn, as velodyne_driver publishes them
+OUSTER = (  # a packet each, as ouster_ros publishes them; of its inertial sensor, too, on another topic
+    "ouster_ros/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg", "ouster_msgs/msg/PacketMsg"
+)  # fmt: skip
+OF_PACKETS = (PACKETS, *OUSTER)
+STRING = "std_msgs/msg/String"  # as which it publishes the metadata
+LARGE = 1000  # bytes: smaller packets are inertial measurements
+ASKED = "in or beside the bag, or a bag as --metadata that holds it (the first of a split recording)"
+FRAME = "os_sensor"  # the driver's name of the frame that an Ouster's points are in
 PACKED = b"\x28\xb5\x2f\xfd"  # a frame of zstd (RFC 8878); a message in CDR begins with 0
 
 
 @dataclass(frozen=True)
 class Topic:
-    """What one connection of a bag carries.
+    """What one connection of a bag carries: messages of one type; a name may have several.
 
     name      such as /points
     kind      message type in ROS 2's style, such as sensor_msgs/msg/PointCloud2, or the schema's name
@@ -101,18 +111,98 @@ class Bag:
         with naming(self.path):
             yield from self.source(names, start)
 
-    def clouds(self, topic: str) -> Iterator[Cloud | FileError]:
-        """The point clouds of a topic, one at a time; a broken one comes as its error, and the next follow."""
-        for message in self.messages(frozenset([topic])):
+    def scans(
+        self, topic: str, metadata: ouster.Metadata | None = None, start: int = 0
+    ) -> Iterator[Message | TimedTurn]:
+        """The scans of a topic, still in their bytes: messages, from `start` (nanoseconds) on, or, of an Ouster's
+        packets, all turns (`whole_turns`).
+
+        metadata  of the Ouster; None = as `metadata_of`
+        Raises FileError for a broken bag, where nothing tells of an Ouster, and for packets of another.
+        """
+        return self._turns(topic, metadata) if self.of_ouster(topic) else self._messages(topic, start)
+
+    def count_of(self, topic: str) -> int | None:
+        """How many scans a topic holds, or None where only reading tells."""
+        kind = self.kind_of(topic)
+        counts = [one.count for one in self.topics if (one.name, one.kind) == (topic, kind)]
+        return None if kind in OUSTER else sum(counts) or None
+
+    def of_ouster(self, topic: str) -> bool:
+        """Whether a topic is of an Ouster's packets, which make turns only with its metadata."""
+        return self.kind_of(topic) in OUSTER
+
+    def kind_of(self, topic: str) -> str:
+        """The type of a topic's messages; of several that which is read: points, else packets."""
+        kinds = [one.kind for one in self.topics if one.name == topic]
+        return next((kind for kind in (POINTS, *OF_PACKETS, *kinds) if kind in kinds), "")
+
+    def _messages(self, topic: str, start: int = 0, kind: str | None = None) -> Iterator[Message]:
+        """Those of a topic that are of one type; None = that which is read."""
+        kind = self.kind_of(topic) if kind is None else kind
+        return (message for message in self.messages(frozenset([topic]), start) if message.topic.kind == kind)
+
+    def _turns(self, topic: str, metadata: ouster.Metadata | None) -> Iterator[TimedTurn]:
+        described = metadata or self.metadata_of(topic)
+        try:
+            size = ouster.packet_size(described)
+        except FileError as error:
+            raise FileError(f"{self.path}: {error}") from None
+        first, found = next(self._packets(topic, size), None), 0
+        if first is not None and len(first.payload) != size:
+            raise FileError(f"{self.path}: expected packets of {size} bytes on {topic}, as its metadata says, found "
+                            f"one of {len(first.payload)}")  # fmt: skip
+        for turn in ouster.timed_turns(self._packets(topic, size), described):
+            found += 1
+            yield turn
+        if not found:
+            raise FileError(f"{self.path}: expected a turn of the LiDAR on {topic}, found less than half of one")
+
+    def _packets(self, topic: str, size: int) -> Iterator[Datagram]:
+        """The packets of a topic; the driver's older versions put one byte more after those of `size`."""
+        for message in self._messages(topic):
             try:
-                yield cloud_of(message)
+                payload = _deserialized(message, message.topic.kind).buf.tobytes()
+            except (*BROKEN, *library_errors()) as error:
+                raise FileError(f"{self.path}: {topic}: expected a packet, found {len(message.data)} broken bytes: "
+                                f"{one_line(error)}") from None  # fmt: skip
+            yield Datagram(message.time, 0, payload[:size] if len(payload) == size + 1 else payload)
+
+    def metadata_of(self, topic: str) -> ouster.Metadata:
+        """What tells of the Ouster whose packets a topic holds: the topic of metadata beside it, else the only one in
+        the bag, else the only `.json` beside the bag. Raises FileError where none does."""
+        strings = [self._first(one) for one in self.topics if one.kind == STRING]
+        told = {one.topic.name: one for one in strings if one is not None and ouster.KEY.encode() in one.data}
+        beside = f"{topic.rpartition('/')[0]}/metadata"
+        own = [beside] if beside in told else sorted(told)
+        if not own:
+            return ouster.read_metadata(ouster.metadata_beside(self.path, ASKED))
+        if len(own) > 1:
+            raise FileError(f"{self.path}: expected --metadata FILE.json of the Ouster of {topic}, found in the bag "
+                            f"that of several: {', '.join(own)}")  # fmt: skip
+        where = f"{self.path}: {own[0]}"
+        try:
+            text = _deserialized(told[own[0]], STRING).data
+        except (*BROKEN, *library_errors()) as error:
+            raise FileError(f"{where}: expected Ouster metadata, found: {one_line(error)}") from None
+        return ouster.parse_metadata(text, where, self.path.stem)
+
+    def _first(self, topic: Topic) -> Message | None:
+        return next(self._messages(topic.name, kind=topic.kind), None)
+
+    def clouds(self, topic: str, metadata: ouster.Metadata | None = None) -> Iterator[Cloud | FileError]:
+        """The point clouds of a topic, as `scans`, one at a time; a broken one comes as its error, and the next
+        follow."""
+        for scan in self.scans(topic, metadata):
+            try:
+                yield cloud_of(scan)
             except FileError as error:
                 yield FileError(f"{self.path}: {topic}: {error}")
 
     def point_topic(self, name: str | None = None) -> str:
         """The topic named, or the only one of points, else of packets. Raises ValueError that lists those there are."""
-        clouds = [topic.name for topic in self.topics if topic.kind == POINTS]
-        packets = [topic.name for topic in self.topics if topic.kind == PACKETS]
+        clouds = list(dict.fromkeys(topic.name for topic in self.topics if topic.kind == POINTS))
+        packets = [topic.name for topic in self.topics if self._of_lidar(topic)]
         clouds = [*clouds, *packets] if name in packets or not clouds else clouds
         listed = ", ".join(clouds) or "none; it holds " + (
             ", ".join(sorted({t.kind for t in self.topics})) or "nothing"
@@ -125,6 +215,16 @@ class Bag:
         if name not in clouds:
             raise ValueError(f"{self.path}: expected a topic of points named {name}, found {listed}")
         return name
+
+    def scan_topics(self) -> list[str]:
+        """Topics that hold scans: points, or packets of a LiDAR."""
+        found = [one.name for one in self.topics if one.kind == POINTS or self._of_lidar(one)]
+        return list(dict.fromkeys(found))
+
+    def _of_lidar(self, topic: Topic) -> bool:
+        """Whether a topic is of a LiDAR's packets: those of an Ouster's inertial sensor are small."""
+        first = self._first(topic) if topic.kind in OUSTER else None
+        return topic.kind == PACKETS or (first is not None and len(first.data) > LARGE)
 
 
 def opened(topic: Topic, data: bytes) -> bytes:
@@ -140,14 +240,15 @@ def opened(topic: Topic, data: bytes) -> bytes:
         return data
 
 
-def cloud_of(message: Message) -> Cloud:
-    """The point cloud in a message of PointCloud2, or of packets. Raises FileError, without the bag's path, for one
+def cloud_of(message: Message | TimedTurn) -> Cloud:
+    """The point cloud in a message of PointCloud2, or of packets, or in a turn of an Ouster's: its stamp is then when
+    the first packet was recorded, and its time when the last was. Raises FileError, without the bag's path, for one
     that is broken."""
+    if isinstance(message, TimedTurn):
+        return Cloud(message.stamp, FRAME, message.time, message.turn())
     kind = message.topic.kind if message.topic.kind == PACKETS else POINTS
-    store = typestore(message.topic.encoding)
-    read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
     try:
-        points: Any = read(message.data, kind)
+        points = _deserialized(message, kind)
         stamp, frame_id = points.header.stamp, points.header.frame_id
         number = points.header.seq if message.topic.encoding == "ros1" else message.sequence
         times = stamp.sec * 10**9 + stamp.nanosec, frame_id, message.time
@@ -157,6 +258,12 @@ def cloud_of(message: Message) -> Cloud:
         raise
     except (*BROKEN, *library_errors()) as error:
         raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {one_line(error)}") from None
+
+
+def _deserialized(message: Message, kind: str) -> Any:
+    store = typestore(message.topic.encoding)
+    read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
+    return read(message.data, kind)
 
 
 def _datagram(packet: Any) -> Datagram:
@@ -177,4 +284,6 @@ def typestore(encoding: str) -> Any:
         store = _STORES[encoding] = get_typestore(stores[encoding])
         store.register(get_types_from_msg("builtin_interfaces/Time stamp\nuint8[1206] data", PACKET))
         store.register(get_types_from_msg(f"std_msgs/Header header\n{PACKET}[] packets", PACKETS))
+        for kind in OUSTER:
+            store.register(get_types_from_msg("uint8[] buf", kind))
     return _STORES[encoding]

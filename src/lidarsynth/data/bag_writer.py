@@ -138,7 +138,7 @@ def _bag(path: Path) -> Iterator[Put]:
         def put(message: Message | Attached) -> None:
             assert isinstance(message, Message)
             topic = message.topic
-            key = topic.name, topic.offered
+            key = topic.name, topic.kind, topic.encoding, topic.offered
             if key not in connections:
                 text, offered = topic.schema[1].decode(), dict(topic.offered)
                 connections[key] = writer.add_connection(
@@ -180,7 +180,7 @@ def _mcap(profile: str, path: Path) -> Iterator[Put]:
                 whose = message.name, message.media_type, message.data
                 return writer.add_attachment(message.create_time, message.log_time, *whose)
             topic = message.topic
-            key = topic.name, topic.offered
+            key = topic.name, topic.kind, topic.encoding, topic.offered
             if key not in channels:
                 kind = topic.kind.replace("/msg/", "/") if topic.schema[0] == MSG_ROS1 else topic.kind
                 schema = writer.register_schema(kind, *topic.schema) if kind or topic.schema[1] else 0

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+from lidarsynth.data import ouster
 from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming
 from lidarsynth.data.bag_records import Attached, Bag, Message, Topic, opened
 from lidarsynth.data.cut_bags import Mended, mend
@@ -22,13 +23,25 @@ from lidarsynth.data.cut_databases import has_log, read_database
 from lidarsynth.files.fields import FileError
 from lidarsynth.lidar.small_file import check_regular
 
+METADATA, KEY = "metadata.yaml", b"rosbag2_bagfile_information"  # of a folder that is a ROS 2 bag, which it begins with
+LOOKED_AT = 4096  # bytes of it
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `rosbag record` leaves
 
 
 def is_bag(path: str | Path) -> bool:
     """Whether a path is a bag by its name, or a folder, of any name, that holds a ROS 2 bag."""
     path = Path(path)
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.name.lower().endswith(SUFFIXES)
+    return _tells_of_a_bag(path / METADATA) if path.is_dir() else path.name.lower().endswith(SUFFIXES)
+
+
+def _tells_of_a_bag(path: Path) -> bool:
+    """Whether a file is the metadata of a ROS 2 bag: data sets have others of that name, and a killed recording may
+    have none that tells."""
+    if not path.is_file():
+        return False
+    with suppress(OSError), path.open("rb") as file:
+        return KEY in file.read(LOOKED_AT)
+    return False
 
 
 @contextmanager
@@ -54,6 +67,18 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         opened.close()
 
 
+def metadata_from(path: Path | None, bag: Bag, topic: str) -> ouster.Metadata | None:
+    """The metadata of the Ouster whose packets a topic of a bag holds, in a `.json` file, or in another bag, on the
+    topic beside one of that name: of a recording that ROS 1 has split the first alone may hold it. None for no file,
+    and for a topic of something else. Raises FileError."""
+    if path is None or not bag.of_ouster(topic):
+        return None
+    if not is_bag(path):
+        return ouster.read_metadata(path)
+    with open_bag(path) as other:
+        return other.metadata_of(topic)
+
+
 def _rosbags(path: Path) -> Generator[Bag, None, None]:
     """A ROS 1 `.bag`, a ROS 2 folder or a `.db3`, through rosbags."""
     first = not path.is_dir() and path.suffix.lower() != ".db3"
@@ -71,7 +96,7 @@ def _rosbags(path: Path) -> Generator[Bag, None, None]:
 
         # rosbags counts to the nanosecond after the last message
         duration = max(reader.duration - 1, 0) / 1e9 if reader.message_count else 0.0
-        yield Bag(path, _by_name(topics.values()), duration, messages, cut)
+        yield Bag(path, _together(topics.values()), duration, messages, cut)
 
 
 def _ros2(path: Path) -> tuple[Any, tuple[str, ...]]:
@@ -116,14 +141,18 @@ def _ros1(path: Path) -> tuple[Any, tuple[str, ...]]:
         return reader, (mended.words(),)
 
 
-def _by_name(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """One of each name, with the messages of all: a topic has a connection for each node that published it, and so
-    one more where a driver was started anew."""
-    found: dict[str, Topic] = {}
+def _together(topics: Iterable[Topic]) -> tuple[Topic, ...]:
+    """One of each name and type, with the messages of all: a topic has a connection for each node that published it,
+    and so one more where a driver was started anew."""
+    found: dict[tuple[str, str, str], Topic] = {}
     for topic in topics:
-        before = found.get(topic.name)
-        found[topic.name] = topic if before is None else replace(before, count=before.count + topic.count)
+        before = found.get(_key(topic))
+        found[_key(topic)] = topic if before is None else replace(before, count=before.count + topic.count)
     return tuple(found.values())
+
+
+def _key(topic: Topic) -> tuple[str, str, str]:
+    return topic.name, topic.kind, topic.encoding
 
 
 def _files_of(reader: Any) -> list[Any]:
@@ -170,7 +199,7 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
             raise FileError(mended[files[0]].words())
         streams = [stack.enter_context(mended.get(file, file).open("rb")) for file in files]
         parts = sorted(map(_mcap_part, streams), key=lambda part: part.first)
-        topics = {topic.name: topic for topic in _by_name(topic for part in parts for topic in part.topics)}
+        topics = {_key(topic): topic for topic in _together(one for part in parts for one in part.topics.values())}
 
         def messages(names: frozenset[str], start: int) -> Iterator[Message]:
             for together in _overlapping(parts):
@@ -184,11 +213,11 @@ def _mcap(path: Path, files: list[Path]) -> Generator[Bag, None, None]:
 
 
 class _Part(NamedTuple):
-    """An open MCAP file: its topics, the times of its first and last message (nanoseconds), 0 where it has none, and
-    whether it is read by its index."""
+    """An open MCAP file: its topics by channel, the times of its first and last message (nanoseconds), 0 where it has
+    none, and whether it is read by its index."""
 
     stream: IO[bytes]
-    topics: tuple[Topic, ...]
+    topics: dict[int, Topic]
     first: int
     last: int
     indexed: bool
@@ -214,17 +243,17 @@ def _mcap_part(stream: IO[bytes]) -> _Part:
     s = None if summary is None else summary.statistics
     if summary is not None and s is not None and _tells_of(summary, s.channel_message_counts):
         counts = s.channel_message_counts
-        topics = [
-            _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
+        topics = {
+            number: _mcap_topic(channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
             for number, channel in summary.channels.items()
-        ]
-        return _Part(stream, tuple(topics), s.message_start_time, s.message_end_time, True)
+        }
+        return _Part(stream, topics, s.message_start_time, s.message_end_time, True)
     seen: dict[int, list[Any]] = {}
     times = [0, 0]
     for schema, channel, message in _mcap_reader(stream, summary is None).iter_messages(log_time_order=False):
         times = [min(times[0] or message.log_time, message.log_time), max(times[1], message.log_time)]
         seen.setdefault(channel.id, [channel, schema, 0])[2] += 1
-    topics = tuple(_mcap_topic(*found) for found in seen.values())
+    topics = {number: _mcap_topic(*found) for number, found in seen.items()}
     return _Part(stream, topics, times[0], times[1], summary is None or _tells_of(summary, seen))
 
 
@@ -250,10 +279,12 @@ def _mcap_topic(channel: Any, schema: Any, count: int) -> Topic:
     return Topic(channel.topic, kind, channel.message_encoding, text, count, offered=tuple(channel.metadata.items()))
 
 
-def _mcap_messages(part: _Part, names: frozenset[str], topics: dict[str, Topic], start: int) -> Iterator[Message]:
+def _mcap_messages(
+    part: _Part, names: frozenset[str], topics: dict[tuple[str, str, str], Topic], start: int
+) -> Iterator[Message]:
     reader = _mcap_reader(part.stream, part.indexed)
     for _, channel, message in reader.iter_messages(topics=sorted(names) or None, starting_at=start or None):
-        topic = topics[channel.topic]
+        topic = topics[_key(part.topics[channel.id])]
         told = message.publish_time, message.sequence
         yield Message(topic, message.log_time, opened(topic, message.data), *told)
 

@@ -42,8 +42,9 @@ class Datagram(NamedTuple):
 
 
 def is_capture(path: str | Path) -> bool:
-    """Whether a path is a capture by its name: also drive.pcap1, drive.pcap2, ..., as `tcpdump -C` goes on."""
-    return ENDING.search(Path(path).name) is not None
+    """Whether a path is a capture by its name: also drive.pcap1, drive.pcap2, ..., as `tcpdump -C` goes on. A folder is
+    none."""
+    return ENDING.search(Path(path).name) is not None and not Path(path).is_dir()
 
 
 def datagrams(path: str | Path) -> Iterator[Datagram]:

@@ -6,6 +6,7 @@ point by point (tests/test_captures.py). That library is not asked for: it pins 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -15,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.whole_turns import Unread, whole_turns
+from lidarsynth.data.whole_turns import TimedTurn, Unread, until_broken, whole_turns
 from lidarsynth.files.fields import Fields, FileError
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.lidar.small_file import read_json, read_text
+from lidarsynth.lidar.small_file import read_text
 
 MODES = {"512x10": 512, "512x20": 512, "1024x10": 1024, "1024x20": 1024, "2048x10": 2048, "4096x5": 4096}
+KEY = '"beam_altitude_angles"'  # of all metadata
 LATE = 8  # packets into a turn, at most, after which one of the turn before may come
 ORIGIN = 12.163  # mm from the lidar's axis to a beam's origin where the metadata does not say: a first-generation OS1
 LIFT = 36.18  # mm from the sensor's base to the lidar's centre, the same
@@ -83,18 +85,29 @@ def read_metadata(path: str | Path) -> Metadata:
     """The metadata `.json` of an Ouster sensor, of any firmware. Raises FileError for a file that is none."""
     path = Path(path)
     try:
-        flat = flatten(read_json(path))
+        text = read_text(path)
     except OSError as error:
         raise FileError(f"{path}: expected a readable file, found: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise FileError(f"{error}; it should be metadata of an Ouster sensor") from None
+    return parse_metadata(text, str(path), path.stem)
+
+
+def parse_metadata(text: str, where: str, name: str) -> Metadata:
+    """The metadata of a sensor that is called `name`, in the text of such a file, found at `where`. Raises FileError
+    that names it."""
+    try:
+        flat = flatten(json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{where}: expected JSON, found {error!s:.120}; it should be metadata of an Ouster "
+                        "sensor") from None  # fmt: skip
     if not {"beam_altitude_angles", "beam_azimuth_angles"} <= flat.keys():
-        raise FileError(f"{path}: expected Ouster metadata with beam_altitude_angles and beam_azimuth_angles, found "
+        raise FileError(f"{where}: expected Ouster metadata with beam_altitude_angles and beam_azimuth_angles, found "
                         f"{', '.join(list(flat)[:6]) or 'nothing'}")  # fmt: skip
     try:
-        return _metadata(flat, path.stem)
+        return _metadata(flat, name)
     except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise FileError(f"{path}: expected Ouster metadata, found: {error}") from None
+        raise FileError(f"{where}: expected Ouster metadata, found: {error}") from None
 
 
 def flatten(values: Any) -> dict[str, Any]:
@@ -124,9 +137,21 @@ def is_metadata(path: str | Path) -> bool:
     """Whether a `.json` file is Ouster metadata: it has the beams' altitudes."""
     path = Path(path)
     try:
-        return path.suffix.lower() == ".json" and '"beam_altitude_angles"' in read_text(path)
+        return path.suffix.lower() == ".json" and KEY in read_text(path)
     except (OSError, ValueError):
         return False
+
+
+def metadata_beside(path: Path, where: str) -> Path:
+    """The only metadata file in the folder of a recording, or in that which the recording is. Raises FileError that
+    asks for it, or for one at `where`."""
+    folders = [path.parent, path] if path.is_dir() else [path.parent]
+    found = [p for folder in folders for p in sorted(folder.glob("*.json")) if is_metadata(p)]
+    named = [p for p in found if p.stem.startswith(path.stem) or path.stem.startswith(p.stem)]
+    if len(named or found) == 1:
+        return (named or found)[0]
+    listed = ", ".join(p.name for p in found) or "none"
+    raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one {where}, found {listed}")
 
 
 def sensor_of(metadata: Metadata, name: str | None = None) -> Sensor:
@@ -160,34 +185,42 @@ def turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Fields]:
 
 def unread_turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[Unread]:
     """The same, each decoded when it is called."""
-    return whole_turns(_parts(packets, metadata))
+    return (one.turn for one in timed_turns(packets, metadata))
 
 
-def _parts(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[tuple[float, Unread]]:
+def timed_turns(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[TimedTurn]:
+    """The same, with the times of their packets."""
+    fault: list[FileError] = []
+    return whole_turns(_parts(until_broken(packets, fault), metadata), fault)
+
+
+def _parts(packets: Iterable[Datagram], metadata: Metadata) -> Iterator[tuple[float, TimedTurn]]:
     """Share of a turn and the turn of each. A packet that comes after the first of the next turn is of its own."""
     size, profile = packet_size(metadata), PROFILES[metadata.profile]
-    before: list[bytes] = []
-    payloads: list[bytes] = []
+    before: list[Datagram] = []
+    own: list[Datagram] = []
     ended, number = None, None
     for packet in packets:
         if len(packet.payload) != size:
             continue
         frame = _frame_number(packet.payload, profile)
-        if frame == ended and len(payloads) <= LATE:
-            before.append(packet.payload)
+        if frame == ended and len(own) <= LATE:
+            before.append(packet)
             continue
         if frame != number:
             yield from _turn(before, metadata)
-            before, payloads, ended, number = payloads, [], number, frame
-        payloads.append(packet.payload)
+            before, own, ended, number = own, [], number, frame
+        own.append(packet)
     yield from _turn(before, metadata)
-    yield from _turn(payloads, metadata)
+    yield from _turn(own, metadata)
 
 
-def _turn(payloads: list[bytes], metadata: Metadata) -> Iterator[tuple[float, Unread]]:
+def _turn(packets: list[Datagram], metadata: Metadata) -> Iterator[tuple[float, TimedTurn]]:
     """Share and turn, or nothing where no column was measured."""
+    payloads = [packet.payload for packet in packets]
     if columns := sum(len(_columns(payload, metadata)) for payload in payloads):
-        yield columns / metadata.columns, partial(_decoded, metadata, payloads)
+        turn = partial(_decoded, metadata, payloads)
+        yield columns / metadata.columns, TimedTurn(packets[0].time, packets[-1].time, turn)
 
 
 def _columns(payload: bytes, metadata: Metadata) -> list[tuple[int, bytes]]:

@@ -79,7 +79,7 @@ def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, 
         raise FileError(f"{path}: expected packets of a LiDAR, found none")
     if any(velodyne.is_velodyne(packet.payload) for packet in large):
         return lambda packet: velodyne.is_velodyne(packet.payload), velodyne.unread_turns
-    described = ouster.read_metadata(metadata or _metadata_beside(path))
+    described = ouster.read_metadata(metadata or ouster.metadata_beside(path, "beside the capture"))
     size = ouster.packet_size(described)
     return lambda packet: len(packet.payload) == size, lambda packets: ouster.unread_turns(packets, described)
 
@@ -92,13 +92,3 @@ def _listed(path: Path, belongs: Test) -> list[str]:
         raise FileError(f"{path}: expected packets of a Velodyne or of the Ouster that the metadata describes, found "
                         f"none; the first large packet has {first} bytes")  # fmt: skip
     return sorted(found)
-
-
-def _metadata_beside(path: Path) -> Path:
-    """The only Ouster metadata file in a capture's folder. Raises FileError that asks for it."""
-    found = sorted(p for p in path.parent.glob("*.json") if ouster.is_metadata(p))
-    named = [p for p in found if p.stem.startswith(path.stem) or path.stem.startswith(p.stem)]
-    if len(named or found) == 1:
-        return (named or found)[0]
-    listed = ", ".join(p.name for p in found) or "none"
-    raise FileError(f"{path}: expected --metadata FILE.json of the Ouster, or one beside the capture, found {listed}")

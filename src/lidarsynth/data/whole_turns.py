@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from lidarsynth.files.fields import Fields, FileError
 
 T = TypeVar("T")
 Unread = Callable[[], Fields]  # a turn that is still in its packets, as it goes to another process, or is passed over
+
 WHOLE, HALF = 0.9, 0.5  # of the turns beside it
+
+
+class TimedTurn(NamedTuple):
+    """A turn, and when the first and the last of its packets came, nanoseconds."""
+
+    stamp: int
+    time: int
+    turn: Unread
 
 
 def whole_turns(parts: Iterable[tuple[float, T]], fault: list[FileError] | None = None) -> Iterator[T]:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsynth.data.bag_records import PACKETS, POINTS, Bag, Cloud
+from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import by_number, scan_files
+from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import moved
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
@@ -26,7 +26,8 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict, get_sensor
-from lidarsynth.verbs.inputs import Reading, has_scans, is_stream
+from lidarsynth.verbs.expansion import has_scans, streams_below
+from lidarsynth.verbs.inputs import Reading
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 from lidarsynth.verbs.viewpoint import viewpoint_note
@@ -56,7 +57,7 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
             return _bag(path, reading)
         if not (path / INDEX).exists():
             return _folder(path, reading)
-    if path.name.lower().endswith(tuple(READERS)):
+    if path.name.lower().endswith(tuple(READERS)) and not path.is_dir():
         placed = {} if reading.moves or (note := viewpoint_note(path)) is None else {"viewpoint": note}
         return _image(path) | _scan_file(path, reading) | placed
     if is_bag(path):
@@ -135,13 +136,15 @@ def _stands(height: float, nose: float, left: float) -> str:
 
 def _bag(path: Path, reading: Reading) -> Lines:
     with open_bag(path) as bag:
-        lines = {"kind": f"bag of {bag.seconds:.1f} s, {plural(len(bag.topics), 'topic')}"}
+        names = {topic.name for topic in bag.topics}
+        lines = {"kind": f"bag of {bag.seconds:.1f} s, {plural(len(names), 'topic')}"}
         for topic in bag.topics:
             rate = f", {(topic.count - 1) / bag.seconds:.1f} a second" if bag.seconds > 0 and topic.count > 1 else ""
-            lines[topic.name] = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
+            told = f"{topic.kind}, {plural(topic.count, 'message')}{rate} ({topic.encoding})"
+            lines[topic.name] = f"{lines[topic.name]}; {told}" if topic.name in lines else told
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
-        clouds = [topic.name for topic in bag.topics if topic.kind in (POINTS, PACKETS)]
+        clouds = bag.scan_topics()
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
         raise FileError(f"{path}: {clouds[0]}: {told[0][1]}")
@@ -196,13 +199,13 @@ def _cache(path: Path) -> Lines:
 def _folder(path: Path, reading: Reading) -> Lines:
     """A folder of scans, or of bags and captures: what it holds, what else, and the first scan."""
     files = scan_files(path) if has_scans(path) else []
-    streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
+    streams = streams_below(path)
     if not files and not streams:
         raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
     if not files and reading.moves:
         raise FileError(f"{path}: expected a scan to move or take rings of, found bags and captures: name one of them")
     if not files:
-        listed = ", ".join(p.name for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
+        listed = ", ".join(str(p.relative_to(path)) for p in streams[:6]) + (", ..." if len(streams) > 6 else "")
         kind = f"folder of {len(streams)} bags and captures" if streams[1:] else "folder of a bag or capture"
         return {"kind": kind, "files": listed}
     lines = {"kind": "folder of scans", "scans": _counted(None, files)}

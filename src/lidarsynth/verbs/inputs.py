@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import glob
-import os
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from lidarsynth.data.bag_records import Message, cloud_of
-from lidarsynth.data.bags import is_bag, open_bag
-from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
+from lidarsynth.data.bags import is_bag, metadata_from, open_bag
 from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import unread_turns
-from lidarsynth.data.whole_turns import Unread
+from lidarsynth.data.whole_turns import TimedTurn, Unread
 from lidarsynth.files.fields import (
     PLACE,
     Fields,
@@ -29,16 +23,17 @@ from lidarsynth.files.fields import (
     scan_from_fields,
     written_names,
 )
-from lidarsynth.files.formats import READERS, marks_left_out, read_with_report, sensor_in
+from lidarsynth.files.formats import marks_left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
+from lidarsynth.lidar.plural import was
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.verbs.earlier_results import EarlierResults, earlier_results
+from lidarsynth.verbs.earlier_results import earlier_results
+from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders, streams_below
 
-NAMED = 3  # files of a pattern that are no scans
-MAGIC = "*?["  # of patterns
+NAMED = 5  # bags and captures that are passed over
 
 
 @dataclass(frozen=True)
@@ -47,7 +42,8 @@ class Reading:
 
     intensity  scale, as in `files.formats.read_with_report`
     topic      of a bag, or ADDRESS:PORT of a sensor in a capture; None = the only one
-    metadata   `.json` of an Ouster capture; None = the only one beside it
+    metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; None =
+               what the bag tells, or the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
@@ -122,12 +118,12 @@ class FileInput:
 
 @dataclass(frozen=True)
 class MessageInput:
-    """A point cloud in a bag, still in its bytes."""
+    """A point cloud in a bag, still in its bytes: a message, or a turn of an Ouster's packets."""
 
     name: str
     path: Path
     reading: Reading
-    message: Message
+    message: Message | TimedTurn
 
     def read(self) -> Loaded:
         """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
@@ -163,7 +159,7 @@ class TurnInput:
 
 @dataclass(frozen=True)
 class BrokenInput:
-    """What is left of a bag or capture from where it is broken."""
+    """What is left of a bag or capture from where it is broken; all of it where nothing tells what is to be read."""
 
     name: str
     path: Path
@@ -182,7 +178,7 @@ class Inputs:
     count    how many there are, or None where only reading tells (captures)
     stream   gives them; from the start each time
     streams  whether bags or captures are among them
-    passed   bags and captures that lie in a folder beside its scan files, which alone are read
+    passed   bags and captures in a folder of scan files, which alone are read
     below    scans below the output folder that are not read, though no report there tells of them
     cut      what is to be said, a line each, of bags that end early
     """
@@ -195,6 +191,16 @@ class Inputs:
     cut: tuple[str, ...] = ()
     below: tuple[Path, ...] = ()
 
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What is to be said of `passed` and `cut`, a line each."""
+        if not self.passed:
+            return self.cut
+        count, what = len(self.passed), "bags or captures" if self.passed[1:] else "bag or capture"
+        named = ", ".join(map(str, self.passed[:NAMED])) + (", ..." if self.passed[NAMED:] else "")
+        line = f"{count} {what} beside scan files {was(count)} passed over: {named}; name them to read them"
+        return (line, *self.cut)
+
 
 def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path | None = None) -> Inputs:
     """The scans of files, folders, globs, bags and captures, without the results that lie in an output folder `out`.
@@ -202,23 +208,30 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     reading = reading or Reading()
     if not paths:
         raise ValueError("expected one scan or more, found none")
-    expanded, below = _all_expanded(paths, earlier_results(out))
+    expanded, below = all_expanded(paths, earlier_results(out))
     if not expanded:
         raise ValueError(f"{out}: expected scans to read, found only what lies in this output folder; name another")
     streams = [path for path in expanded if is_stream(path)]
     if reading.topic is not None and not streams:
         raise ValueError(f"expected a bag or a capture for --topic {reading.topic}, found none")
-    if reading.metadata is not None and not any(map(is_capture, streams)):
-        raise ValueError(f"expected a capture for --metadata {reading.metadata}, found none")
-    files = [FileInput(name, path, reading) for name, path in _names(expanded)]
-    single = len(files) == 1 and not streams and not (len(paths) == 1 and paths[0].is_dir() and not _is_scan(paths[0]))
+    files = [FileInput(name, path, reading) for name, path in scan_names(expanded)]
+    single = len(files) == 1 and not streams and not (len(paths) == 1 and is_folder(paths[0]))
     count: int | None = len(files)
-    each = list(dict.fromkeys(streams))
-    folders = dict(zip(each, _unlike([_folder(path) for path in each], each), strict=True))
+    folders = stream_folders(streams)
     cut: list[str] = []
+    packets = False
     for path in streams:
-        more = _stream_count(path, reading, cut)
-        count = None if more is None or count is None else count + more
+        try:
+            more, of_packets = _stream_count(path, reading, cut)
+        except ValueError:
+            if len(expanded) == 1:
+                raise
+            more, of_packets = 1, True  # told in its place, and the others go on
+        count, packets = None if more is None or count is None else count + more, packets or of_packets
+    if reading.metadata is not None and not packets:
+        raise ValueError(
+            f"expected a capture, or a bag of an Ouster's packets, for --metadata {reading.metadata}, found none"
+        )
 
     def stream() -> Iterator[Input]:
         yield from files
@@ -226,107 +239,31 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
             try:
                 inputs = _bag_inputs if is_bag(path) else _capture_inputs
                 yield from inputs(path, reading, folders[path])
-            except FileError as error:
+            except ValueError as error:
                 if len(expanded) == 1:
                     raise
                 yield BrokenInput(folders[path], path, str(error))  # the others go on
 
-    folders_given = [path for path in paths if path.is_dir() and not is_bag(path) and not _is_scan(path)]
-    inside = [p for folder in folders_given for p in sorted(folder.iterdir()) if is_stream(p) and p not in streams]
+    inside = [p for folder in filter(is_folder, paths) for p in streams_below(folder) if p not in streams]
     return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below)
 
 
-def is_stream(path: Path) -> bool:
-    """Whether a path holds many scans one after the other: a bag or a capture."""
-    return is_bag(path) or is_capture(path)
-
-
-def _all_expanded(paths: Sequence[Path], earlier: EarlierResults | None) -> tuple[list[Path], tuple[Path, ...]]:
-    """What the paths stand for, without results of earlier runs, and scans as `Inputs.below`."""
-    parts = [_expanded(path, earlier) for path in paths]
-    found, below = ([path for part in parts for path in part[side]] for side in (0, 1))
-    if earlier is not None:
-        streams = {path for path in found if is_stream(path)}
-        scans, _ = earlier.parted([path for path in found if path not in streams], list(streams), None)
-        kept = streams.union(scans)
-        found = [path for path in found if path in kept]
-    return found, tuple(below)
-
-
-def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], list[Path]]:
-    """The path, the files of a folder, or those that a glob finds; bags in a folder come too. Beside them, scans as
-    `Inputs.below`."""
-    if not path.exists() and any(c in str(path) for c in MAGIC):
-        found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        scans, streams = [p for p in found if _is_scan(p)], sorted(filter(is_stream, found), key=by_number)
-        if not (scans or streams):
-            others = ", ".join(p.name for p in found[:NAMED]) + (", ..." if found[NAMED:] else "")
-            raise ValueError(f"{path}: expected scans, bags or captures of this pattern, found {others or 'none'}")
-        fixed = Path(*takewhile(lambda part: not any(c in part for c in MAGIC), path.parts))
-        scans, below = earlier.parted(scans, streams, fixed) if earlier else (scans, [])
-        return scans + streams, below
-    if path.is_dir() and not is_bag(path) and not _is_scan(path):
-        streams = sorted(filter(is_stream, path.iterdir()), key=by_number)
-        scans = scans_below(path) if streams else scan_files(path)
-        scans, below = earlier.parted(scans, streams, path) if earlier else (scans, [])
-        return scans or streams, below
-    if not (path.exists() or _is_scan(path) or is_stream(path)):
-        raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
-    return [path], []
-
-
-def _is_scan(path: Path) -> bool:
-    return path.name.lower().endswith(tuple(READERS))
-
-
-def has_scans(folder: Path) -> bool:
-    """Whether a folder holds a scan file, at any depth."""
-    try:
-        return bool(scan_files(folder))
-    except ValueError:
-        return False
-
-
-def _names(expanded: list[Path]) -> Iterator[tuple[str, Path]]:
-    """(name, path) of each scan file: its stem, with the folders above it as far as names repeat without them."""
-    files = [path for path in expanded if not is_stream(path)]
-    return iter(zip(_unlike([stem(path) for path in files], files), files, strict=True))
-
-
-def _folder(path: Path) -> str:
-    """Where the results of a bag or capture belong: its stem, of drive.pcap2 drive_2."""
-    number = re.sub(r"\D", "", path.suffix) if is_capture(path) else ""
-    return f"{path.stem}_{number}" if number else path.stem
-
-
-def _unlike(stems: list[str], files: list[Path]) -> list[str]:
-    """The stems, or, where any is there twice, all with the folders above their files. Raises ValueError where these
-    do not tell them apart."""
-    if len(set(stems)) == len(stems):
-        return stems
-    root = Path(os.path.commonpath([path.absolute().parent for path in files]))
-    names = [str(path.absolute().parent.relative_to(root) / one) for path, one in zip(files, stems, strict=True)]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        one, other = [path for name, path in zip(names, files, strict=True) if name == twice[0]][:2]
-        raise ValueError(f"expected scans of different names, found two named {twice[0]}: {one} and {other}")
-    return names
-
-
-def _stream_count(path: Path, reading: Reading, cut: list[str]) -> int | None:
-    """Scans of a bag, or None where only reading tells; `cut` gets what is to be said of it."""
+def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | None, bool]:
+    """Scans of a bag, or None where only reading tells, and whether it, or a capture, holds packets that metadata may
+    be of; `cut` gets what is to be said of it."""
     if not is_bag(path):
-        return None
+        return None, True
     with open_bag(path) as bag:
         name = bag.point_topic(reading.topic)
         cut += bag.cut
-        return sum(topic.count for topic in bag.topics if topic.name == name) or None
+        return bag.count_of(name), bag.of_ouster(name)
 
 
 def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
-        for number, message in enumerate(bag.messages(frozenset([topic]))):
-            yield MessageInput(f"{folder}/{number:06d}", path, reading, message)
+        for number, scan in enumerate(bag.scans(topic, metadata_from(reading.metadata, bag, topic))):
+            yield MessageInput(f"{folder}/{number:06d}", path, reading, scan)
 
 
 def _capture_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:

@@ -6,11 +6,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+from lidarsynth.data.folder import stem
 from lidarsynth.files.fields import FileError, dropped_points
 from lidarsynth.files.formats import marks_left_out, read_with_report
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
-from lidarsynth.verbs.inputs import stem
 from lidarsynth.verbs.viewpoint import viewpoint_note
 from lidarsynth.viewer.packing import Shown
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from lidarsynth.data.capture import is_capture
 from lidarsynth.lidar.plural import plural
-from lidarsynth.verbs.inputs import Reading, is_stream
+from lidarsynth.verbs.expansion import is_stream
+from lidarsynth.verbs.inputs import Reading
 from lidarsynth.viewer.page import Entry
 from lidarsynth.viewer.series import Files, Series, series_of
 
@@ -50,7 +51,7 @@ def _by_name(scans: Files, partners: Files) -> Files:
     if not all(name in place for name in scans.names):
         return partners
     order = [place[name] for name in scans.names]
-    return Files(scans.names, [partners.paths[i] for i in order], partners.reading)
+    return Files(scans.names, [partners.paths[i] for i in order], partners.reading, partners.cut)
 
 
 def entries(series: Mapping[str, Series], broken: list[str]) -> Iterator[Entry]:

@@ -9,9 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from lidarsynth.data.bags import is_bag, open_bag
+from lidarsynth.data.bags import is_bag, metadata_from, open_bag
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import moved
+from lidarsynth.data.whole_turns import TimedTurn
 from lidarsynth.files.fields import dropped_points
 from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of
 from lidarsynth.viewer.beside import read_shown
@@ -24,7 +25,7 @@ class Series(Protocol):
     """Scans by number: `series[i] -> Shown`, IndexError behind the last; ValueError where that scan is broken.
 
     names  of those known so far; count: how many there are, or None where only reading tells
-    cut    what is to be said, a line each, of bags that end early
+    cut    what is to be said, a line each, of bags that end early, and of bags and captures that are passed over
     """
 
     @property
@@ -39,9 +40,8 @@ class Series(Protocol):
 class Files:
     """Scan files, with what lies beside them."""
 
-    def __init__(self, names: Sequence[str], paths: Sequence[Path], reading: Reading):
-        self.names, self.paths, self.reading = list(names), list(paths), reading
-        self.cut: Sequence[str] = ()
+    def __init__(self, names: Sequence[str], paths: Sequence[Path], reading: Reading, cut: Sequence[str] = ()):
+        self.names, self.paths, self.reading, self.cut = list(names), list(paths), reading, cut
 
     @property
     def count(self) -> int:
@@ -111,7 +111,7 @@ def series_of(paths: Sequence[Path], reading: Reading) -> Series:
         if not isinstance(item, FileInput):  # of a capture, or of one bag of several
             return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count, inputs.cut)
         files.append(item)
-    return Files([item.name for item in files], [item.path for item in files], reading)
+    return Files([item.name for item in files], [item.path for item in files], reading, inputs.words)
 
 
 def _scans_only(path: Path) -> list[Path]:
@@ -128,12 +128,12 @@ def _scans_only(path: Path) -> list[Path]:
 def _bag(path: Path, reading: Reading) -> Stream:
     with open_bag(path) as bag:
         topic = bag.point_topic(reading.topic)
-        count, cut = sum(t.count for t in bag.topics if t.name == topic) or None, bag.cut
+        count, cut = bag.count_of(topic), bag.cut
 
     def open_at(mark: int, number: int) -> Iterator[tuple[int, Input]]:
         with open_bag(path) as bag:
-            for message in bag.messages(frozenset([topic]), mark):
-                name = f"{topic} {message.time / 1e9:.3f} s"
-                yield message.time, MessageInput(name, path, reading, message)
+            for scan in bag.scans(topic, metadata_from(reading.metadata, bag, topic), mark):
+                name = f"{topic} {scan.time / 1e9:.3f} s"
+                yield 0 if isinstance(scan, TimedTurn) else scan.time, MessageInput(name, path, reading, scan)
 
     return Stream(open_at, count, cut)
