@@ -281,7 +281,7 @@ def test_tracks_are_of_the_stamps_and_boxes_of_when_they_were_seen(tmp_path: Pat
     there = {box.instance: box for box in LabelledStreets(0, 1, SENSOR, Options(frames=7))[3].boxes}
     for box in record["boxes"]:
         truth = there[box["instance"]].place
-        np.testing.assert_allclose(tracks[str(box["instance"])]["frames"]["3"][:3], truth, atol=1e-3)
+        np.testing.assert_allclose(tracks[str(box["instance"])]["frames"]["3"][:3], truth, atol=5e-3)
         moved = max(moved, float(np.linalg.norm(np.array(box["place"]) - truth)))
     assert moved > 0.05  # m
 

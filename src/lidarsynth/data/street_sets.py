@@ -29,7 +29,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
-from lidarsynth.streets.areas import MORE
+from lidarsynth.streets.areas import MORE, TODAY
 from lidarsynth.streets.drawing import bev_with_boxes, strips
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import LabelledStreets, Options
@@ -148,9 +148,11 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
 
 def _edition(options: Options, layout: str) -> int:
     """EDITION, or one more where 2026-11-25 brought boxes that stand where seen, cyclists who roll off kerbs, or no
-    vehicles in car parks, and one where label_2 lists what the camera sees alone: other sets go on."""
+    vehicles in car parks, one where label_2 lists what the camera sees alone, and one where 2026-11-28 set everyone
+    apart: other sets go on."""
     drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
-    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti")
+    apart = options.frames > 0 or options.density != TODAY
+    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + apart
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,18 +12,21 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.streets.actors import KINDS, actors_of, numbers_of
+from lidarsynth.streets.apart import stand_apart
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import Box, boxes_of
 from lidarsynth.streets.drive import Drive, Moment, check_drives, draw_drive, parked_world
 from lidarsynth.streets.hdl64e import NAME
 from lidarsynth.streets.interiors import buildings
+from lidarsynth.streets.layout import build
 from lidarsynth.streets.moving import Bodies, MovingCaster
+from lidarsynth.streets.passing import set_apart
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.reader import FULL_TURN, Worlds, whole
 from lidarsynth.streets.sensor_model import OPTICS, Optics
 from lidarsynth.streets.turn import Turn, attitudes, perfect, sensor_pose, shoot
 from lidarsynth.streets.weather import CLEAR, Weather
-from lidarsynth.streets.world import POSES, World
+from lidarsynth.streets.world import POSES, World, visible
 
 OUTLIER = np.uint32(1)  # returns of rain and fog
 FURNITURE = np.uint32(99)  # SemanticKITTI's other-object
@@ -124,7 +128,7 @@ class LabelledStreets:
         full = sensor.name == NAME and sensor.width < FULL_TURN
         self.sensor = sensor.resized(width=FULL_TURN) if full else sensor
         self.seed, self.count, self.options = seed, count, options
-        self._worlds = buildings(seed, sensor) if options.inside else Worlds(seed, sensor, density=options.density)
+        self._worlds = self._places()
         self._held: tuple[int, Any] | None = None
 
     def __len__(self) -> int:
@@ -141,8 +145,8 @@ class LabelledStreets:
         return world, number
 
     def drive(self, number: int) -> Drive:
-        """Drive `number`, which lasts one turn longer than its frames."""
-        return draw_drive(self.seed, number, self._seconds, self.options.density, self.options.speed)
+        """Drive `number`, which lasts one turn longer than its frames, and in which nobody goes through anybody."""
+        return set_apart(draw_drive(self.seed, number, self._seconds, self.options.density, self.options.speed))
 
     def check_drives(self) -> None:
         """Raises ValueError where a drive is longer than a street may be: before any is drawn."""
@@ -152,6 +156,15 @@ class LabelledStreets:
     @property
     def _seconds(self) -> float:
         return (self.options.frames + 1) / self.options.rate
+
+    def _places(self) -> Worlds:
+        """Worlds of scans of places. Streets as they are stay what they always were, those of other densities have
+        everyone apart."""
+        if self.options.inside:
+            return buildings(self.seed, self.sensor)
+        density = self.options.density
+        built = None if density == TODAY else partial(_apart, self.seed, self.sensor, density)
+        return Worlds(self.seed, self.sensor, built=built)
 
     def _still(self, index: int) -> Frame:
         number, pose = divmod(index, POSES)
@@ -230,6 +243,11 @@ class LabelledStreets:
         raw = np.where((scan.label == 0) & (turn.face[:, order][hit] < 0), OUTLIER, raw)
         raw = np.where((raw == 0) & self.options.inside, FURNITURE, raw)
         return Frame(scan, raw, boxes, to_world, stamp, number, k)
+
+
+def _apart(seed: int, sensor: Sensor, density: Density, number: int) -> World:
+    """The street of that number, with everyone apart, as far as the sensor sees it."""
+    return visible(stand_apart(build(np.random.default_rng((seed, number)), density))[0], sensor)
 
 
 def _standing(bodies: Bodies) -> Moment:
