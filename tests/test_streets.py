@@ -114,6 +114,22 @@ def test_deskewed_boxes_stand_where_their_points_were_seen(driven: list[Frame]):
     np.testing.assert_allclose(off, np.round(off), atol=0.12)  # clockwise, the stamp ahead, both ends behind
 
 
+def test_what_follows_the_carrier_is_one_thing_though_both_ends_of_a_turn_meet_it():
+    """A turn begins and ends directly behind: two parts of a vehicle there are met 0.1 s apart, a metre at 36 km/h."""
+    reader, twice = LabelledStreets(6, 1, SMALL, Options(frames=40, deskewed=True, density=Density(traffic=6))), 0
+    for frame in (reader[k] for k in range(0, 40, 8)):
+        assert frame.scan.time is not None
+        for box in (box for box in frame.boxes if box.moves and box.points > 9 and box.centre[0] < -4):
+            mine = frame.raw >> 16 == box.instance
+            ahead = (frame.scan.xyz[mine] - box.centre) @ [np.cos(box.yaw), np.sin(box.yaw), 0]
+            early = frame.scan.time[mine] < 0.05
+            if early.any() and not early.all():
+                twice += 1
+                assert np.linalg.norm(box.velocity) > 7 and inside(box, frame.scan.xyz[mine], 0).all()
+                assert abs(ahead[early].max() - ahead[~early].max()) < 0.3, box  # both parts of its front
+    assert twice > 3
+
+
 def test_boxes_hold_little_else(still: list[Frame]):
     """What returns from within a car's box is that car, its ground, or what leans against it."""
     for frame in still:

@@ -40,7 +40,8 @@ class Options:
     rate      turns per second
     speed     m/s the carrier would like to drive, None = as the street has it
     deskewed  the carrier's own motion within a turn is taken out of the points, as odometry data sets have it, and
-              boxes stand where the beams met them, as annotators put them around the points
+              boxes stand where the beams met them, as annotators put them around the points; of what moves and is met
+              by both ends of the turn, directly behind, one part is brought to the other
     perfect   as a simulator casts: every beam reports exactly what it meets first, with a reflectance of 0
     inside    places in buildings, not in streets: rooms, halls, garages, the sensor `mount` above the floor
     """
@@ -228,7 +229,10 @@ class LabelledStreets:
         late = None if times is None else times - stamp
         deskewed = self.options.deskewed and times is not None
         boxes = boxes_of(world, bodies, moment, sensor, turn, numbers, poses, late, to_world, as_seen=deskewed)
-        points = _deskewed(sensor, turn, poses, to_world) if deskewed else turn.points
+        points = turn.points
+        if deskewed and late is not None:
+            points = _deskewed(sensor, turn, poses, to_world)
+            _bring_together(points, numbers, boxes, late, period)
         order = np.roll(np.arange(sensor.width)[::-1], sensor.width // 2)
         hit = (turn.distance > 0)[:, order]
         ring, column = np.nonzero(hit)
@@ -265,6 +269,17 @@ def _raw(scan: Scan, numbers: np.ndarray, bodies: Bodies, moment: Moment) -> np.
     kinds = [KINDS[str(kind)] for kind in bodies.actors.kind]
     of_actor = np.array([0, *(k.moving if quick else k.raw for k, quick in zip(kinds, fast, strict=True))], np.uint32)
     return np.where(numbers > 0, of_actor[numbers], raw) | (numbers.astype(np.uint32) << np.uint32(16))
+
+
+def _bring_together(points: np.ndarray, numbers: np.ndarray, boxes: list[Box], late: np.ndarray, period: float) -> None:
+    """Move the points (H, W, 3) of what was met more than half a turn from when its box stands there: by its motion
+    since. numbers (H, W) as in `boxes_of`, late (W,) s after the stamp."""
+    for box in boxes:
+        if not (box.moves and box.points and box.late is not None):
+            continue
+        after = box.late - late
+        part = np.nonzero((numbers == box.instance) & (np.abs(after) > period / 2))
+        points[part] += (after[part[1], None] * box.velocity).astype(np.float32)
 
 
 def _deskewed(sensor: Sensor, turn: Turn, poses: np.ndarray, to_world: np.ndarray) -> np.ndarray:
