@@ -9,7 +9,7 @@ from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
-from lidarsynth.streets.apart import stand_apart
+from lidarsynth.streets.apart import boxes_on_ground, stand_apart
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
@@ -246,7 +246,7 @@ def test_boxes_of_crowded_streets_never_meet(frames: int):
     assert {"person", "bicycle", "bicyclist", "car"} <= kinds and (moving > 50) == (frames > 0)
 
 
-def test_people_of_crowded_streets_stand_in_no_pole_and_no_house():
+def test_nobody_in_crowded_streets_stands_in_a_pole_or_a_trunk():
     plain = world(0, CROWD)
     full, left = stand_apart(plain)
     posts = full.things["row"][np.isin(full.things["kind"], ["lamp", "sign", "bollard", "tree", "bin"]), :2]
@@ -256,6 +256,10 @@ def test_people_of_crowded_streets_stand_in_no_pole_and_no_house():
     assert 0.8 * len(left) < left.sum() == len(actors) <= len(left)
     stayed = {corners.tobytes() for corners in full.corners} & {corners.tobytes() for corners in plain.corners}
     assert len(stayed) > 0.8 * len(full.corners)
+    vehicles = boxes_on_ground(actors, 0.0)[np.isin(actors.kind, ["car", "van", "truck", "bus", "lorry", "coach"])]
+    for x, y, yaw, *half in vehicles:
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        assert not (np.abs((posts - (x, y)) @ turn) < half).all(axis=1).any()
     gap = full.ground.carriageway(place[:, 0], place[:, 1])
     assert ((gap > 0) == (plain.ground.height(*place[:, :2].T) < place[:, 2] - 0.06)).mean() > 0.9  # on the kerb
 

@@ -17,6 +17,7 @@ from lidarsynth.streets.world import FRONT, TRAFFIC, World
 VEHICLES = ("car", "van", "truck", "bus", "lorry", "coach", "trailer")
 LEAVES = ("bush", "thicket")  # people may stand at them
 TRUNKS, TRUNK = ("tree", "young tree"), 0.3  # m, half of a trunk
+POSTS = (*TRUNKS, "lamp", "sign", "bollard", "bin", "panel")
 WALL = 0.1  # m, half of a house's wall
 CARRIER = (2.15, 0.95)  # m, half length and half width of what carries the sensor
 FAR, ASIDE, STEP = 6.0, 1.5, 0.3  # m, how far one is moved along the street and across it, and in which steps
@@ -82,12 +83,13 @@ def stand_apart(
     kept = footprints(world.poses, world.poses[:, 3], np.zeros(2), np.array(CARRIER)) if ways is None else ways
     going = np.equal(actors.pace, TRAFFIC) if makes is None else makes
     fixed, taken = what_stands(world), np.zeros((0, 5))
+    posts = int(np.isin(world.things["kind"], POSTS).sum())  # vehicles may stand at fences and in hedges
     shift, left = np.zeros((len(actors), 2)), there.copy()
     for one in _order(actors):
         if not there[one]:
             continue
         parked, goes = actors.kind[one] in VEHICLES, bool(going[one])
-        others = np.concatenate([taken, kept[: 0 if goes else None], fixed[: 0 if parked or goes else None]])
+        others = np.concatenate([taken, kept[: 0 if goes else None], fixed[: 0 if goes else posts if parked else None]])
         move: np.ndarray | None = np.zeros(2)
         if meet(boxes[one], near(boxes[one], others, 0.0)).any():
             move = None if goes else _moved(boxes[one], others, world.ground, parked)
@@ -142,10 +144,11 @@ def _moved(box: np.ndarray, others: np.ndarray, ground: Ground, parked: bool) ->
 
 
 def what_stands(world: World) -> np.ndarray:
-    """(N, 5) footprints of all that stands and is no road user, and of walls; leaves aside, of trees their trunks."""
+    """(N, 5) footprints of all that stands and is no road user, first POSTS, last walls; of trees their trunks, leaves
+    aside."""
     things = world.things
-    known = np.isin(things["kind"], [*LEAVES]) | np.isin(np.arange(len(things)), actors_of(world).thing)
-    found = things[~known]
+    others = ~np.isin(things["kind"], [*POSTS, *LEAVES]) & ~np.isin(np.arange(len(things)), actors_of(world).thing)
+    found = np.concatenate([things[np.isin(things["kind"], POSTS)], things[others]])
     bounds = np.array([bounds_of(str(one["kind"]), int(one["variant"])) for one in found]).reshape(-1, 2, 3)
     low, high = (bounds[:, k, :2] * found["row"][:, 4:6] for k in (0, 1))
     tree = np.isin(found["kind"], TRUNKS)[:, None]
