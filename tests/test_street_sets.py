@@ -18,6 +18,7 @@ from lidarsynth.files.formats import read
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.streets.areas import Density
 from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
@@ -307,6 +308,11 @@ def test_sets_and_caches_have_one_edition(tmp_path: Path, monkeypatch: pytest.Mo
     line = LabelledStreets(0, 1, Sensor("line", (-10.0,), 32, 1.0, 30.0))
     written(tmp_path / "set", "pcd", line)
     assert json.loads((tmp_path / "set" / "streets.json").read_text())["edition"] == EDITION
+    crowded = Options(density=Density(pedestrians=2))
+    for options in (crowded, Options(frames=3)):  # whose boxes met before 2026-11-28
+        written(tmp_path / "other" / str(options.frames), "pcd", LabelledStreets(0, 1, line.sensor, options))
+        record = json.loads((tmp_path / "other" / str(options.frames) / "streets.json").read_text())
+        assert record["edition"] == EDITION + 1
     monkeypatch.setattr("lidarsynth.data.street_sets.EDITION", EDITION + 1)
     with pytest.raises(ValueError, match=r"made with \{edition \d\}, found \{edition \d\}"):
         written(tmp_path / "set", "pcd", line)
