@@ -18,6 +18,7 @@ from lidarsynth.files.formats import read
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.streets.areas import Density
 from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
@@ -281,7 +282,7 @@ def test_tracks_are_of_the_stamps_and_boxes_of_when_they_were_seen(tmp_path: Pat
     there = {box.instance: box for box in LabelledStreets(0, 1, SENSOR, Options(frames=7))[3].boxes}
     for box in record["boxes"]:
         truth = there[box["instance"]].place
-        np.testing.assert_allclose(tracks[str(box["instance"])]["frames"]["3"][:3], truth, atol=1e-3)
+        np.testing.assert_allclose(tracks[str(box["instance"])]["frames"]["3"][:3], truth, atol=5e-3)
         moved = max(moved, float(np.linalg.norm(np.array(box["place"]) - truth)))
     assert moved > 0.05  # m
 
@@ -290,7 +291,7 @@ def test_a_scan_without_a_point_is_no_scan(tmp_path: Path):
     blind = Sensor("blind", (89.0,), 16)
     with pytest.raises(ValueError, match=r"blind: expected a sensor that sees something .* found no return .* scan 0"):
         list(write_streets(tmp_path / "set", LabelledStreets(0, 1, blind), "pcd"))
-    assert not list((tmp_path / "set").glob("0*"))
+    assert not (tmp_path / "set").exists()
 
 
 def test_other_settings_and_other_folders_are_refused(tmp_path: Path):
@@ -307,6 +308,11 @@ def test_sets_and_caches_have_one_edition(tmp_path: Path, monkeypatch: pytest.Mo
     line = LabelledStreets(0, 1, Sensor("line", (-10.0,), 32, 1.0, 30.0))
     written(tmp_path / "set", "pcd", line)
     assert json.loads((tmp_path / "set" / "streets.json").read_text())["edition"] == EDITION
+    crowded = Options(density=Density(pedestrians=2))
+    for options in (crowded, Options(frames=3)):  # whose boxes met before 2026-11-28
+        written(tmp_path / "other" / str(options.frames), "pcd", LabelledStreets(0, 1, line.sensor, options))
+        record = json.loads((tmp_path / "other" / str(options.frames) / "streets.json").read_text())
+        assert record["edition"] == EDITION + 1
     monkeypatch.setattr("lidarsynth.data.street_sets.EDITION", EDITION + 1)
     with pytest.raises(ValueError, match=r"made with \{edition \d\}, found \{edition \d\}"):
         written(tmp_path / "set", "pcd", line)
@@ -317,13 +323,29 @@ def test_what_is_refused_leaves_the_folder_to_the_corrected_command(tmp_path: Pa
     with pytest.raises(ValueError, match=r"expected a drive of at most 3760 m, found 500 s .* choose fewer frames"):
         list(write_streets(folder, LabelledStreets(0, 2, SENSOR, Options(frames=5000)), "pcd"))
     assert not folder.exists()
-    folder, blind = tmp_path / "set", LabelledStreets(0, 1, Sensor("blind", (89.0,), 16))
+    folder, blind = tmp_path / "new" / "set", LabelledStreets(0, 1, Sensor("blind", (89.0,), 16))
     with pytest.raises(ValueError, match="expected a sensor that sees"):
         list(write_streets(folder, blind, "nuscenes"))
+    assert not (tmp_path / "new").exists()
     line = LabelledStreets(0, 1, Sensor("line", (-10.0,), 32, 1.0, 30.0))
     written(folder, "pcd", line)
     with pytest.raises(ValueError, match=r"made with {sensor blind}, found {sensor line}"):
         list(write_streets(folder, blind, "pcd"))
+
+
+@pytest.mark.parametrize("words", ["streets --out", "streets --inside --out", "data synthetic", "train default --out"])
+def test_without_embreex_nothing_is_begun(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    def missing() -> None:
+        raise ImportError("No module named 'embreex'")
+
+    monkeypatch.setattr("lidarsynth.streets.raycast.library", missing)
+    monkeypatch.chdir(tmp_path)
+    more = ["--data", "varied"] if words.startswith("train") else ["--sensor", "vlp-16"]
+    with pytest.raises(SystemExit) as refused:
+        main([*words.split(), str(tmp_path / "new" / "set"), *more])
+    assert refused.value.code == 2 and not list(tmp_path.iterdir())
+    wants = "synthetic streets need embreex: pip install 'lidarsynth[synthetic]'"
+    assert capsys.readouterr().err == f"lidarsynth: {wants}\n"
 
 
 def test_a_drive_that_is_too_long_is_found_before_the_first_is_made():

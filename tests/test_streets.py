@@ -9,6 +9,7 @@ from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
+from lidarsynth.streets.apart import boxes_on_ground, stand_apart
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
@@ -16,6 +17,7 @@ from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.ground import Ground
 from lidarsynth.streets.layout import build
 from lidarsynth.streets.objects import USUAL, library
+from lidarsynth.streets.passing import _to_and_fro
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.recordings import RecordedStreets
 from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
@@ -112,6 +114,22 @@ def test_deskewed_boxes_stand_where_their_points_were_seen(driven: list[Frame]):
     np.testing.assert_allclose(off, np.round(off), atol=0.12)  # clockwise, the stamp ahead, both ends behind
 
 
+def test_what_follows_the_carrier_is_one_thing_though_both_ends_of_a_turn_meet_it():
+    """A turn begins and ends directly behind: two parts of a vehicle there are met 0.1 s apart, a metre at 36 km/h."""
+    reader, twice = LabelledStreets(6, 1, SMALL, Options(frames=40, deskewed=True, density=Density(traffic=6))), 0
+    for frame in (reader[k] for k in range(0, 40, 8)):
+        assert frame.scan.time is not None
+        for box in (box for box in frame.boxes if box.moves and box.points > 9 and box.centre[0] < -4):
+            mine = frame.raw >> 16 == box.instance
+            ahead = (frame.scan.xyz[mine] - box.centre) @ [np.cos(box.yaw), np.sin(box.yaw), 0]
+            early = frame.scan.time[mine] < 0.05
+            if early.any() and not early.all():
+                twice += 1
+                assert np.linalg.norm(box.velocity) > 7 and inside(box, frame.scan.xyz[mine], 0).all()
+                assert abs(ahead[early].max() - ahead[~early].max()) < 0.3, box  # both parts of its front
+    assert twice > 3
+
+
 def test_boxes_hold_little_else(still: list[Frame]):
     """What returns from within a car's box is that car, its ground, or what leans against it."""
     for frame in still:
@@ -201,6 +219,61 @@ def test_the_carrier_stays_on_its_road_and_meets_nobody():
         gap = np.linalg.norm(now.place[now.present, :2] - pose[:2], axis=1)
         vehicles = np.isin(drive.actors.kind[now.present], ["car", "van", "truck", "bus"])
         assert gap[vehicles].min(initial=99) > 1.5
+
+
+CROWD = Density(traffic=2, pedestrians=4, groups=2, motorcycles=2, cyclists=2, riders=2, walkers=3, racks=1, heavy=1)
+
+
+def apart(one: Box, other: Box) -> float:
+    """m between two boxes as seen from above along the best of their four sides, negative where they meet."""
+    sides = [np.array([np.cos(yaw), np.sin(yaw)]) for of in (one, other) for yaw in (of.yaw, of.yaw + np.pi / 2)]
+    shadows = [[box.corners()[:, :2] @ side for box in (one, other)] for side in sides]
+    return max(max(a.min() - b.max(), b.min() - a.max()) for a, b in shadows)
+
+
+@pytest.mark.parametrize("frames", [0, 24])
+def test_boxes_of_crowded_streets_never_meet(frames: int):
+    """In scans of places, and in drives from one turn to the next, among them those who turn where their way ends."""
+    reader = LabelledStreets(0, 2 if frames else 32, SMALL, Options(frames=frames, rate=2, density=CROWD))
+    kinds, moving = set(), 0
+    for k in range(0, len(reader), 4):
+        boxes = reader[k].boxes
+        kinds |= {box.kind for box in boxes}
+        moving += sum(box.moves and box.kind == "person" for box in boxes)
+        for number, one in enumerate(boxes):
+            near = (box for box in boxes[:number] if np.hypot(*np.subtract(box.centre, one.centre)[:2]) < 14)
+            assert all(apart(one, other) > -1e-3 for other in near), one
+    assert {"person", "bicycle", "bicyclist", "car"} <= kinds and (moving > 50) == (frames > 0)
+
+
+def test_nobody_in_crowded_streets_stands_in_a_pole_or_a_trunk():
+    plain = world(0, CROWD)
+    full, left = stand_apart(plain)
+    posts = full.things["row"][np.isin(full.things["kind"], ["lamp", "sign", "bollard", "tree", "bin"]), :2]
+    actors = actors_of(full)
+    place = actors.place[actors.kind == "person"]
+    assert len(place) > 40 and np.hypot(*(place[:, None, :2] - posts).T).min() > 0.3
+    assert 0.8 * len(left) < left.sum() == len(actors) <= len(left)
+    stayed = {corners.tobytes() for corners in full.corners} & {corners.tobytes() for corners in plain.corners}
+    assert len(stayed) > 0.8 * len(full.corners)
+    vehicles = boxes_on_ground(actors, 0.0)[np.isin(actors.kind, ["car", "van", "truck", "bus", "lorry", "coach"])]
+    for x, y, yaw, *half in vehicles:
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        assert not (np.abs((posts - (x, y)) @ turn) < half).all(axis=1).any()
+    gap = full.ground.carriageway(place[:, 0], place[:, 1])
+    assert ((gap > 0) == (plain.ground.height(*place[:, :2].T) < place[:, 2] - 0.06)).mean() > 0.9  # on the kerb
+
+
+def test_who_walks_turns_where_their_way_ends():
+    """To and fro between 0 and 6 m at 1.5 m/s from the middle on, 2 s at each end."""
+    times = np.arange(0, 30, 0.05)
+    s, facing = _to_and_fro(0.0, 6.0, 3.0, 1.5, 1, times)
+    assert s[0] == 3 and s.min() >= 0 and s.max() <= 6 and facing[0] == 0
+    np.testing.assert_allclose(np.abs(np.diff(s)).max(), 1.5 * 0.05, atol=1e-9)
+    back = (times > 4.1) & (times < 7.9)
+    assert np.all(np.diff(s[back]) < 0) and np.allclose(facing[back], np.pi)
+    assert np.diff(facing).max() < 0.2  # nobody turns at once
+    assert _to_and_fro(0.0, 1.0, 0.5, 1.5, -1, times)[0].std() == 0
 
 
 def test_density_does_what_it_says():

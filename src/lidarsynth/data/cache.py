@@ -111,7 +111,8 @@ def _write(
             yield done
     finally:
         entries.close()
-        close_index(folder, index)
+        if index["shards"]:
+            close_index(folder, index)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep
 from lidarsynth.pictures.figure import panel
-from lidarsynth.streets.areas import MORE
+from lidarsynth.streets.areas import MORE, TODAY
 from lidarsynth.streets.drawing import bev_with_boxes, strips
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import LabelledStreets, Options
@@ -59,7 +59,16 @@ def write_streets(folder: Path, streets: LabelledStreets, layout: str, workers: 
 
 
 def _write(folder: Path, streets: LabelledStreets, layout: str, workers: int) -> Iterator[int]:
-    _claim(folder, _settings(streets, layout))
+    begun = _claim(folder, _settings(streets, layout))
+    try:
+        yield from _frames(folder, streets, layout, workers)
+    except Exception:
+        if begun and not _holds_more(folder):
+            (folder / RECORD).unlink(missing_ok=True)
+        raise
+
+
+def _frames(folder: Path, streets: LabelledStreets, layout: str, workers: int) -> Iterator[int]:
     sweep(folder, deep=True)
     streets = with_those_there(folder, streets, layout)
     task = _Task(folder, streets, layout)
@@ -139,15 +148,17 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
 
 def _edition(options: Options, layout: str) -> int:
     """EDITION, or one more where 2026-11-25 brought boxes that stand where seen, cyclists who roll off kerbs, or no
-    vehicles in car parks, and one where label_2 lists what the camera sees alone: other sets go on."""
+    vehicles in car parks, one where label_2 lists what the camera sees alone, and one where 2026-11-28 set everyone
+    apart: other sets go on."""
     drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
-    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti")
+    apart = options.frames > 0 or options.density != TODAY
+    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + apart
 
 
-def _claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Begin a folder, or go on with one that was begun with the same settings; the number of scans may grow.
+def _claim(folder: Path, settings: dict[str, Any]) -> bool:
+    """Begin a folder, and say so, or go on with one that was begun with the same settings; scans may grow in number.
 
-    What a refused command has begun, and nothing was written to since, is begun anew.
+    What a stopped command has begun, and nothing was written to since, is begun anew.
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
@@ -155,8 +166,8 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
     if path.exists():
         found = read_json(path)
         if found == settings:
-            return
-        if any(entry.is_file() and not entry.name.startswith(".") for entry in folder.rglob("*") if entry != path):
+            return False
+        if _holds_more(folder):
             asked, was = _differing(settings, found), _differing(found, settings)
             raise ValueError(f"{folder}: expected a folder of streets made with {_told(asked)}, found {_told(was)}; "
                              "use another --out")  # fmt: skip
@@ -164,6 +175,13 @@ def _claim(folder: Path, settings: dict[str, Any]) -> None:
         raise ValueError(f"{folder}: expected an empty folder, or one with {RECORD}; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
     _put(path, (json.dumps(settings, indent=1) + "\n").encode())
+    return True
+
+
+def _holds_more(folder: Path) -> bool:
+    """Whether there is a file beside the record, hidden ones aside."""
+    files = (entry for entry in folder.rglob("*") if entry.is_file() and not entry.name.startswith("."))
+    return any(entry != folder / RECORD for entry in files)
 
 
 def _told(settings: dict[str, Any]) -> str:

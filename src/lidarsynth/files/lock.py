@@ -22,8 +22,8 @@ UNKNOWN = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of fil
 
 @contextmanager
 def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]:
-    """Hold the folder, which is made if it is not there, and goes again where nothing came into it, for as long as the
-    context lasts; gives whether there is a lock, without which others may be there.
+    """Hold the folder, which is made if it is not there, with those above it, and goes again where nothing came into
+    it, for as long as the context lasts; gives whether there is a lock, without which others may be there.
 
     work    in words, such as "training", for the error
     shared  with others that share it
@@ -36,7 +36,8 @@ def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]
         return
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
-    path, held, locked, tries, made = folder / LOCK, False, True, TRIES if shared else 1, not folder.exists()
+    path, held, locked, tries = folder / LOCK, False, True, TRIES if shared else 1
+    made = [at for at in (folder, *folder.parents) if not at.exists()]
     while not held:
         folder.mkdir(parents=True, exist_ok=True)  # a shard that left nothing in it may have taken it away
         try:
@@ -67,8 +68,8 @@ def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]
                         if locked and shared:
                             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                         path.unlink(missing_ok=True)
-                        if made:
-                            folder.rmdir()  # refused where it holds anything
+                        for at in made:
+                            at.rmdir()  # refused where it holds anything
 
 
 def _inode(path: Path) -> int | None:

@@ -11,6 +11,9 @@ import numpy as np
 from lidarsynth.streets.objects import library
 from lidarsynth.streets.world import World
 
+MARGIN = 0.05  # m between a shape and each side of its box: flat sides are seen through the noise, boxes stand upright
+# in the sensor's frame, and the sensor tilts
+
 
 class Kind(NamedTuple):
     """How other data sets call one kind of road user."""
@@ -65,14 +68,15 @@ def actors_of(world: World) -> Actors:
     """Everyone of KINDS in the world, in the order of `World.things`."""
     thing = np.flatnonzero(np.isin(world.things["kind"], list(KINDS)))
     found = world.things[thing]
-    bounds = np.array([_bounds(str(one["kind"]), int(one["variant"])) for one in found]).reshape(-1, 2, 3)
+    bounds = np.array([bounds_of(str(one["kind"]), int(one["variant"])) for one in found]).reshape(-1, 2, 3)
     low, high = bounds[:, 0] * found["row"][:, 4:7], bounds[:, 1] * found["row"][:, 4:7]
     place, yaw = found["row"][:, :3], found["row"][:, 3]
     return Actors(found["kind"], thing, place, yaw, high - low, (low + high) / 2, found["pace"])
 
 
 @lru_cache(maxsize=64)
-def _bounds(kind: str, variant: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def bounds_of(kind: str, variant: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The least and the greatest x, y and z, m, of a shape of the library."""
     corners = library()[kind][variant].corners.reshape(-1, 3)
     return tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist())
 

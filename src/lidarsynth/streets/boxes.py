@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.actors import MARGIN
 from lidarsynth.streets.drive import Moment
 from lidarsynth.streets.moving import Bodies
 from lidarsynth.streets.turn import Turn, attitudes, some_rays
 from lidarsynth.streets.world import World
 
-MARGIN = 0.05  # m between a shape and each side of its box: flat sides are seen through the noise, boxes stand upright
-# in the sensor's frame, and the sensor tilts
 MOVES = 0.2  # m/s from which a thing counts as moving
 
 
@@ -25,7 +24,7 @@ class Box:
     kind        a word of actors.KINDS; instance: its number in this world, 1 and up, the same in all scans of it
     centre      (3,) m, of the box; size: length, width, height in m; yaw: rad, of its front, counter-clockwise from x
     velocity    (3,) m/s over ground
-    place, heading, world_velocity: centre, yaw and velocity in the world's frame
+    place, heading, world_velocity: centre, yaw and velocity in the world's frame; spin: rad/s, of its yaw
     points      how many returns are labelled with it; occlusion: share of its first hits that others hide, 0 to 1
     late        s after the stamp at which it was where the box stands, None = the stamp: centre, place, yaw and heading
                 are of that time, so that centre - late * velocity is where it is at the stamp
@@ -43,6 +42,7 @@ class Box:
     points: int
     occlusion: float
     late: float | None = None
+    spin: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -65,7 +65,7 @@ class Box:
             if value is not None
         }
         late = {} if self.late is None else {"late": round(self.late, 5)}
-        return rounded | {key: round(getattr(self, key), 5) for key in ("yaw", "heading", "occlusion")} | late
+        return rounded | {key: round(getattr(self, key), 5) for key in ("yaw", "heading", "occlusion", "spin")} | late
 
 
 def boxes_of(
@@ -110,7 +110,7 @@ def boxes_of(
             float(np.arctan2(front[1], front[0])), _three(moment.velocity[actor] @ to_world[:3, :3]),
             _three(shown_at[actor]), float(np.arctan2(np.sin(now.yaw[actor]), np.cos(now.yaw[actor]))),
             _three(moment.velocity[actor]), int(points[actor + 1]), float(np.clip(1 - shown, 0, 1)),
-            None if after is None else float(after[actor]),
+            None if after is None else float(after[actor]), float(moment.spin[actor]),
         ))  # fmt: skip
     return found
 

@@ -52,6 +52,7 @@ class Drive:
     along   (steps, A) m along its road of each actor, every traffic.STEP seconds; constant for those that stand
     aside   (A,) m to the left of its road; number (A,) of its road in the ground, -1 for those that stand
     ahead   (A,) +1 or -1: whether it faces along its road or against
+    turned  (steps, A) rad by which each looks elsewhere than ahead, counter-clockwise
     own     (steps,) m of the carrier along the main road; lane, its m to the left of the centre line
     weave   (3, 3): amplitude, frequency in rad/s, phase of what the carrier's offset, pitch and roll sway by
     """
@@ -62,6 +63,7 @@ class Drive:
     aside: np.ndarray
     number: np.ndarray
     ahead: np.ndarray
+    turned: np.ndarray
     own: np.ndarray
     lane: float
     weave: np.ndarray
@@ -90,13 +92,13 @@ class Drive:
 
     def _placed(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         place, yaw = self.actors.place.copy(), self.actors.yaw.copy()
-        s = _at(self.along, np.array([time]))[0]
+        s, turned = (_at(track, np.array([time]))[0] for track in (self.along, self.turned))
         x, y = np.zeros((2, len(place)))
         for number, road in enumerate(self.world.ground.roads):
             mine = np.flatnonzero(self.number == number)
             if len(mine):
                 x[mine], y[mine], heading = road.at(s[mine], self.aside[mine])
-                yaw[mine] = heading + np.where(self.ahead[mine] > 0, 0, np.pi)
+                yaw[mine] = heading + np.where(self.ahead[mine] > 0, 0, np.pi) + turned[mine]
         moved = np.flatnonzero(self.number >= 0)  # on all roads at once: long drives have many
         x, y = x[moved], y[moved]
         place[moved] = np.column_stack([x, y, self.world.ground.height(x, y) + self._up(moved, x, y)])
@@ -209,8 +211,8 @@ def _set_off(
     weave = np.array([(0.12, 0.35, 0), (0.003, 5.0, 0), (0.004, 3.5, 0)]) * [[1, rng.uniform(0.8, 1.2), 0]]
     weave[:, 2] = rng.uniform(0, 2 * np.pi, 3)
     still = number < 0
-    whole = np.where(still, 0.0, track)
-    return Drive(world, actors, whole, np.where(still, 0.0, aside), number, ahead, mine, lane, weave)
+    whole, turned = np.where(still, 0.0, track), np.zeros(track.shape, np.float32)
+    return Drive(world, actors, whole, np.where(still, 0.0, aside), number, ahead, turned, mine, lane, weave)
 
 
 def _in_the_way(actors: Actors, aside: np.ndarray, number: np.ndarray, roads: tuple[Road, ...], lane: float, ahead):

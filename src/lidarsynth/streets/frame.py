@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,18 +12,21 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.streets.actors import KINDS, actors_of, numbers_of
+from lidarsynth.streets.apart import stand_apart
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import Box, boxes_of
 from lidarsynth.streets.drive import Drive, Moment, check_drives, draw_drive, parked_world
 from lidarsynth.streets.hdl64e import NAME
 from lidarsynth.streets.interiors import buildings
+from lidarsynth.streets.layout import build
 from lidarsynth.streets.moving import Bodies, MovingCaster
+from lidarsynth.streets.passing import set_apart
 from lidarsynth.streets.raycast import Caster
 from lidarsynth.streets.reader import FULL_TURN, Worlds, whole
 from lidarsynth.streets.sensor_model import OPTICS, Optics
 from lidarsynth.streets.turn import Turn, attitudes, perfect, sensor_pose, shoot
 from lidarsynth.streets.weather import CLEAR, Weather
-from lidarsynth.streets.world import POSES, World
+from lidarsynth.streets.world import POSES, World, visible
 
 OUTLIER = np.uint32(1)  # returns of rain and fog
 FURNITURE = np.uint32(99)  # SemanticKITTI's other-object
@@ -36,7 +40,8 @@ class Options:
     rate      turns per second
     speed     m/s the carrier would like to drive, None = as the street has it
     deskewed  the carrier's own motion within a turn is taken out of the points, as odometry data sets have it, and
-              boxes stand where the beams met them, as annotators put them around the points
+              boxes stand where the beams met them, as annotators put them around the points; of what moves and is met
+              by both ends of the turn, directly behind, one part is brought to the other
     perfect   as a simulator casts: every beam reports exactly what it meets first, with a reflectance of 0
     inside    places in buildings, not in streets: rooms, halls, garages, the sensor `mount` above the floor
     """
@@ -124,7 +129,7 @@ class LabelledStreets:
         full = sensor.name == NAME and sensor.width < FULL_TURN
         self.sensor = sensor.resized(width=FULL_TURN) if full else sensor
         self.seed, self.count, self.options = seed, count, options
-        self._worlds = buildings(seed, sensor) if options.inside else Worlds(seed, sensor, density=options.density)
+        self._worlds = self._places()
         self._held: tuple[int, Any] | None = None
 
     def __len__(self) -> int:
@@ -141,8 +146,8 @@ class LabelledStreets:
         return world, number
 
     def drive(self, number: int) -> Drive:
-        """Drive `number`, which lasts one turn longer than its frames."""
-        return draw_drive(self.seed, number, self._seconds, self.options.density, self.options.speed)
+        """Drive `number`, which lasts one turn longer than its frames, and in which nobody goes through anybody."""
+        return set_apart(draw_drive(self.seed, number, self._seconds, self.options.density, self.options.speed))
 
     def check_drives(self) -> None:
         """Raises ValueError where a drive is longer than a street may be: before any is drawn."""
@@ -152,6 +157,15 @@ class LabelledStreets:
     @property
     def _seconds(self) -> float:
         return (self.options.frames + 1) / self.options.rate
+
+    def _places(self) -> Worlds:
+        """Worlds of scans of places. Streets as they are stay what they always were, those of other densities have
+        everyone apart."""
+        if self.options.inside:
+            return buildings(self.seed, self.sensor)
+        density = self.options.density
+        built = None if density == TODAY else partial(_apart, self.seed, self.sensor, density)
+        return Worlds(self.seed, self.sensor, built=built)
 
     def _still(self, index: int) -> Frame:
         number, pose = divmod(index, POSES)
@@ -215,7 +229,10 @@ class LabelledStreets:
         late = None if times is None else times - stamp
         deskewed = self.options.deskewed and times is not None
         boxes = boxes_of(world, bodies, moment, sensor, turn, numbers, poses, late, to_world, as_seen=deskewed)
-        points = _deskewed(sensor, turn, poses, to_world) if deskewed else turn.points
+        points = turn.points
+        if deskewed and late is not None:
+            points = _deskewed(sensor, turn, poses, to_world)
+            _bring_together(points, numbers, boxes, late, period)
         order = np.roll(np.arange(sensor.width)[::-1], sensor.width // 2)
         hit = (turn.distance > 0)[:, order]
         ring, column = np.nonzero(hit)
@@ -230,6 +247,11 @@ class LabelledStreets:
         raw = np.where((scan.label == 0) & (turn.face[:, order][hit] < 0), OUTLIER, raw)
         raw = np.where((raw == 0) & self.options.inside, FURNITURE, raw)
         return Frame(scan, raw, boxes, to_world, stamp, number, k)
+
+
+def _apart(seed: int, sensor: Sensor, density: Density, number: int) -> World:
+    """The street of that number, with everyone apart, as far as the sensor sees it."""
+    return visible(stand_apart(build(np.random.default_rng((seed, number)), density))[0], sensor)
 
 
 def _standing(bodies: Bodies) -> Moment:
@@ -247,6 +269,17 @@ def _raw(scan: Scan, numbers: np.ndarray, bodies: Bodies, moment: Moment) -> np.
     kinds = [KINDS[str(kind)] for kind in bodies.actors.kind]
     of_actor = np.array([0, *(k.moving if quick else k.raw for k, quick in zip(kinds, fast, strict=True))], np.uint32)
     return np.where(numbers > 0, of_actor[numbers], raw) | (numbers.astype(np.uint32) << np.uint32(16))
+
+
+def _bring_together(points: np.ndarray, numbers: np.ndarray, boxes: list[Box], late: np.ndarray, period: float) -> None:
+    """Move the points (H, W, 3) of what was met more than half a turn from when its box stands there: by its motion
+    since. numbers (H, W) as in `boxes_of`, late (W,) s after the stamp."""
+    for box in boxes:
+        if not (box.moves and box.points and box.late is not None):
+            continue
+        after = box.late - late
+        part = np.nonzero((numbers == box.instance) & (np.abs(after) > period / 2))
+        points[part] += (after[part[1], None] * box.velocity).astype(np.float32)
 
 
 def _deskewed(sensor: Sensor, turn: Turn, poses: np.ndarray, to_world: np.ndarray) -> np.ndarray:

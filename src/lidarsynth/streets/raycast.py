@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from ctypes import PyDLL
 from typing import Protocol
 
 import numpy as np
@@ -21,14 +22,20 @@ class AnyCaster(Protocol):
         ...
 
 
+def embree() -> PyDLL | None:
+    """As `library`, which whoever will cast rays asks for before it begins anything. Raises ImportError that names the
+    extra to install."""
+    try:
+        return library()
+    except ImportError as error:
+        raise ImportError("synthetic streets need embreex: pip install 'lidarsynth[synthetic]'") from error
+
+
 class Caster:
     """A scene of T triangles, corners (T, 3, 3) float32 metres. Raises ImportError that names the extra to install."""
 
     def __init__(self, corners: np.ndarray):
-        try:
-            packets = library()
-        except ImportError as error:
-            raise ImportError("synthetic streets need embreex: pip install 'lidarsynth[synthetic]'") from error
+        packets = embree()
         corners = np.ascontiguousarray(corners, np.float32)
         self._faces = PacketScene(corners).faces if packets else one_by_one(corners)
         self._axes, self.level = _planes(corners)

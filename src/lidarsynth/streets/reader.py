@@ -13,7 +13,7 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import FULL_TURNS, SENSORS, Sensor, get_sensor
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.layout import build
-from lidarsynth.streets.raycast import Caster
+from lidarsynth.streets.raycast import Caster, embree
 from lidarsynth.streets.sensor_model import OPTICS, Optics
 from lidarsynth.streets.turn import Turn, perfect, shoot
 from lidarsynth.streets.world import POSES, THING, World, visible
@@ -37,7 +37,7 @@ class Worlds:
 
     built  makes the world of a number, whole; None = a street's
 
-    Raises ValueError for a sensor that cannot stand on a road.
+    Raises ValueError for a sensor that cannot stand on a road, ImportError naming the extra when embreex is missing.
     """
 
     def __init__(
@@ -51,6 +51,7 @@ class Worlds:
         if not 0 < sensor.mount < sensor.max_range:
             raise ValueError(f"sensor {sensor.name}: expected a mount above the road and within its range of it, 0 to "
                              f"{sensor.max_range:g} m, found {sensor.mount:g}")  # fmt: skip
+        embree()
         self.seed, self.sensor, self.without, self.density = seed, sensor, without, density
         self._built = built or self._street
         self._kept: dict[int, tuple[World, Caster]] = {}

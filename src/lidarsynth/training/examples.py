@@ -49,6 +49,9 @@ class Streets:
     """
 
     def __init__(self, seed: int, sensor: Sensor, word: str = SYNTHETIC):
+        from lidarsynth.streets.raycast import embree
+
+        embree()
         self.seed = seed
         self.sensor = sensor
         self.words = words_of(word)

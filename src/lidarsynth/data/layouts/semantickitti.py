@@ -89,8 +89,10 @@ def _tracks(boxes: dict[str, list[dict]]) -> dict[str, dict]:
     for name, found in boxes.items():
         for box in found:
             track = tracks.setdefault(str(box["instance"]), {"kind": box["kind"], "size": box["size"], "frames": {}})
-            place = np.array(box["place"]) - box.get("late", 0.0) * np.array(box["world_velocity"])
-            track["frames"][name] = [*np.round(place, 4).tolist(), box["heading"], *box["world_velocity"]]
+            late = box.get("late", 0.0)
+            place = np.round(np.array(box["place"]) - late * np.array(box["world_velocity"]), 4).tolist()
+            heading = round(box["heading"] - late * box.get("spin", 0.0), 5)
+            track["frames"][name] = [*place, heading, *box["world_velocity"]]
     return tracks
 
 
