@@ -289,9 +289,8 @@ def test_numbers_of_held_out_images_are_in_a_table_and_printed_and_change_nothin
     words = command(cache, halves, "--set", "training.steps=4", "--workers", "0", "--validation", str(cache))
     main([*words, "--sample-every", "2"])
     assert (halves / "judged.csv").read_bytes() == (whole / "judged.csv").read_bytes()
-    assert (
-        f"lidarsynth: after step 4: validation/t_0.1 {last.judged['validation/t_0.1']:.4g}" in capsys.readouterr().err
-    )
+    told = f"validation/t_0.1 {last.judged['validation/t_0.1']:.4g}, "
+    assert f"lidarsynth: after step 4: {told}" in capsys.readouterr().err
 
 
 def test_a_run_refuses_what_does_not_fit(cache: Path, tmp_path: Path):
