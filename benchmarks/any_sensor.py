@@ -34,6 +34,7 @@ from lidarsynth.streets.interiors import interiors
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import SHARING, VirtualStreets
 from lidarsynth.streets.world import POSES
+from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.verbs.completion import named_sensor
 from lidarsynth.verbs.inputs import Reading, inputs_of
 
@@ -60,13 +61,29 @@ def every(image: RangeImage, step: int) -> np.ndarray:
     return known
 
 
+def model_in(word: str, sensor: ls.Sensor) -> ScanModel:
+    """The model in the rays of a sensor. Raises ValueError for one of other beams."""
+    model = loaded(word)
+    model = model.into(sensor) if model.any_sensor else model
+    if model.sensor.elevations != sensor.elevations:
+        raise ValueError(f"expected a model of any sensor, or one of {sensor.name}, found {word}")
+    return model
+
+
+def opened(paths: Sequence[Path], models: Sequence[str], own: Own) -> list[RangeImage]:
+    """The scans; what is wrong with any, or with a model, is said before a line of a table."""
+    if not paths:
+        raise ValueError("expected SCAN..., found none")
+    images = list(map(own, paths))
+    for word in models:
+        for image in images:
+            model_in(word, image.sensor)
+    return images
+
+
 def completed(word: str, image: RangeImage, known: np.ndarray) -> RangeImage:
     """The image of its known pixels only, filled by a model in the same rays."""
-    model = loaded(word)
-    model = model.into(image.sensor) if model.any_sensor else model
-    if model.sensor.elevations != image.sensor.elevations:
-        raise ValueError(f"expected a model of any sensor, or one of {image.sensor.name}, found {word}")
-    return model.complete(image.keep(known), known)
+    return model_in(word, image.sensor).complete(image.keep(known), known)
 
 
 def mean_errors(filled: RangeImage, image: RangeImage, hidden: np.ndarray) -> np.ndarray:
@@ -77,9 +94,10 @@ def mean_errors(filled: RangeImage, image: RangeImage, hidden: np.ndarray) -> np
 
 def errors(paths: Sequence[Path], models: Sequence[str], own: Own = own_image, returned: bool = False) -> Iterator[str]:
     """Metres / reflectance of each, and of the last model against the best of the interpolations."""
+    images = opened(paths, models, own)
     yield "| scan, beams kept | " + " | ".join((*RIVALS, *models)) + " | against the best |"
     yield "|---" * (len(RIVALS) + len(models) + 2) + "|"
-    for image, name in ((own(path), path.name) for path in paths):
+    for image, name in zip(images, (path.name for path in paths), strict=True):
         for step in (2, 4):
             known = every(image, step)
             hidden = ~known & (image.mask | (not returned))
@@ -93,7 +111,7 @@ def phantoms(paths: Sequence[Path], models: Sequence[str], own: Own = own_image)
     """Hidden pixels filled nearer than 5 m where the truth is empty, or where it is a quarter farther; how many of the
     first lie on flat ground, from which a ray came back to nobody; and how many of both the median scan has."""
     counts: dict[str, list[tuple[int, int, int]]] = {word: [] for word in ("bilinear", *models)}
-    for image in map(own, paths):
+    for image in opened(paths, models, own):
         known = every(image, 4)
         for word, found in counts.items():
             filled = completed(word, image, known)
@@ -113,7 +131,7 @@ def floating(paths: Sequence[Path], models: Sequence[str], own: Own = own_image)
     """New points farther than 0.5 m, and 3 % of their range, from every point of the whole scan; and how far new points
     are from the nearest one on average."""
     rows: dict[str, list[tuple[float, float, float]]] = {word: [] for word in (*RIVALS, *models)}
-    for image in map(own, paths):
+    for image in opened(paths, models, own):
         known, measured = every(image, 4), KDTree(image.sensor.points(image.range)[image.mask])
         for word, found in rows.items():
             filled = completed(word, image, known)
@@ -130,11 +148,11 @@ def floating(paths: Sequence[Path], models: Sequence[str], own: Own = own_image)
 
 def shadow(paths: Sequence[Path], models: Sequence[str], own: Own = own_image) -> Iterator[str]:
     """Of unknown pixels that KITTI's car would hide, and of others of the same beams: the share that stays empty."""
-    kitti = ls.get_sensor("hdl-64e-kitti")
+    images, kitti = opened(paths, models, own), ls.get_sensor("hdl-64e-kitti")
     mask, elevations = hdl64e.hidden(kitti), np.asarray(kitti.elevations)
     yield "| scan | model | empty where KITTI's car stands | truly so | elsewhere in these beams | truly so |"
     yield "|---" * 6 + "|"
-    for image, name in ((own(path), path.name) for path in paths):
+    for image, name in zip(images, (path.name for path in paths), strict=True):
         row = np.abs(np.asarray(image.sensor.elevations)[:, None] - elevations).argmin(1)
         column = (np.arange(image.shape[1]) * kitti.width / image.shape[1]).astype(int)
         car, known = mask[np.ix_(row, column)], every(image, 4)
@@ -174,6 +192,8 @@ def inside(models: Sequence[str], count: int = 24) -> Iterator[str]:
     """Metres / reflectance of hidden pixels, and of those that returned, in as many buildings; nobody is told how the
     sensor stands."""
     images = buildings(count)
+    for word in models:
+        model_in(word, images[0].sensor)
     yield f"| {count} buildings | " + " | ".join((*RIVALS, *models)) + " |"
     yield "|---" * (len(RIVALS) + len(models) + 1) + "|"
     patterns: dict[str, Callable[[RangeImage, int], np.ndarray]] = {

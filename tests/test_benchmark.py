@@ -21,7 +21,7 @@ from lidarsynth.benchmark.published import PUBLISHED, published, why_not
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.run import benchmark
 from lidarsynth.benchmark.store import Seconds
-from lidarsynth.benchmark.tables import RANK, Column, protocol_columns, table
+from lidarsynth.benchmark.tables import RANK, Column, notes, protocol_columns, table
 from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.evaluation.protocols import PROTOCOLS, R2DM_UPSAMPLING
@@ -400,6 +400,24 @@ def test_the_best_is_bold_bounds_and_fewer_scans_take_no_part():
         "| none | 4 | N/A | N/A |",
     ]
     assert "**" not in "".join(table(found[:1], [lower])), "alone nobody is best"
+    assert lower.cells([row("a", 2.01), row("b", 1.99), row("c", 2.2)]) == ["**2.0**", "**2.0**", "2.2"], "as shown"
+
+
+def test_rows_that_were_judged_as_other_images_are_told_and_none_is_best():
+    def row(name: str, images: str, floor: bool = False) -> Row:
+        report = {"values": {"JSD x1e2": {"value": float(len(name))}}, "images": images}
+        return Row(name, name, {}, 4, {"bev-1": report}, floor=floor)
+
+    column = next(c for c in protocol_columns("bev-1") if c.heading == "JSD x1e2")
+    one, other = "64 x 1024 of hdl-64e", "64 x 1024 of hdl-64e-kitti"
+    alike = [row("a", one), row("bb", one)]
+    assert column.cells(alike) == ["**1.000**", "2.000"] and notes(alike, [column], "bev-1") == []
+    mixed = [*alike, row("ccc", other)]
+    assert column.cells(mixed) == ["1.000", "2.000", "3.000"]
+    (note,) = notes(mixed, [column], "bev-1")
+    assert f"not to be compared: a, bb as {one}; ccc as {other}; `sensor` in the file" in note
+    floor = [*alike, row("ccc", other, floor=True)]
+    assert column.cells(floor)[0] == "**1.000**" and "ccc as" in notes(floor, [column], "bev-1")[0]
 
 
 # generation

@@ -33,7 +33,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.cascade.layout import block, sampling
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.diffusion.model import LidarModel
-from lidarsynth.verbs.generation import cut, processes
+from lidarsynth.verbs.generation import cut, processes, steps_of
 from lidarsynth.weights.load import load
 
 
@@ -244,6 +244,26 @@ def test_a_folder_of_another_sensor_is_refused_by_name_and_one_of_before_goes_on
     assert "0 of them new" in run(*words, "vlp-16").out
     told = "made with {'model': 'default', 'sensor': 'hdl-32e', 'weights': "
     refused(run(*words, "hdl-32e"), told, f"found {{'weights': '{before['weights']}'}}; use")
+
+
+def test_a_cascades_folder_records_the_samplers_steps_apart_from_the_fills_and_one_of_before_goes_on(
+    run: Run, tmp_path: Path
+):
+    words = ("generate", "-n", 1, "--out", tmp_path, "--no-picture", "--sensor", "vlp-16", "--steps")
+    record = tmp_path / "generate.json"
+    assert run(*words, 2).code == 0
+    found = json.loads(record.read_text())
+    assert (found["steps"], found["fill_steps"]) == (2, 1)
+    refused(run(*words, 3), "made with {'steps': 3}, found {'steps': 2}; use")
+    record.write_text(json.dumps({key: value for key, value in found.items() if key != "fill_steps"} | {"steps": 3}))
+    assert "0 of them new" in run(*words, 2).out  # 3 were those of both
+    refused(run(*words, 3), "made with {'steps': 3}, found {'steps': 2}; use")
+
+
+def test_columns_are_recorded_as_they_are_drawn():
+    model = load("default")
+    assert steps_of(model) == {"steps": 128, "fill_steps": 1}
+    assert steps_of(model, 4) == {"steps": 4, "fill_steps": 1}
 
 
 def test_scans_of_others_are_not_taken_for_generated_ones(run: Run, tiny: Path, tmp_path: Path):

@@ -452,6 +452,16 @@ def test_point_sets_are_judged_where_they_are_few_enough():
     assert json.loads(report.json())["values"]["SWD"]["reason"].endswith("not here")
 
 
+def test_progress_goes_on_while_distances_of_point_sets_are_computed():
+    told: list[tuple[str, int, int]] = []
+    few = replace(DUSTY, sets=replace(DUSTY.sets, points=16))
+    report = evaluation.evaluate(STREETS, REAL, few, on_images=lambda *step: told.append(step))
+    assert [step for step in told if step[2] == 91] == [
+        ("compute COV", i + 1, 91) for i in range(91)
+    ]  # once for 3 rows
+    assert report.values == evaluation.evaluate(STREETS, REAL, few).values
+
+
 def broken_sample(folder: Path, values: torch.Tensor) -> Path:
     folder.mkdir()
     torch.save(values, folder / "0.pth")

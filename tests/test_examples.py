@@ -75,10 +75,21 @@ def test_what_a_script_cannot_read_is_one_line(
     monkeypatch.chdir(tmp_path)
     for path, told in ((scans / "forty.ply", "expected the beams of hdl-64e, "),
                        (tmp_path / "nowhere.bin", "expected a readable file, found: No such file")):  # fmt: skip
-        code, _, error = program(script, *before, path, *after)
-        assert code == 2 and error.startswith(f"lidarsynth: {path}: {told}") and "\n" not in error
+        code, out, error = program(script, *before, path, *after)
+        assert code == 2 and out == "" and error.startswith(f"lidarsynth: {path}: {told}") and "\n" not in error
         assert "model.into" not in error
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("report", ["errors", "phantoms", "floating", "shadow"])
+def test_a_benchmark_prints_no_head_of_a_table_that_it_cannot_make(program: Program, scans: Path, report: str):
+    good = scans / "hdl-32e.ply"
+    for words, told in (((), "expected SCAN..., found none"),
+                        ((good, scans / "forty.ply"), f"{scans / 'forty.ply'}: expected the beams of"),
+                        ((good, "--models", "nonsense"), "nonsense: expected shipped weights"),
+                        ((good, "--models", "nearest", "kitti-streets"), "hdl-32e, found kitti-streets")):  # fmt: skip
+        code, out, error = program("benchmarks/any_sensor.py", report, *words)
+        assert (code, out) == (2, "") and told in error and "\n" not in error
 
 
 def test_a_sensor_of_one_s_own_is_named_to_a_benchmark(program: Program, scans: Path):

@@ -276,3 +276,19 @@ def test_fractions_in_a_column_of_whole_numbers_stay(tmp_path: Path):
         np.testing.assert_array_equal(read(tmp_path / name).reflectance, np.float32([0.25, 0.75, 1]))
         (tmp_path / name).write_text(header + "\n".join(rows).replace("0.25", "51").replace("0.75", "102") + "\n")
         np.testing.assert_allclose(read(tmp_path / name).reflectance, [51 / 255, 102 / 255, 1 / 255], rtol=1e-6)
+
+
+def test_an_image_without_a_sensor_is_told_what_its_file_lacks(tmp_path: Path):
+    """As generators' code saves what it made: no points, and not what `write` makes of an image."""
+    image = np.random.default_rng(0).uniform(5, 50, (32, 64)).astype(np.float32)
+    looks = "which looks like an image: its file is an npz of range, reflectance, mask and sensor"
+    for array in (image, np.stack([image, image]), np.stack([image, image], -1), np.stack([[image, image]] * 3)):
+        np.save(tmp_path / "made.npy", array)
+        with pytest.raises(FileError, match=looks):
+            read(tmp_path / "made.npy")
+    np.savez(tmp_path / "made.npz", range=image, reflectance=image / 50)
+    with pytest.raises(FileError, match="expected a saved range image, found no mask, sensor in range, reflectance"):
+        read(tmp_path / "made.npz")
+    np.save(tmp_path / "table.npy", np.zeros((300, 12), np.float32))
+    with pytest.raises(FileError, match=r"found \(300, 12\) of float32$"):
+        read(tmp_path / "table.npy")

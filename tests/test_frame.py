@@ -13,9 +13,9 @@ from lidarsynth.lidar.crowding import stand_of_beams
 from lidarsynth.lidar.frame import AXES, check_frame, parse_transform, pose_of, transformed, turns_left
 from lidarsynth.lidar.ground import plane, road_axis
 from lidarsynth.lidar.motion import straighten
-from lidarsynth.lidar.recognition import elevations_of, recognise
+from lidarsynth.lidar.recognition import elevations_of, recognise, rings_in_order
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import INVERTED, SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import INVERTED, SENSORS, WORDS, Sensor, get_sensor
 from lidarsynth.lidar.view import misfit
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.verbs.placement import read_transform
@@ -151,6 +151,30 @@ def test_rings_between_the_beams_are_no_named_sensors():
     second = own[np.asarray(own.ring) % 2 == 1]
     for ring in (np.asarray(second.ring), np.asarray(second.ring) // 2):
         assert misfit(second.xyz, SENSORS["vlp-16"], ring) is None, "every second beam, numbered as it was, and anew"
+
+
+@pytest.mark.parametrize("named", ["os1-64", "pandar64"])
+def test_as_many_rings_that_are_off_the_beams_are_no_named_sensors(named: str):
+    """In the view of the named one, whose rows they filled without a word, numbered or in the file's order."""
+    other = Sensor("other", tuple(np.linspace(14, -15, 64).tolist()), 512)
+    scan = cylinder(other)
+    assert misfit(scan.xyz, other, scan.ring) is None
+    for ring in (scan.ring, None):
+        assert "on 64 rings, half of which are" in str(misfit(scan.xyz, SENSORS[named], ring))
+
+
+def test_a_unit_that_is_a_little_off_its_table_or_its_origin_is_no_other_sensor():
+    """As a real OS1-64 in its packets' frame, 0.2 degrees off, whose lowest rings were empty and called another's."""
+    table = SENSORS["os1-64"]
+    unit = replace(table, elevations=tuple((np.array(table.elevations) + 0.2).tolist()))
+    scan = cylinder(unit)
+    few = np.asarray(scan.ring) < 61
+    assert misfit(scan.xyz[few], table, np.asarray(scan.ring)[few]) is None
+    near = replace(cylinder(table), xyz=0.2 * cylinder(table).xyz + np.float32([0, 0, 0.04]))  # walls at 4 m
+    assert misfit(near.xyz, table, near.ring) is None
+    for grid in ("hdl-64e", "hdl-64e-r2dm", "hdl-64e-lidargen"):
+        turn = street("hdl-64e-kitti", rings=False).xyz
+        assert misfit(turn, WORDS[grid], rings_in_order(turn)) is None
 
 
 def cylinder(sensor: Sensor) -> Scan:

@@ -269,6 +269,30 @@ def test_tensorboard_holds_losses_speed_validation_and_pictures(cache: Path, tmp
     assert board.Scalars("train/loss")[1].value == pytest.approx(rows[1])
 
 
+def test_numbers_of_held_out_images_are_in_a_table_and_printed_and_change_nothing_learned(
+    cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    looking, whole = Options(sample_every=2, save_every=2, workers=0), tmp_path / "whole"
+    (last, *_) = reversed(list(run(tiny(4), cache, whole, options=looking, validation=cache)))
+    with (whole / "judged.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["step"] for row in rows} == {"2", "4"}
+    assert last.judged == {row["number"]: float(row["value"]) for row in rows if row["step"] == "4"}
+    assert {"validation/t_0.1", "validation/completion"} <= last.judged.keys()
+    list(run(tiny(4), cache, tmp_path / "blind", options=QUIET))
+    assert not (tmp_path / "blind" / "judged.csv").exists()
+    assert (tmp_path / "blind" / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+    halves = tmp_path / "halves"
+    list(run(tiny(2), cache, halves, options=looking, validation=cache))
+    with (halves / "judged.csv").open("a") as file:
+        file.write("3,validation/completion,0.5\n")  # of a run that was killed after its checkpoint
+    words = command(cache, halves, "--set", "training.steps=4", "--workers", "0", "--validation", str(cache))
+    main([*words, "--sample-every", "2"])
+    assert (halves / "judged.csv").read_bytes() == (whole / "judged.csv").read_bytes()
+    told = f"validation/t_0.1 {last.judged['validation/t_0.1']:.4g}, "
+    assert f"lidarsynth: after step 4: {told}" in capsys.readouterr().err
+
+
 def test_a_run_refuses_what_does_not_fit(cache: Path, tmp_path: Path):
     with pytest.raises(ValueError, match="expected a run to resume, found no checkpoint"):
         list(run(tiny(2), cache, tmp_path, options=QUIET, resume=True))

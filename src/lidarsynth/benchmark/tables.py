@@ -38,19 +38,24 @@ class Column:
     competes: bool = True  # whether the best is bold
     published: Callable[[Row], float | None] = lambda row: None
     why: Callable[[Row], str] = lambda row: row.reason
+    images: Callable[[Row], str] = lambda row: ""  # that a row was judged as; of several nobody is best
 
     def cells(self, rows: Sequence[Row]) -> list[str]:
-        """A cell per row; the best of the rows of most scans is bold, bounds and shorter ones take no part."""
+        """A cell per row; the best of the rows of most scans is bold, and what is shown equal to it; bounds and shorter
+        ones take no part."""
         values = [self.value(row) for row in rows]
         most = max((row.count for row in rows if not row.floor), default=0)
         competing = [
             self.competes and not row.floor and row.count == most and v is not None
             for v, row in zip(values, rows, strict=True)
         ]
-        ranks = [self.rank(v) for v, competes in zip(values, competing, strict=True) if competes and v is not None]
+        if len({self.images(row) for row, competes in zip(rows, competing, strict=True) if competes}) > 1:
+            competing = [False] * len(rows)
+        shown = [None if v is None else round(v, self.digits) + 0.0 for v in values]  # no -0.000
+        ranks = [self.rank(v) for v, competes in zip(shown, competing, strict=True) if competes and v is not None]
         cells = []
-        for value, competes, row in zip(values, competing, rows, strict=True):
-            cell = "N/A" if value is None else f"{round(value, self.digits) + 0.0:.{self.digits}f}"  # no -0.000
+        for value, competes, row in zip(shown, competing, rows, strict=True):
+            cell = "N/A" if value is None else f"{value:.{self.digits}f}"
             if value is not None and competes and len(ranks) > 1 and self.rank(value) == min(ranks):
                 cell = f"**{cell}**"
             paper = self.published(row)
@@ -98,6 +103,7 @@ def protocol_columns(name: str) -> list[Column]:
             True,
             lambda row: row.published.get(name, {}).get(row_name),
             lambda row: row.why(name, row_name),
+            lambda row: row.reports.get(name, {}).get("images", ""),
         )
 
     absent = [column(row_name, "", 3, "") for row_name, _ in protocol.absent]
@@ -140,6 +146,13 @@ def notes(rows: Sequence[Row], columns: Sequence[Column], protocol: str) -> list
                 told.setdefault(reason, []).append(row.name if reason == row.reason else column.heading)
     lines = [f"- N/A, {', '.join(dict.fromkeys(names))}: {_escaped(reason)}" for reason, names in told.items()]
     judged = [row for row in rows if "values" in row.reports.get(protocol, {})]
+    kinds: dict[str, list[str]] = {}
+    for row in judged:
+        kinds.setdefault(row.reports[protocol].get("images", ""), []).append(row.name)
+    if len(kinds) > 1:
+        each = "; ".join(f"{', '.join(names)} as {images}" for images, names in kinds.items())
+        lines.append(f"- {_escaped(f'numbers of other images are not to be compared: {each}')}; "
+                     "`sensor` in the file draws points and tensors into those of one")  # fmt: skip
     for warning in dict.fromkeys(text for row in judged for text in row.reports[protocol].get("warnings", ())):
         warned = [row.name for row in judged if warning in row.reports[protocol].get("warnings", ())]
         whose = "" if len(warned) == len(judged) else f"{', '.join(warned)}: "

@@ -35,7 +35,7 @@ def generate(
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.generation import Drawing, claim, endings_of, generate_into, missing, processes
+    from lidarsynth.verbs.generation import Drawing, claim, endings_of, generate_into, missing, processes, steps_of
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
@@ -44,8 +44,9 @@ def generate(
     loaded = source.of(load_with_bar(model, device))
     calls = loaded.generation_steps(steps, sampler)
     used = loaded.sampler_used(steps, sampler)
-    settings = {"weights": fingerprint(loaded), "format": format, "steps": calls, "sampler": used, "seed": seed}
-    settings |= {"model": str(model), "sensor": loaded.sensor.name} | ({"labels": True} if labels else {})
+    settings = {"weights": fingerprint(loaded), "format": format} | steps_of(loaded, steps, sampler)
+    settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
+    settings |= {"labels": True} if labels else {}
     settings |= {} if layouts is None else {"layouts": layouts}
     with only_writer(out, "generation"):
         claim(out, settings, loaded.sampler_used(steps))

@@ -128,6 +128,9 @@ def progress_line(run: Iterator[Progress], steps: int) -> Iterator[int]:
             rest = f"norm {progress.grad_norm:.2f} rate {progress.learning_rate:.1e}"
             bar.set_postfix_str(f"{losses} {rest}", refresh=False)
             bar.update(progress.step - bar.n)
+            if progress.judged:
+                numbers = ", ".join(f"{name} {value:.4g}" for name, value in progress.judged.items())
+                tqdm.write(f"lidarsynth: after step {progress.step}: {numbers}", file=sys.stderr)
             yield progress.step
             asked = time.perf_counter()
     finally:  # what a run ends with stands on a line of its own

@@ -23,6 +23,9 @@ from lidarsynth.metrics.point_sets import earth_movers_distance, sphere_counts
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 from lidarsynth.metrics.sharpness import KINDS
 
+OnPair = Callable[[int, int], object] | None  # (done, in all), for progress bars
+SetDistances = tuple[np.ndarray, np.ndarray, np.ndarray]
+
 
 def _frechet(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
     assert row.network
@@ -109,21 +112,39 @@ def _sets(statistics: Statistics) -> Sets:
     return statistics.protocol.sets
 
 
-@lru_cache(maxsize=1)  # three rows need the same; `set_distances.cache_clear()` lets go of the statistics
-def set_distances(samples: Statistics, real: Statistics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Earth mover's distances among the samples, between samples and real ones, and among the real ones."""
+def set_distances(samples: Statistics, real: Statistics, on_pair: OnPair = None) -> SetDistances:
+    """Earth mover's distances among the samples, between samples and real ones, and among the real ones.
+
+    on_pair  called with (distances done, in all) after each, which may take seconds
+    """
+    if not (kept := kept_distances(samples, real)):
+        kept.append(_set_distances(samples, real, on_pair))
+    return kept[0]
+
+
+@lru_cache(maxsize=1)  # `cache_clear()` lets go of the statistics
+def kept_distances(samples: Statistics, real: Statistics) -> list[SetDistances]:
+    """What `set_distances` found of these, which three rows need."""
+    return []
+
+
+def _set_distances(samples: Statistics, real: Statistics, on_pair: OnPair) -> SetDistances:
     record, fake, true = _sets(samples), samples.sets(), real.sets()
     g, r = len(fake), len(true)
     pairs = g * r + g * (g - 1) // 2 + r * (r - 1) // 2
     if pairs > record.pairs:
         raise ValueError(f"needs {pairs:,} earth mover's distances between sets of {record.points:,} points, at most "
                          f"{record.pairs:,} are computed here; dusty-2023-small takes fewer points")  # fmt: skip
-    within, between, among = ((fake, fake), (fake, true), (true, true))
-    return (
-        distance_matrix(*within, earth_movers_distance),
-        distance_matrix(*between, earth_movers_distance),
-        distance_matrix(*among, earth_movers_distance),
-    )
+    done = 0
+
+    def told(a: np.ndarray, b: np.ndarray) -> float:
+        nonlocal done
+        distance, done = earth_movers_distance(a, b), done + 1
+        if on_pair:
+            on_pair(done, pairs)
+        return distance
+
+    return distance_matrix(fake, fake, told), distance_matrix(fake, true, told), distance_matrix(true, true, told)
 
 
 def _cloud_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
@@ -160,4 +181,10 @@ MEASURES: dict[str, Callable[[Row, Statistics, Statistics, int], float]] = {
     "sets-mmd": _sets_mmd,
     "sets-1nna": _sets_1nna,
     **{f"sharp-{kind}": _sharpness for kind in KINDS},
+}
+# What rows share and takes long, computed before the first of them, with progress.
+SHARED: dict[str, Callable[[Statistics, Statistics, OnPair], object]] = {
+    "sets-coverage": set_distances,
+    "sets-mmd": set_distances,
+    "sets-1nna": set_distances,
 }

@@ -7,15 +7,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
-from lidarsynth.evaluation.measures import MEASURES, filled_scans, set_distances
+from lidarsynth.evaluation.measures import MEASURES, SHARED, filled_scans, kept_distances
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 
 DEFINITIONS = "## Definitions"  # every page has them
-OnRow = Callable[[str, int, int], object] | None  # (what, rows done, rows in all), for progress bars
+OnRow = Callable[[str, int, int], object] | None  # (what, done, in all) of rows, or of a row's parts; for progress bars
 
 
 @dataclass(frozen=True)
@@ -62,16 +63,20 @@ def results_of(
     for i, row in enumerate(samples.protocol.rows):
         if on_row:
             on_row(f"compute {row.name}", i, len(samples.protocol.rows))
-        rows.append(_result(row, samples, real, missing or {}, seed))
-    set_distances.cache_clear()
+        rows.append(_result(row, samples, real, missing or {}, seed, on_row))
+    kept_distances.cache_clear()
     return (*rows, *(Result(name, None, reason=reason) for name, reason in samples.protocol.absent))
 
 
-def _result(row: Row, samples: Statistics, real: Statistics, missing: Mapping[str, str], seed: int) -> Result:
+def _result(
+    row: Row, samples: Statistics, real: Statistics, missing: Mapping[str, str], seed: int, on_row: OnRow
+) -> Result:
     reason = _lack(row, samples, real, missing)
     value = None
     if not reason:
         try:
+            if on_row and row.measure in SHARED:
+                SHARED[row.measure](samples, real, partial(on_row, f"compute {row.name}"))
             value = MEASURES[row.measure](row, samples, real, seed) * row.scale
         except ValueError as error:
             reason = str(error)

@@ -20,6 +20,7 @@ from lidarsynth.files.fields import (
     Fields,
     FileError,
     check_names,
+    find,
     rings_of_grid,
     written_names,
 )
@@ -96,7 +97,10 @@ def fields_of(array: np.ndarray) -> Fields:
     if array.ndim == 3 and 3 <= array.shape[2] <= 10:
         array = array.reshape(-1, array.shape[2])
     if array.ndim != 2 or not 3 <= array.shape[1] <= 10 or array.dtype.kind not in "fiu":
-        raise FileError(f"expected an (N, 3) to (N, 10) array of points, found {array.shape} of {array.dtype}")
+        looks = array.ndim > 1 and sorted(array.shape)[-2] >= LOWEST
+        raise FileError(f"expected an (N, 3) to (N, 10) array of points, found {array.shape} of {array.dtype}"
+                        + (", which looks like an image: its file is an npz of range, reflectance, mask and sensor"
+                           if looks else ""))  # fmt: skip
     fields = dict(zip(COLUMNS, array.T, strict=False))
     ring = fields.get("ring")
     if ring is not None and not (
@@ -158,6 +162,8 @@ def read_npz(data: bytes) -> Fields:
     if "xyz" not in arrays:
         table = _points_among(arrays)
         if table is None:
+            if "range" in arrays and arrays["range"].ndim > 1 and find(arrays, "x") is None:
+                image_of(arrays)  # says what it lacks
             return dict(arrays)
         cells = table.shape if table.dtype.names else table.shape[:-1]
         more = {name: array for name, array in arrays.items() if array.shape == cells and array is not table}
@@ -224,6 +230,7 @@ IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least an
 
 
 NEEDED = {"range", "reflectance", "mask", "sensor"}  # arrays of a range image
+LOWEST = 16  # rows of what looks like an image, not like a table of points
 
 
 def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:

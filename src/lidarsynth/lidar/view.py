@@ -11,6 +11,8 @@ from lidarsynth.lidar.recognition import (
     EVERYWHERE,
     FAR,
     POINTS,
+    UNIT,
+    degrees_off,
     elevations_of,
     layers,
     lies_on,
@@ -53,11 +55,18 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
     rings = 0 if turns is None else _count(turns)
     if rings > MISCOUNTED * sensor.height:
         return f"them on {rings} rings, more than its {sensor.height} beams"
-    if other := _of_another(Scan(xyz, ring=ring), sensor):
+    scan = Scan(xyz, ring=ring)
+    if other := _of_another(scan, sensor):
         return other
     if ring is not None and off_rows(ring, xyz, sensor):
         return f"them on {_count(ring)} rings that are not on its {sensor.height} beams"
-    if ring is not None or turns is not None or is_even_grid(sensor):
+    rows = turns if ring is None else ring
+    if rows is not None:
+        off = degrees_off(rows, xyz, sensor)
+        if off is None or off < UNIT or lies_on(scan, sensor):
+            return None
+        return f"them on {_count(rows)} rings, half of which are {off:.1f} degrees or more off its beams"
+    if is_even_grid(sensor):
         return None
     few = far[np.random.default_rng(0).permutation(len(far))[:POINTS]]
     return BESIDE if share_on_beams(few, sensor) < BETWEEN else None

@@ -1,4 +1,5 @@
-"""What a run leaves to look at: a table of every step, TensorBoard curves and pictures, Weights & Biases if asked."""
+"""What a run leaves to look at: tables of every step and of what it is judged by, TensorBoard curves and pictures,
+Weights & Biases if asked."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from lidarsynth.pictures.render import save_png
 from lidarsynth.training.loop import Progress
 
 TABLE = "losses.csv"
+JUDGED, LOOKED = "judged.csv", ("step", "number", "value")  # a line for each number of each look
 
 
 class Journal:
@@ -23,8 +25,8 @@ class Journal:
     parts    names of the parts of the loss
     project  of Weights & Biases, or None
 
-    Raises ImportError when Weights & Biases is asked for and not installed. Without tensorboard, only the table and the
-    pictures are written.
+    Raises ImportError when Weights & Biases is asked for and not installed. Without tensorboard, only the tables and
+    the pictures are written.
     """
 
     def __init__(
@@ -42,6 +44,8 @@ class Journal:
         self._every = every
         self._recent: dict[str, list[float]] = defaultdict(list)
         self._table = _continue_table(self.out / TABLE, step, self._columns)
+        judged = self.out / JUDGED
+        self._judged = _continue_table(judged, step, LOOKED) if judged.exists() else None
         self._board = _tensorboard(self.out / "tensorboard", step)
         self._wandb = _wandb(self.out, project) if project else None
 
@@ -60,6 +64,14 @@ class Journal:
             speed = {"speed/samples_per_second": samples / seconds, "speed/waiting_share": waited / seconds}
             self.curves(progress.step, {**curves, **speed, "train/learning_rate": progress.learning_rate})
             self._recent.clear()
+
+    def judged(self, step: int, values: dict[str, float]) -> None:
+        """A line of the second table for each number of a look at the averaged weights, and a point of each curve."""
+        if self._judged is None:
+            self._judged = _continue_table(self.out / JUDGED, step, LOOKED)
+        self._judged.write("".join(f"{step},{name},{value!r}\n" for name, value in values.items()))
+        self._judged.flush()
+        self.curves(step, values)
 
     def curves(self, step: int, values: dict[str, float]) -> None:
         """A point of each named curve."""
@@ -81,6 +93,8 @@ class Journal:
     def close(self) -> None:
         """Write what is still in memory."""
         self._table.close()
+        if self._judged:
+            self._judged.close()
         if self._board:
             self._board.close()
         if self._wandb:

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -75,6 +75,7 @@ class Progress:
     seconds: float = 0.0  # that the step took
     waited: float = 0.0  # seconds of these spent waiting for data
     note: str = ""  # what the user should know, such as a damaged checkpoint that was passed over
+    judged: dict[str, float] = field(default_factory=dict)  # after a look at the averaged weights: what it found
 
 
 def start(experiment: Experiment, network: nn.Module, task: Task, scaler: torch.amp.GradScaler | None = None) -> Run:

@@ -37,12 +37,14 @@ class Monitor:
             if not words_of(data) and not words_of(validation):
                 SeveralCaches([*folders_of(data), *folders_of(validation)])  # refuses another sensor's
 
-    def look(self, network: nn.Module, step: int, journal: Journal) -> None:
-        """The task's numbers and pictures of the averaged weights, into the journal."""
+    def look(self, network: nn.Module, step: int, journal: Journal) -> dict[str, float]:
+        """The task's numbers and pictures of the averaged weights, into the journal; and the numbers."""
         self._images = self._images or _spread(self._experiment, self._source)
         values = self._task.judge(self._experiment, network, self._images)
-        journal.curves(step, {f"{self._name}/{name}": value for name, value in values.items()})
+        values = {f"{self._name}/{name}": float(value) for name, value in values.items()}
+        journal.judged(step, values)
         journal.pictures(step, "sample", self._task.pictures(self._experiment, network, self._images))
+        return values
 
 
 def _spread(experiment: Experiment, source: str | Path) -> list[RangeImage]:

@@ -23,12 +23,11 @@ from lidarsynth.lidar.whole_file import sweep, write_whole
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
-from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.model import FILL_STEPS, CascadeModel
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL
 
 RECORD = "generate.json"
-TOLD = {"steps": "steps of all networks"}  # those of the sampler, and the fill
 NAMED = frozenset({"model", "sensor"})  # in words what `weights` says in digits, by which alone folders are compared
 MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
 
@@ -39,6 +38,15 @@ def endings_of(format: str, labels: bool, picture: bool) -> tuple[str, ...]:
         words = ", ".join(ending.removeprefix(".") for ending in WRITERS)
         raise ValueError(f"expected a format of {words}, found {format!r}")
     return (f".{format}", *([LABEL] if labels else []), *([".png"] if picture else []))
+
+
+def steps_of(model: ScanModel, steps: int | None = None, sampler: str | None = None) -> dict[str, int]:
+    """What a folder records of a model's steps for a scan: `steps` of the sampler (of `columns`: the columns), and
+    `fill_steps` of a cascade, which follow them. Raises ValueError as `stream`."""
+    calls = model.generation_steps(steps, sampler)
+    if isinstance(model, CascadeModel):
+        return {"steps": calls - FILL_STEPS, "fill_steps": FILL_STEPS}
+    return {"steps": calls}
 
 
 def claim(folder: Path, settings: dict[str, Any], sampler: str | None = None) -> None:
@@ -52,9 +60,12 @@ def claim(folder: Path, settings: dict[str, Any], sampler: str | None = None) ->
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
     if record.exists():
         found = _recorded(record)
+        if "fill_steps" in settings and "fill_steps" not in found and isinstance(found.get("steps"), int):
+            fill = settings["fill_steps"]  # before 2026-11-28 `steps` held those of both
+            found |= {"steps": found["steps"] - fill, "fill_steps": fill}
         found |= {"sampler": sampler} if found.get("sampler") is None else {}
         if other := _differing(settings, found):
-            asked, was = ({TOLD.get(key, key): of.get(key) for key in other if key in of} for of in (settings, found))
+            asked, was = ({key: of.get(key) for key in other if key in of} for of in (settings, found))
             raise ValueError(f"{folder}: expected a folder of scans made with {asked}, found {was}; use another --out")
         return
     if taken := sorted(folder.glob("[0-9]" * 6 + ".*")):

@@ -155,7 +155,7 @@ def _run(
                 if stop or _due(progress.step, options.save_every, experiment):
                     save_checkpoint(out, _with_history(experiment, state.step, accelerator), state, options.keep)
                 if not stop and options.sample_every and _due(progress.step, options.sample_every, experiment):
-                    monitor.look(state.ema, state.step, journal)
+                    progress = replace(progress, judged=monitor.look(state.ema, state.step, journal))
                 yield progress
             if stop:
                 break

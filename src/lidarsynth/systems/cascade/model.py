@@ -61,6 +61,8 @@ from lidarsynth.systems.known_pixels import with_known
 from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep
 
+FILL_STEPS = 1  # after those of the layout
+
 
 @dataclass(frozen=True, repr=False)
 class CascadeModel(AnySensorModel):
@@ -224,7 +226,7 @@ class CascadeModel(AnySensorModel):
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch: the coarse steps, the fill. Raises ValueError as `stream`."""
         grid_of(self.sensor)
-        return 1 + sampling(self.network, steps, sampler)[1]
+        return sampling(self.network, steps, sampler)[1] + FILL_STEPS
 
     def sampler_used(self, steps: int | None = None, sampler: str | None = None) -> str | None:
         """`columns` where they draw, by default too: 128 steps of diffusion are as many calls."""
