@@ -16,9 +16,9 @@ import numpy as np
 from lidarsynth.data.index import MOVED, close_index, open_index, resumable_file, stored_step, write_index
 from lidarsynth.data.workers import in_order
 from lidarsynth.files.lock import only_writer
-from lidarsynth.lidar.depth import RANGE_STEP, range_step
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.stored import RANGE_STEP, range_step
 
 NO_LABEL = 255  # in every pixel of an image without labels
 SHARD = 64  # images per shard

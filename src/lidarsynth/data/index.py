@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lidarsynth.lidar.depth import RANGE_STEP
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
+from lidarsynth.lidar.stored import RANGE_STEP
 from lidarsynth.lidar.whole_file import sweep, whole_file
 
 INDEX, REPORT = "index.json", "report.json"

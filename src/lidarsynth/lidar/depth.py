@@ -13,7 +13,6 @@ from torch import Tensor
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
-RANGE_STEP = 0.002  # metres per unit of the uint16 that caches store, 0 = nothing returned; see `range_step`
 OVERSHOOT = 0.05  # what comes out of a network may pass its limits by so much, and is clipped; other codes by far more
 
 
@@ -108,14 +107,3 @@ def from_x_0(x_0: Tensor | np.ndarray, sensor: Sensor | str, codec: str = "log")
     mask = distance > 0
     reflectance = unit[1] * mask if len(unit) == 2 else torch.zeros_like(distance)
     return RangeImage(distance.numpy(), reflectance.numpy(), mask.numpy(), sensor)
-
-
-def range_step(sensor: Sensor) -> float:
-    """Metres per stored unit for this sensor: 2 mm, or as many whole millimetres as its furthest range needs."""
-    return max(RANGE_STEP, math.ceil(sensor.max_range / 65.535) / 1000)
-
-
-def as_stored(image: RangeImage) -> np.ndarray:
-    """(H, W) float32 ranges of the image as a cache of its sensor keeps them: what measured is never 0."""
-    step = range_step(image.sensor)
-    return np.where(image.mask, np.maximum(np.round(image.range / step), 1) * step, 0).astype(np.float32)

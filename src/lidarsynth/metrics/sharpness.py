@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarsynth.lidar.depth import as_stored
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.stored import as_stored
 
 BINS = 40
 # Bins of log10: what is finer than a sensor's own noise falls into the first one.
