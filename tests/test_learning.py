@@ -296,3 +296,13 @@ def test_scans_of_two_sensors_and_beams_that_only_see_the_sky_are_told():
         (line,) = doubts(learn_sensor([one] * 3 + others, "own"))
         assert f"expected as many rings in every scan, found {words} the others" in line
     assert doubts(learn_sensor([one] * 9 + [less], "own")) == [], "one odd scan of many is named, and no more"
+
+
+def test_scans_of_another_sensor_of_as_many_beams_are_left_out_and_told():
+    one, other = turn(SENSORS["vlp-16"]), turn(replace(SENSORS["vlp-16"], elevations=tuple(np.linspace(10, -20, 16))))
+    alone, mixed = learn_sensor([one] * 3, "own"), learn_sensor([one, other, one, other, one], "own")
+    assert mixed.sensor == alone.sensor and (mixed.scans, mixed.left) == (3, ("2 of other beams",))
+    (line,) = doubts(mixed)
+    assert "expected scans of one sensor, found 2 of 5 with rings 0.5 degrees or more off those of most" in line
+    lifted = [replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.3])) for scan in (one, turn(SENSORS["vlp-16"]))]
+    assert learn_sensor(lifted, "own").scans == 2, "an origin elsewhere is no other sensor"

@@ -25,6 +25,7 @@ SMEARED = 0.1  # degrees: known sensors' points lie within 0.03 of their beams w
 SAMPLE = 1500  # points of a ring and scan are enough
 HALVED = 0.5  # of the residual: heights that explain less are bent rings of a moving car
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
+OTHER = 0.5  # degrees: rings of two scans of one sensor are closer, as `recognition.UNIT`
 SPLIT = 0.2  # of the scans: so many that have other rings than the others are no chance
 ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
 
@@ -68,7 +69,14 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     where most beams are wider than SMEARED, or where most of what elevations crowd into are none.
     """
     kept, left, split = _alike(scans)
-    points = _pooled(kept)
+    guessed = _guessed(kept[0][0])
+    points, rings, row_of = _fitted(kept, guessed)
+    if others := sum(not _on(rings, row_of, *pair) for pair in kept) % len(kept):  # none, or all: they are of one kind
+        split = split or (f"expected scans of one sensor, found {others} of {len(kept)} with rings {OTHER} degrees or "
+                          "more off those of most, which are left out")  # fmt: skip
+        left.append(f"{others} of other beams")
+        kept = [pair for pair in kept if _on(rings, row_of, *pair)]
+        points, rings, row_of = _fitted(kept, guessed)
     steps, depths, grounds, above = [], [], [], 0
     for scan, ring in kept:
         steps.append(azimuth_step(scan.xyz, ring))
@@ -76,10 +84,8 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         depths.append((depth.min(), depth.max()))
         grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
         above += is_above(scan.xyz)
-    guessed = _guessed(kept[0][0])
-    rings, row_of = _fit_rows(points, FEWEST if guessed else THIN)
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
-    merged = len(points) - missing - len(rings)
+    merged = points - missing - len(rings)
     _check_sharp(rings, merged, kept[0][0], guessed)
     if guessed:
         _check_guessed(rings, merged, missing)
@@ -202,6 +208,23 @@ def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[s
     split = f"expected as many rings in every scan, {told}: are they of two sensors, or do beams see only the sky in " \
             "some? give scans of one sensor that show all of its beams"  # fmt: skip
     return kept, left, split
+
+
+def _fitted(kept: list[tuple[Scan, np.ndarray]], guessed: bool) -> tuple[int, list[Ring], np.ndarray]:
+    """How many rings the scans have, the fits of their rows, and the row of each."""
+    points = _pooled(kept)
+    return len(points), *_fit_rows(points, FEWEST if guessed else THIN)
+
+
+def _on(rings: list[Ring], row_of: np.ndarray, scan: Scan, ring: np.ndarray) -> bool:
+    """Whether half of a scan's rings lie less than OTHER degrees off their rows, as those of the same sensor do."""
+    off = []
+    for number, xyz in _rows(scan.xyz, ring, len(row_of)):
+        if len(xyz) >= THIN and row_of[number] >= 0:
+            fit, rho = rings[row_of[number]], np.hypot(xyz[:, 0], xyz[:, 1])
+            seen = np.degrees(np.arctan2(xyz[:, 2] - fit.height, rho))
+            off.append(abs(float(np.median(seen)) - fit.elevation))
+    return not off or float(np.median(off)) < OTHER
 
 
 def _pooled(kept: list[tuple[Scan, np.ndarray]]) -> list[np.ndarray]:
