@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from learn_judge import follow
+from learn_judge import descend
 from torch import Tensor
 
 from lidarsynth.experiment.record import with_fields
@@ -106,11 +106,7 @@ def learned(start: ClassUNet, scans: list[Sketches], steps: int, report: Callabl
         loss = objective(crops(scans[int(rng.integers(len(scans)))], rng, step))["named"].mean()
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1, (step + 1) / 100) * max(0.02, 1 - step / steps) ** 0.7
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        follow(mean, network, step, AVERAGE)
+        descend(loss, optimizer, network, mean, step, AVERAGE)
         if (step + 1) % OFTEN == 0:
             report(f"step {step + 1} of {steps}: {loss.item():.3f}")
     return mean.eval()

@@ -50,12 +50,19 @@ def learned(true: Grid, drawn: Grid, rays: Tensor, steps: int, width: int) -> Gr
         truth = torch.cat([torch.ones(BATCH), torch.zeros(BATCH)])
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
-        optimizer.zero_grad()
-        F.binary_cross_entropy_with_logits(odds, truth).backward()
-        torch.nn.utils.clip_grad_norm_(judge.parameters(), 1.0)
-        optimizer.step()
-        follow(mean, judge, step, AVERAGE)
+        descend(F.binary_cross_entropy_with_logits(odds, truth), optimizer, judge, mean, step, AVERAGE)
     return mean.eval()
+
+
+def descend(
+    loss: Tensor, optimizer: torch.optim.Optimizer, network: nn.Module, mean: nn.Module, step: int, average: float
+) -> None:
+    """One step down the gradient of a loss (), cut to a norm of 1, of a network's weights and their running mean."""
+    optimizer.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+    optimizer.step()
+    follow(mean, network, step, average)
 
 
 @torch.no_grad()

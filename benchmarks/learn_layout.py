@@ -23,7 +23,7 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
-from learn_judge import follow
+from learn_judge import descend
 from torch import Tensor, nn
 
 from lidarsynth.diffusion.denoiser import Denoiser
@@ -41,9 +41,9 @@ from lidarsynth.systems.cascade.training import CoarseObjective
 from lidarsynth.weights.load import load
 
 AVERAGE, OFTEN, WARM = 0.998, 100, 100
-# The time from which on drafts are made, and a little before it; the share of what learns them; times of judging.
+# A little below the time to which drafts are led; the share of times above it; times at which it is judged.
 FROM, OF_DRAFTS, TIMES = 0.42, 0.65, (0.3, 0.53, 0.75, 0.95)
-Parts: TypeAlias = "list[Tensor]"
+Grids: TypeAlias = "list[Tensor]"  # as of `grids_of`
 KITTI, OTHERS = "hdl-64e-kitti", tuple(sorted({*KNOWN} - {"hdl-64e-kitti"}))
 
 
@@ -56,7 +56,7 @@ def plain_sensor(rng: np.random.Generator) -> VirtualSensor:
     return VirtualSensor(replace(sensor, dimness=(), max_range=float(rng.uniform(60, 200))))
 
 
-def of_columns(cascade: Cascade, columns: nn.Module, grids: Parts, rng: torch.Generator, learns: bool) -> Tensor:
+def of_columns(cascade: Cascade, columns: nn.Module, grids: Grids, rng: torch.Generator, learns: bool) -> Tensor:
     """(3,) negative log-likelihoods of grids after drafts, of half of their columns."""
     metres, reflectance, rays, standing = grids
     whole = known_grid(metres, reflectance)
@@ -68,7 +68,7 @@ def of_columns(cascade: Cascade, columns: nn.Module, grids: Parts, rng: torch.Ge
         return columns(whole, rays, draft, judged, spoilt(whole, rng) if learns else whole).mean(0)
 
 
-def of_coarse(cascade: Cascade, coarse: nn.Module, grids: Parts, rng: torch.Generator, learns: bool) -> Tensor:
+def of_coarse(cascade: Cascade, coarse: nn.Module, grids: Grids, rng: torch.Generator, learns: bool) -> Tensor:
     """(1,) squared errors of the velocity, two thirds of them at times at which drafts are made; (4,) at TIMES."""
     metres, reflectance, rays, standing = grids
     x_0, count = cascade.coarse.encode(metres, reflectance, standing), len(metres)
@@ -89,8 +89,9 @@ def of_coarse(cascade: Cascade, coarse: nn.Module, grids: Parts, rng: torch.Gene
 PARTS = {"columns": (of_columns, 16, 3e-4), "coarse": (of_coarse, 32, 2e-4)}
 
 
-def grids_of(images: list[RangeImage], rng: np.random.Generator) -> Parts:
-    """Metres and reflectance, rays and standing elevations of as many grids, each in any phase."""
+def grids_of(images: list[RangeImage], rng: np.random.Generator) -> Grids:
+    """Metres and reflectance (B, 16, 128), rays (B, 8, 16, 128) and standing elevations (B, 16, 128) in radians of B
+    images, each in any phase."""
     return [torch.stack(part) for part in zip(*(grid(image, rng) for image in images), strict=True)]
 
 
@@ -99,24 +100,16 @@ def learned(
 ) -> nn.Module:
     """The part, gone on for so many steps: the running mean of its weights."""
     loss_of, batch, rate = PARTS[part]
-    network, mean, rng = (
-        deepcopy(getattr(cascade, part)).train(),
-        deepcopy(getattr(cascade, part)),
-        np.random.default_rng(0),
-    )
-    network.requires_grad_(True)
-    random = torch.Generator().manual_seed(0)
+    network, mean = (deepcopy(getattr(cascade, part)) for _ in range(2))
+    network.train().requires_grad_(True)
+    rng, random = np.random.default_rng(0), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(network.parameters(), rate, betas=(0.9, 0.99))
     for step in range(steps):
         chosen = [images[int(i)] for i in rng.integers(len(images), size=batch)]
         loss = loss_of(cascade, network, grids_of(chosen, rng), random, True).sum()
         for group in optimizer.param_groups:
             group["lr"] = rate * min(1, (step + 1) / WARM) * (0.02 + 0.98 * math.cos(math.pi * step / steps / 2) ** 2)
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        follow(mean, network, step, AVERAGE)
+        descend(loss, optimizer, network, mean, step, AVERAGE)
         if (step + 1) % OFTEN == 0:
             report(f"step {step + 1} of {steps}: {loss.item():.3f}")
     return mean.eval()

@@ -63,19 +63,21 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     """The sensor that took the scans: points with a ring field, or ring after ring in the file.
 
     Beams are fitted over all scans, z = tan(e) rho + h, with h = 0 unless heights halve the residual; a row's height is
-    the neighbours' where its own points cannot tell it. Rings of one beam are one row. Columns come from the azimuths'
-    steps, mount and tilt from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what
-    never returned in five scans or more, of several places. Raises ValueError without rings, with too few points, or
-    where most beams are wider than SMEARED, or where most of what elevations crowd into are none.
+    the neighbours' where its own points cannot tell it. Rings of one beam are one row. Scans half of whose rings are
+    OTHER degrees or more off are another sensor's, and left out. Columns come from the azimuths' steps, mount and tilt
+    from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what never returned in five
+    scans or more, of several places. Raises ValueError without rings, with too few points, or where most beams are
+    wider than SMEARED, or where most of what elevations crowd into are none.
     """
     kept, left, split = _alike(scans)
     guessed = _guessed(kept[0][0])
     points, rings, row_of = _fitted(kept, guessed)
-    if others := sum(not _on(rings, row_of, *pair) for pair in kept) % len(kept):  # none, or all: they are of one kind
+    on = [_on(rings, row_of, *pair) for pair in kept]
+    if any(on) and (others := on.count(False)):
         split = split or (f"expected scans of one sensor, found {others} of {len(kept)} with rings {OTHER} degrees or "
                           "more off those of most, which are left out")  # fmt: skip
         left.append(f"{others} of other beams")
-        kept = [pair for pair in kept if _on(rings, row_of, *pair)]
+        kept = [pair for pair, is_on in zip(kept, on, strict=True) if is_on]
         points, rings, row_of = _fitted(kept, guessed)
     steps, depths, grounds, above = [], [], [], 0
     for scan, ring in kept:
