@@ -139,8 +139,9 @@ def test_a_drawn_scan_is_rough_where_greenery_is_seen_in_it(monkeypatch: pytest.
         (image,) = model.generate(1, labels=True)
         assert image.label is not None and (image.label[image.mask] == CLASS_NUMBER[word]).all()
         seen.append(image)
-    smooth, rough = (np.abs(np.diff(image.range, 2, axis=1))[:, 8:-8] for image in seen)
-    assert (seen[0].mask == seen[1].mask).all()
+    assert (seen[0].mask == seen[1].mask).mean() > 0.9  # rays pass through leaves to the sky, and none through a road
+    here = seen[0].mask & seen[1].mask
+    smooth, rough = (np.abs(np.diff(image.range * here, 2, axis=1))[:, 8:-8] for image in seen)
     assert np.median(rough[rough > 0]) > 2 * np.median(smooth[smooth > 0])
 
 

@@ -37,10 +37,12 @@ class Grain(NamedTuple):
 # learned from scans of the sensor, all of it.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 OBSERVED, TUNED = Grain((1.0, 1.0, 1.0), ground=0.6), Grain((1.0, 1.0, 1.0), ground=1.0)
-# Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf or a stalk
-# before or behind it: of shares of the rays; of a few more, as a crown is deep. Chosen by street-2
-# (docs/generation.md); streets have 0.08, 0.035 and 0.02 for all of them.
-STRAYING = {"vegetation": ((0.955, 0.08), (0.045, 0.45)), "terrain": ((1.0, 0.035),), "trunk": ((1.0, 0.02),)}
+# Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf, a stalk, an
+# arm or a window's frame before or behind it: of shares of the rays. Chosen by street-2 (docs/generation.md); streets
+# have 0.08 for leaves, 0.035 for grass and 0.02 for bark, and shapes for the rest.
+STRAYING = {"vegetation": ((1.0, 0.08),), "terrain": ((1.0, 0.031),), "trunk": ((0.9, 0.025), (0.1, 0.08)),
+            "building": ((0.89, 0.0), (0.11, 0.045)), "person": ((0.7, 0.0), (0.3, 0.04))}  # fmt: skip
+UPRIGHT = 3.0  # degrees of elevation in which rays of a column stray alike from a building: frames and sills are edges
 ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about are drawn alike: things are whole
 # The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it
 # has: so there is as much terrain and fence as in streets, while labels are right more often.
@@ -98,7 +100,7 @@ def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
     also with the roughness of what grows, and then with the likeliest class alone."""
     noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(image.sensor)
     if image.label is not None:
-        noise = noise + torch.randn(image.shape, generator=rng).numpy() * _straying(texture(image.label), rng)
+        noise = noise + _straying(texture(image.label), image.sensor, rng)
     label = None if image.label is None else image.label % TEXTURE
     return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask, label=label)
 
@@ -114,13 +116,18 @@ def texture(label: np.ndarray) -> np.ndarray:
     return np.where(label < TEXTURE, label, label // TEXTURE)
 
 
-def _straying(label: np.ndarray, rng: torch.Generator) -> np.ndarray:
-    """(H, W) metres: how far each ray strays from what is of a class (H, W), standard deviation."""
-    chance, metres = torch.rand(label.shape, generator=rng).numpy(), np.zeros(label.shape, np.float32)
+def _straying(label: np.ndarray, sensor: Sensor, rng: torch.Generator) -> np.ndarray:
+    """(H, W) metres: how far each ray strays from what is of a class (H, W)."""
+    unit, chance = torch.randn(label.shape, generator=rng).numpy(), torch.rand(label.shape, generator=rng).numpy()
+    metres = np.zeros(label.shape, np.float32)
+    bands = np.floor(np.asarray(sensor.elevations) / UPRIGHT)
+    first = np.unique(bands, return_index=True)[1][np.unique(bands, return_inverse=True)[1]]  # row of each one's band
     for name, some in STRAYING.items():
         before, here = 0.0, label == CLASS_NUMBER[name]
+        how, off = (chance[first], unit[first]) if name == "building" else (chance, unit)
         for share, rough in some:
-            metres[here & (before <= chance) & (chance < before + share)] = rough
+            strays = here & (before <= how) & (how < before + share)
+            metres[strays] = rough * off[strays]
             before += share
     return metres
 

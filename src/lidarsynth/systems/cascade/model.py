@@ -28,6 +28,7 @@ from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.edges import with_edges
 from lidarsynth.systems.cascade.floating import settled
+from lidarsynth.systems.cascade.foliage import grown
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
 from lidarsynth.systems.cascade.holes import Told, with_holes_drawn, with_planes
 from lidarsynth.systems.cascade.images import (
@@ -242,16 +243,16 @@ class CascadeModel(AnySensorModel):
         """Grids (B, R, C) as whole images, with the texture of the classes that the fill draws, then of those that are
         seen in the result, by which surfaces are shaded, too, and cars and people cast anew."""
         drawn, shades = self._whole(metres, reflectance, rows, columns, rng)
-        recorded = textured(drawn, shades, rng)
         if self.network.classes is None:
-            return self._named(recorded)
+            return self._named(grown(drawn, shades, self._blocked, rng))
         network, more = self.network.drawn, SKETCHED
         if network is None:  # one that has seen recorded scans alone: calm between the beams of the grid
             network, more = self.network.classes, RARER | (GROWING if len(rows) > ROWS else {})
+        recorded = textured(drawn, shades, rng)
         seen = named(network, recorded, self.response, self.sensor, self.precision, more=more, alone=True)
         shades = np.stack([shaded(even, image, self.tuned) for even, image in zip(shades, seen, strict=True)])
-        recorded = textured([replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)], shades, rng)
-        cast = all_recast(recorded, rng)
+        drawn = [replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)]
+        cast = all_recast(grown(drawn, shades, self._blocked, rng), rng)
         if self.network.drawn is None:
             return as_cast(self._named(cast), cast)
         return cast if self.labelled else [replace(image, label=None) for image in cast]

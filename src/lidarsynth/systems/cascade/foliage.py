@@ -1,0 +1,59 @@
+"""Crowns that let rays through: a fill draws what grows as a wall, with whole edges; lasers meet a leaf, or what is
+behind it, and both stand beside each other in an image. Measured in docs/generation.md."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.systems.cascade.images import texture, textured
+
+# Share of the rays in and beside crowns that meet what a ray beside them meets, and how far beside at most: degrees on
+# the ring, and beams. Chosen by street-2 of streets told their own layouts.
+PIERCED, ASIDE, BEAMS = 0.25, 1.8, 1
+LEAFY = CLASS_NUMBER["vegetation"]
+STANDING = [CLASS_NUMBER[name] for name in ("vegetation", "building", "fence", "trunk", "pole", "traffic-sign")]
+
+
+def grown(
+    drawn: list[RangeImage], even: np.ndarray, blocked: np.ndarray, rng: list[torch.Generator]
+) -> list[RangeImage]:
+    """Images as recorded, `textured`, with `through_foliage`: reflectances `even` (B, H, W) on average."""
+    parts = [through_foliage(*both, blocked, one) for both, one in zip(zip(drawn, even, strict=True), rng, strict=True)]
+    return textured([image for image, _ in parts], np.stack([shade for _, shade in parts]), rng)
+
+
+def through_foliage(
+    image: RangeImage, even: np.ndarray, blocked: np.ndarray, rng: torch.Generator
+) -> tuple[RangeImage, np.ndarray]:
+    """A sample in the making, and its reflectances on average `even` (H, W), in which some rays in and beside what
+    grows meet, or miss, what a ray beside them does; as they are without labels.
+
+    Nothing is drawn onto the ground, vehicles or people, nor on blocked rays (H, W).
+    """
+    if image.label is None:
+        return image, even
+    height, width = image.shape
+    chance, up, aside = torch.rand(3, height, width, generator=rng).numpy()
+    reach = max(1, round(ASIDE / 360 * width))
+    rows = (np.arange(height)[:, None] + _step(up, BEAMS)).clip(0, height - 1)
+    columns = (np.arange(width) + _step(aside, reach)) % width
+    label = texture(image.label)
+    leafy = (label == LEAFY) & image.mask
+    open_to = (np.isin(label, STANDING) | ~image.mask) & ~blocked
+    moved = (leafy | leafy[rows, columns]) & open_to & open_to[rows, columns] & (chance < PIERCED)
+
+    def taken(part: np.ndarray) -> np.ndarray:
+        return np.where(moved, part[rows, columns], part)
+
+    parts = {name: taken(getattr(image, name)) for name in ("range", "reflectance", "mask", "label")}
+    return replace(image, **parts), taken(even)
+
+
+def _step(chance: np.ndarray, most: int) -> np.ndarray:
+    """Whole steps from -most to most, all as likely, of chances in [0, 1)."""
+    return np.floor(chance * (2 * most + 1)).astype(int) - most

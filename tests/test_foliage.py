@@ -1,0 +1,85 @@
+"""Crowns let rays through: beside what grows, some rays meet what is behind it, and some behind it meet a leaf."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.systems.cascade.foliage import ASIDE, PIERCED, grown, through_foliage
+from lidarsynth.systems.cascade.images import UPRIGHT, noisy
+
+SENSOR = SENSORS["os1-64"]
+REACH = round(ASIDE / 360 * SENSOR.width)
+NONE = np.zeros(SENSOR.blocked_rays().shape, bool)
+LEAVES, WALL, ROAD, CAR = (CLASS_NUMBER[name] for name in ("vegetation", "building", "road", "car"))
+
+
+def scene(*classes: int) -> RangeImage:
+    """Parts of the turn, each of a class, and each metres further away than the one before; 0 is no return."""
+    label = np.repeat(np.repeat(classes, SENSOR.width // len(classes))[None], SENSOR.height, 0)
+    metres = np.repeat(np.repeat(np.arange(len(classes)) * 4.0 + 4, SENSOR.width // len(classes))[None], len(label), 0)
+    mask = label > 0
+    return RangeImage((metres * mask).astype(np.float32), (metres / 100 * mask).astype(np.float32), mask, SENSOR, label)
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_what_is_beside_a_crown_is_seen_through_it_and_nothing_is_lost_on_average():
+    image = scene(LEAVES, WALL)
+    found, even = through_foliage(image, image.reflectance, NONE, rng())
+    edge = SENSOR.width // 2
+    beside = found.label[:, edge : edge + REACH] == LEAVES
+    assert 0.2 * PIERCED < beside.mean() < 0.8 * PIERCED
+    through = found.label[:, edge - REACH : edge] == WALL
+    assert abs(through.mean() - beside.mean()) < 0.05
+    inside = found.label[:, edge - 100 : edge - REACH]
+    assert (inside == LEAVES).all()
+    assert ((found.label == WALL) == (found.range == 8)).all()  # ranges, labels and reflectances go together
+    np.testing.assert_array_equal(even, found.reflectance)
+    np.testing.assert_allclose(even, found.range / 100, rtol=1e-6)
+
+
+def test_the_sky_is_seen_through_crowns_but_roads_and_cars_stay_as_they_are():
+    for other in (ROAD, CAR):
+        image = scene(LEAVES, other)
+        found, _ = through_foliage(image, image.reflectance, NONE, rng())
+        np.testing.assert_array_equal(found.label, image.label)
+    image = scene(LEAVES, 0)
+    found, _ = through_foliage(image, image.reflectance, NONE, rng())
+    assert (found.mask != image.mask).sum() > 50
+    np.testing.assert_array_equal(found.mask, found.label > 0)
+    assert not found.range[~found.mask].any()
+
+
+def test_blocked_rays_stay_empty_and_are_not_what_is_seen():
+    image = scene(LEAVES, 0)
+    blocked = ~image.mask
+    found, _ = through_foliage(image, image.reflectance, blocked, rng())
+    np.testing.assert_array_equal(found.mask, image.mask)
+
+
+def test_images_without_classes_stay_as_they_are_and_seeds_decide():
+    image = replace(scene(LEAVES, WALL), label=None)
+    assert through_foliage(image, image.reflectance, NONE, rng())[0] is image
+    image = scene(LEAVES, WALL)
+    one, again, other = (grown([image], image.reflectance[None], NONE, [rng(k)])[0].range for k in (0, 0, 1))
+    np.testing.assert_array_equal(one, again)
+    assert (one != other).any()
+
+
+def test_frames_of_windows_are_upright():
+    """A few rays on walls stray from them, one above the other alike, by more than the sensor's noise."""
+    image = scene(WALL)
+    off = noisy(image, rng()).range - 4
+    strays = np.abs(off) > 0.03
+    assert 0.02 < strays.mean() < 0.11
+    bands = np.floor(np.asarray(SENSOR.elevations) / UPRIGHT)
+    alike, apart = ((bands[1:] == bands[:-1]) == same for same in (True, False))
+    both = strays[1:] & strays[:-1]
+    assert both[alike].mean() > 0.6 * strays.mean() and both[apart].mean() < 0.3 * strays.mean()
+    assert np.corrcoef(off[1:][alike][both[alike]], off[:-1][alike][both[alike]])[0, 1] > 0.9
