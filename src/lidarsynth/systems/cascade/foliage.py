@@ -14,7 +14,7 @@ from lidarsynth.systems.cascade.images import texture, textured
 
 # Share of the rays in and beside crowns that meet what a ray beside them meets, and how far beside at most: degrees on
 # the ring, and beams. Chosen by street-2 of streets told their own layouts.
-PIERCED, ASIDE, BEAMS = 0.25, 1.8, 1
+PIERCED, ASIDE, BEAMS = 0.2, 1.8, 1
 LEAFY = CLASS_NUMBER["vegetation"]
 STANDING = [CLASS_NUMBER[name] for name in ("vegetation", "building", "fence", "trunk", "pole", "traffic-sign")]
 
