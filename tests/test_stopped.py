@@ -109,9 +109,20 @@ def test_sigterm_is_one_line_and_the_same_command_goes_on(group: bool, tmp_path:
 
 
 def test_sigterm_ends_as_it_did_where_a_command_is_done():
-    with pytest.raises(SystemExit, match="143"):
-        answer(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    answer(lambda: None)
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_the_same_sigterm_once_more_does_not_kill_what_is_about_to_exit():
+    def both() -> None:
+        with pytest.raises(SystemExit, match="143"):
+            answer(lambda: os.kill(os.getpid(), signal.SIGTERM))
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    try:
+        both()
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 TRAIN = ["train", "tiny", "--data", "cache", "--out", "run", "--workers", "2", "--threads", "1", "--sample-every", "0",
