@@ -114,13 +114,11 @@ def test_sigterm_ends_as_it_did_where_a_command_is_done():
 
 
 def test_the_same_sigterm_once_more_does_not_kill_what_is_about_to_exit():
-    def both() -> None:
+    try:
         with pytest.raises(SystemExit, match="143"):
             answer(lambda: os.kill(os.getpid(), signal.SIGTERM))
+        assert signal.getsignal(signal.SIGTERM) != signal.SIG_DFL
         os.kill(os.getpid(), signal.SIGTERM)
-
-    try:
-        both()
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 

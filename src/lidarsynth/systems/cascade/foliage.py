@@ -13,7 +13,7 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.systems.cascade.images import texture, textured
 
 # Share of the rays in and beside crowns that meet what a ray beside them meets, and how far beside at most: degrees on
-# the ring, and beams. Chosen by street-2 of streets told their own layouts.
+# the ring, and beams. Chosen by street-2, of streets told their own layouts and of drawn ones (docs/generation.md).
 PIERCED, ASIDE, BEAMS = 0.2, 1.8, 1
 LEAFY = CLASS_NUMBER["vegetation"]
 STANDING = [CLASS_NUMBER[name] for name in ("vegetation", "building", "fence", "trunk", "pole", "traffic-sign")]
@@ -30,8 +30,8 @@ def grown(
 def through_foliage(
     image: RangeImage, even: np.ndarray, blocked: np.ndarray, rng: torch.Generator
 ) -> tuple[RangeImage, np.ndarray]:
-    """A sample in the making, and its reflectances on average `even` (H, W), in which some rays in and beside what
-    grows meet, or miss, what a ray beside them does; as they are without labels.
+    """A sample in the making (H, W), metres, and its reflectances on average `even` (H, W) in [0, 1], in which some
+    rays in and beside what grows meet, or miss, what a ray beside them does; as they are without labels.
 
     Nothing is drawn onto the ground, vehicles or people, nor on blocked rays (H, W).
     """

@@ -120,8 +120,8 @@ def _straying(label: np.ndarray, sensor: Sensor, rng: torch.Generator) -> np.nda
     """(H, W) metres: how far each ray strays from what is of a class (H, W)."""
     unit, chance = torch.randn(label.shape, generator=rng).numpy(), torch.rand(label.shape, generator=rng).numpy()
     metres = np.zeros(label.shape, np.float32)
-    bands = np.floor(np.asarray(sensor.elevations) / UPRIGHT)
-    first = np.unique(bands, return_index=True)[1][np.unique(bands, return_inverse=True)[1]]  # row of each one's band
+    bands = np.unique(np.floor(np.asarray(sensor.elevations) / UPRIGHT), return_index=True, return_inverse=True)
+    first = bands[1][bands[2]]  # row of each one's band
     for name, some in STRAYING.items():
         before, here = 0.0, label == CLASS_NUMBER[name]
         how, off = (chance[first], unit[first]) if name == "building" else (chance, unit)
