@@ -14,14 +14,17 @@ from torch.testing import assert_close
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.samplers import (
     STEPS,
+    State,
     ddim,
     ddpm,
+    dpmpp_2m,
     even_log_snr,
     even_times,
     generators,
     heun,
     noise_like,
     sample,
+    sde_dpmpp_2m,
     starting_noise,
 )
 from lidarsynth.diffusion.schedule import SCHEDULES, cosine, flow, ve
@@ -144,6 +147,25 @@ def test_fresh_noise_of_second_order_spreads_as_the_data_in_few_steps():
     assert off["sde-dpmpp-2m"] < 0.05 < off["ddpm"]
     moved = {name: abs(spreads[name, 1.0][0] - mean) / std for name in ("sde-dpmpp-2m", "dpmpp-2m")}
     assert moved["sde-dpmpp-2m"] < 0.1 < moved["dpmpp-2m"]
+
+
+def test_fresh_noise_goes_from_none_to_all_of_it_and_may_be_larger():
+    """With eta 0 the deterministic step, with 1 and no estimate before it the ancestral one; s_noise enlarges noise."""
+    denoiser, noise = gaussian_denoiser(cosine()), torch.randn(3, 2, 4, 8, generator=torch.Generator().manual_seed(1))
+    x_t, (t, s) = (
+        torch.randn(3, 2, 4, 8, generator=torch.Generator().manual_seed(0)),
+        torch.tensor([[0.7] * 3, [0.6] * 3]),
+    )
+    before = State(0, t + 0.1, t, x_t, x_t, x_t / 2)
+
+    def step(previous=None, **how):
+        return sde_dpmpp_2m(denoiser, x_t, t, s, lambda x: noise, previous, **how)[0]
+
+    assert_close(step(before, eta=0.0), dpmpp_2m(denoiser, x_t, t, s, lambda x: noise, before)[0])
+    assert_close(step(eta=1.0), ddpm(denoiser, x_t, t, s, lambda x: noise)[0])
+    log_snr, _, sigma = cosine().at(s, x_t)
+    h = log_snr - cosine().at(t, x_t)[0]
+    assert_close(step(eta=0.5, s_noise=1.1) - step(eta=0.5), 0.1 * sigma * (1 - torch.exp(-h / 2)).sqrt() * noise)
 
 
 @pytest.mark.parametrize("name", sorted(STEPS))

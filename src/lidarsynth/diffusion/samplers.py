@@ -209,16 +209,27 @@ def dpmpp_2m(
 
 
 def sde_dpmpp_2m(
-    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
+    denoiser: Denoiser,
+    x_t: Tensor,
+    t: Tensor,
+    s: Tensor,
+    rng: Rng,
+    previous: State | None = None,
+    eta: float = 1.0,  # share of fresh noise: 0 = `dpmpp_2m`, 1 = as in the reverse diffusion
+    s_noise: float = 1.0,  # by which it is larger, where a network takes off too much (Karras et al. 2022, appendix D)
 ) -> tuple[Tensor, Tensor]:
     """SDE-DPM-Solver++(2M) (Lu et al. 2022, algorithm 4): `ddpm`, on the line of `dpmpp_2m`.
 
     Fresh noise at each step takes off what the network's errors have made of those before, which a deterministic step
-    keeps.
+    keeps; but each step's is also smoothed by what the network does not know.
     """
     x_0_hat = denoiser(x_t, t)
-    estimate = _ahead(denoiser.schedule, x_t, x_0_hat, t, s, previous)
-    return _drawn(denoiser.schedule, x_t, estimate, t, s, rng), x_0_hat
+    log_snr_t, _, sigma_t = denoiser.schedule.at(t, x_t)
+    log_snr_s, alpha_s, sigma_s = denoiser.schedule.at(s, x_t)
+    estimate, h = _ahead(denoiser.schedule, x_t, x_0_hat, t, s, previous), (log_snr_s - log_snr_t) / 2
+    mean = sigma_s / sigma_t * torch.exp(-eta * h) * x_t - alpha_s * torch.expm1(-(1 + eta) * h) * estimate
+    fresh = s_noise * sigma_s * torch.sqrt(-torch.expm1(-2 * eta * h))
+    return mean + fresh * noise_like(x_t, rng), x_0_hat
 
 
 def _ahead(schedule: Schedule, x_t: Tensor, x_0_hat: Tensor, t: Tensor, s: Tensor, previous: State | None) -> Tensor:
