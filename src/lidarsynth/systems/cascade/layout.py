@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample
+from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample, sde_dpmpp_2m
 from lidarsynth.diffusion.schedule import Schedule, flow
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
@@ -32,7 +32,8 @@ from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightene
 STEPS_DEFAULT = 16
 # Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
 DRAFT, DRAFT_STEPS = 0.53, 8
-DRAFTING = "sde-dpmpp-2m"  # its sampler: a deterministic one keeps what is wrong at first, and has few near walls
+# Its sampler: a deterministic one keeps what is wrong at first, one of fresh noise alone smooths what is small.
+DRAFTING = partial(sde_dpmpp_2m, eta=0.5, s_noise=1.02)
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 LEVEL = 0.15  # natural logarithm of the range of flat ground by which a return on the ground may be nearer or farther
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
@@ -81,9 +82,7 @@ def draft(network: Cascade, rays: Tensor, standing: Tensor, rng: list[torch.Gene
     elevations (B, 16, 128) in radians, each by a generator of its own."""
 
     x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
-    *_, last = sample(
-        velocity(network, rays, guided=True), x_1, STEPS[DRAFTING], DRAFT_STEPS, rng, partial(to_draft, t=t)
-    )
+    *_, last = sample(velocity(network, rays, guided=True), x_1, DRAFTING, DRAFT_STEPS, rng, partial(to_draft, t=t))
     return drafted(network.coarse, last.x_s, last.s, rays, standing)
 
 
