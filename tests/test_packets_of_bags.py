@@ -201,6 +201,24 @@ def test_packets_of_an_ouster_without_metadata_ask_for_it(tmp_path: Path, capsys
     assert len(list(inputs_of([path]).stream())) == 2, "that beside it"
 
 
+def test_a_run_does_not_go_on_with_scans_of_other_metadata(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    ouster_drive(tmp_path / "in.bag", {"/os1_node": ouster_packets(2)}, described=None)
+    told, moved = tmp_path / "of" / "os.json", tmp_path / "moved.json"
+    told.parent.mkdir()
+    told.write_text(DESCRIBED)
+    words = ["project", str(tmp_path / "in.bag"), "--out", str(tmp_path / "o"), "--sensor", "vlp-16", "--no-picture"]
+    main([*words, "--metadata", str(told)])
+    told.rename(moved)
+    main([*words, "--metadata", str(moved), "--skip-existing"])
+    assert "2 were there already" in capsys.readouterr().out
+    other = json.loads(DESCRIBED)
+    other["beam_intrinsics"]["beam_altitude_angles"][0] += 1
+    moved.write_text(json.dumps(other))
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--metadata", str(moved), "--skip-existing"])
+    assert "found other settings: metadata " in capsys.readouterr().err
+
+
 def test_the_parts_of_a_split_recording_take_the_metadata_of_the_first(tmp_path: Path):
     """ROS 1 repeats no latched message in the parts."""
     first = ouster_drive(tmp_path / "run_0.bag", {"/ouster": ouster_packets(2)})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -259,6 +260,7 @@ def _settings(job: Job, model: ScanModel | None, out: Path, many: Many, ending: 
 
     reading = {"intensity": None if intensity == "auto" else intensity, "rings": many.rings, "topic": many.topic}
     recipe = job.recipe(None if model is None else fingerprint(model))
+    reading["metadata"] = None if many.metadata is None else _told_by(many.metadata)
     recipe |= {name: word for name, word in reading.items() if word is not None}
     if many.skip_existing:
         check_same(out, recipe)
@@ -266,6 +268,13 @@ def _settings(job: Job, model: ScanModel | None, out: Path, many: Many, ending: 
         check_no_other_whole(out, recipe)
     settings = {"verb": job.verb, "model": job.model, "out": str(out), "format": ending, "workers": many.workers}
     return settings | ({"shard": many.shard} if many.shard else {}) | {"recipe": recipe}
+
+
+def _told_by(metadata: Path) -> str:
+    """The digits of a `.json` of an Ouster, wherever it is; of a bag that holds one, which may be large, its name."""
+    if metadata.suffix.lower() != ".json":
+        return metadata.name
+    return blake2b(metadata.read_bytes(), digest_size=8).hexdigest()
 
 
 def _begin(report: Path, settings: dict[str, Any], goes_on: bool) -> None:
