@@ -1,4 +1,4 @@
-"""Of several drawn layouts the one that the judge takes for a street's is kept."""
+"""Of several drawn layouts one is kept, by the odds that the judge gives it as a street's."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ class Fullest(nn.Module):
 
     def forward(self, grid: Grid, rays: Tensor) -> Tensor:
         assert rays.shape[1:] == (8, 16, 128)
-        return grid.returned.float().sum((1, 2))
+        return 100 * grid.returned.float().sum((1, 2))
 
 
 def cascade(judge: nn.Module | None) -> CascadeModel:
@@ -98,6 +98,24 @@ def test_the_best_of_each_scans_own_draws_is_kept(monkeypatch: pytest.MonkeyPatc
         kept = layout._chosen(model.network, told, standing, rng, lambda: None, layout.CHOICE)
     assert torch.equal(kept.returned.flatten(1).sum(1), counts.amax(1))
     assert len(images) == 2 and images[0].mask.any()
+
+
+def test_one_is_kept_by_its_odds(monkeypatch: pytest.MonkeyPatch):
+    """Three times as often, where they are three times as good."""
+    count = 4000
+
+    class Odds(nn.Module):
+        def forward(self, grid: Grid, rays: Tensor) -> Tensor:
+            return grid.code[:, 0, 0] * np.log(3)
+
+    numbers = torch.arange(2.0).repeat(count).view(-1, 1, 1)
+    grids = Grid(numbers, numbers, numbers > 0)
+    monkeypatch.setattr(layout, "draft", lambda *args: None)
+    monkeypatch.setattr(layout, "draw", lambda *args: grids)
+    none = torch.zeros(count, 1, 1)
+    kept = layout._chosen(cascade(Odds()).network, none, none, generators(4, count), lambda: None, 2)
+    assert kept.code.shape == (count, 1, 1) and kept.code.mean().item() == pytest.approx(0.75, abs=0.03)
+    assert torch.equal(kept.returned, kept.code > 0)
 
 
 def test_a_chosen_scan_is_the_same_however_many_are_made():

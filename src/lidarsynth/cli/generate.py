@@ -22,7 +22,9 @@ def generate(
     sampler: Sampler = None,
     layouts: Annotated[
         int | None,
-        arg(metavar="INT", help="drawn for each scan, of which the likeliest street is kept; default 3, 1 is faster."),
+        arg(
+            metavar="INT", help="drawn for each scan; the likelier a street, the likelier kept; default 3, 1 is faster."
+        ),
     ] = None,
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one.")] = 4,

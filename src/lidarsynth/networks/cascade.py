@@ -34,7 +34,7 @@ class Cascade(nn.Module):
     classes    says of each return what it is of
     inside     the same of scans that were taken inside a building, and which are
     drawn      the same of scans in the making, whose surfaces are smoother than any recorded one's
-    judge      says which of several drawn grids is most like a street's
+    judge      says of drawn grids what the odds are that they are a street's
     """
 
     def __init__(

@@ -16,7 +16,7 @@ def _details(experiment: Experiment) -> dict[str, str]:
     layout = "column by column after a draft by flow matching, and " if model.column_channels else ""
     between = "; 512 columns by what is drawn between them" if model.between_channels else ""
     between += ", then up to 61 beams" if model.beam_channels else ""
-    between += f", of {CHOICE} layouts the one most like a street's" if model.judge_channels else ""
+    between += f", one of {CHOICE} layouts, by its odds as a street's" if model.judge_channels else ""
     grid = f"a grid of 16 beams x 128 columns, {layout}by flow matching{between}"
     return {"layout": f"{grid}; all pixels are filled in one step"}
 

@@ -77,7 +77,7 @@ class CascadeModel(AnySensorModel):
     precision        of the fill's matrix products: fp32 | bf16
     response         how the sensor reports what it sees, as found out from the scan at hand
     grain            how much of each kind of noise its samples take
-    layouts          drawn for each generated scan, of which the likeliest street is kept: see `choosing`
+    layouts          drawn for each generated scan, of which one is kept, by its odds as a street's: see `choosing`
     """
 
     network: Cascade
@@ -107,8 +107,8 @@ class CascadeModel(AnySensorModel):
         return replace(self, labelled=True)
 
     def choosing(self, layouts: int) -> CascadeModel:
-        """The same model, which draws so many layouts of each generated scan and keeps the one most like a street's:
-        with 1 scans take about half the time, and fewer of them look like streets.
+        """The same model, which draws so many layouts of each generated scan and keeps one, by the odds that it
+        is a street's: with 1 scans take about half the time, and fewer of them look like streets.
 
         Raises ValueError for a number below 1, and for a model without a judge of layouts.
         """
