@@ -18,6 +18,7 @@ from lidarsynth.data.bag_writer import FORMATS, MSG_CDR, MSG_ROS1, write_bag
 from lidarsynth.data.bags import open_bag
 from lidarsynth.data.capture import Datagram, datagrams
 from lidarsynth.files.fields import FileError
+from lidarsynth.verbs.description import describe
 from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading, inputs_of
 from lidarsynth.viewer.series import series_of
@@ -197,6 +198,9 @@ def test_packets_of_an_ouster_without_metadata_ask_for_it(tmp_path: Path, capsys
     told = tmp_path / "of" / "os.json"
     told.write_text(DESCRIBED)
     assert len(list(inputs_of([path], Reading(metadata=told)).stream())) == 2
+    main(["info", str(path), "--metadata", str(told)])
+    (points,) = (line for line in capsys.readouterr().out.splitlines() if "/os1_node/lidar_packets: points" in line)
+    assert points.split()[-1] == str(BEAMS * COLUMNS)
     told.rename(tmp_path / "os.json")
     assert len(list(inputs_of([path]).stream())) == 2, "that beside it"
 
@@ -237,6 +241,9 @@ def test_metadata_is_of_packets_and_not_of_points(tmp_path: Path):
     points = drive(tmp_path / "points.mcap", [spun(0, TURN)])
     with pytest.raises(ValueError, match=r"a bag of an Ouster's packets, for --metadata o.json, found none"):
         inputs_of([points], Reading(metadata=Path("o.json")))
+    for what, found in ((str(points), "none"), ("vlp-16", "another kind of file or word")):
+        with pytest.raises(ValueError, match=f"{what}: expected a capture, .* for --metadata o.json, found {found}"):
+            describe(what, Reading(metadata=Path("o.json")))
 
 
 @pytest.mark.parametrize("kind", OUSTER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from lidarsynth.cli.arguments import NoSeed, Positional, Rings, arg
@@ -20,6 +21,7 @@ def info(
     axes: Annotated[str, arg(metavar="XYZ", help="where x, y, z of a scan point: CARLA has fru, AirSim frd.")] = "flu",
     mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above a scan's z = 0.")] = None,
     rings: Rings = None,
+    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture or packets in a bag.")] = None,
     seed: NoSeed = 0,
 ) -> None:
     """What a model, a preset, a sensor, a file or a folder is."""
@@ -27,4 +29,5 @@ def info(
     from lidarsynth.verbs.inputs import Reading
     from lidarsynth.verbs.placement import parse_rings, read_transform
 
-    say(describe(what, Reading(transform=read_transform(transform, mount, axes), rings=parse_rings(rings))))
+    moved = read_transform(transform, mount, axes)
+    say(describe(what, Reading(metadata=metadata, transform=moved, rings=parse_rings(rings))))

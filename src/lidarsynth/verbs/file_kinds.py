@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.data.bag_records import Bag, Cloud
-from lidarsynth.data.bags import SUFFIXES, is_bag, open_bag
+from lidarsynth.data.bags import SUFFIXES, is_bag, metadata_from, open_bag
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import moved
@@ -27,7 +27,7 @@ from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict, get_sensor
 from lidarsynth.verbs.expansion import has_scans, streams_below
-from lidarsynth.verbs.inputs import Reading
+from lidarsynth.verbs.inputs import OF_METADATA, Reading
 from lidarsynth.verbs.json_kinds import json_lines
 from lidarsynth.verbs.other_files import other_lines
 from lidarsynth.verbs.viewpoint import viewpoint_note
@@ -40,15 +40,18 @@ LOOKED_AT = 400  # packets of a capture that are counted
 def file_lines(path: Path, reading: Reading) -> Lines | None:
     """What a path is, as lines by title, or None for what is no file of ours to tell: a model, a sensor, a word.
 
-    reading  of which transform and rings count
-    Raises FileError, in one line, for a file that is broken or of no kind that is known, or holds no scan to move.
+    reading  of which transform, rings and metadata count
+    Raises FileError, in one line, for a file that is broken or of no kind that is known, or holds no scan to move, or
+    no packets that metadata could be of.
     """
     model = path.name in (WEIGHTS, RECORD) or (path.is_dir() and (path / RECORD).exists())
-    if model or path.suffix.lower() in MODELS:
-        return None
-    if not path.exists():
-        if path.name.lower().endswith((*READERS, *KINDS, *STREAMS)) or is_capture(path):
-            raise FileError(f"{path}: expected a file, found no file or folder of that name")
+    model = model or path.suffix.lower() in MODELS
+    named = path.name.lower().endswith((*READERS, *KINDS, *STREAMS)) or is_capture(path)
+    if named and not model and not path.exists():
+        raise FileError(f"{path}: expected a file, found no file or folder of that name")
+    if reading.metadata is not None and not (path.exists() and (is_bag(path) or is_capture(path))):
+        raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found another kind of file or word")
+    if model or not path.exists():
         return None
     if path.is_dir():
         if not any(path.iterdir()):
@@ -145,6 +148,8 @@ def _bag(path: Path, reading: Reading) -> Lines:
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
         clouds = bag.scan_topics()
+        if reading.metadata is not None and not any(bag.of_ouster(name) for name in clouds):
+            raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found none")
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
         raise FileError(f"{path}: {clouds[0]}: {told[0][1]}")
@@ -157,7 +162,7 @@ def _first_of_topic(bag: Bag, name: str, reading: Reading) -> tuple[Lines, str |
     """What there is to say of the first scan of a topic, and what is wrong with it: others may be sound, as beside a
     topic of a map."""
     try:
-        first = next(bag.clouds(name), None)
+        first = next(bag.clouds(name, metadata_from(reading.metadata, bag, name)), None)
         if isinstance(first, FileError):
             return {}, str(first).removeprefix(f"{bag.path}: {name}: ")
         if first is None:
@@ -179,9 +184,9 @@ def _capture(path: Path, reading: Reading) -> Lines:
     listed = ", ".join(f"{count} of {size} bytes as {sender}" for (sender, size), count in sizes.most_common(6))
     listed += ", ..." if len(sizes) > 6 else ""
     lines = {"kind": "network capture", "packets": f"{listed or 'none'} (of the first {LOOKED_AT})"}
-    found = senders(path)
+    found = senders(path, reading.metadata)
     for sender in found:
-        scan, dropped = scan_from_fields(next(capture_turns(path, None, sender)), rings=reading.rings)
+        scan, dropped = scan_from_fields(next(capture_turns(path, reading.metadata, sender)), rings=reading.rings)
         title = "first turn" if len(found) == 1 else f"--topic {sender}"
         lines |= {f"{title}: {key}": text for key, text in scan_lines(scan, dropped, reading).items()}
     return lines

@@ -34,6 +34,7 @@ from lidarsynth.verbs.earlier_results import earlier_results
 from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders, streams_below
 
 NAMED = 5  # bags and captures that are passed over
+OF_METADATA = "expected a capture, or a bag of an Ouster's packets, for --metadata"
 
 
 @dataclass(frozen=True)
@@ -229,9 +230,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
             more, of_packets = 1, True  # told in its place, and the others go on
         count, packets = None if more is None or count is None else count + more, packets or of_packets
     if reading.metadata is not None and not packets:
-        raise ValueError(
-            f"expected a capture, or a bag of an Ouster's packets, for --metadata {reading.metadata}, found none"
-        )
+        raise ValueError(f"{OF_METADATA} {reading.metadata}, found none")
 
     def stream() -> Iterator[Input]:
         yield from files
