@@ -30,7 +30,7 @@ from lidarsynth.networks.drafts import READ, DraftReader
 from lidarsynth.networks.pixel_mixture import CODES, TONES, PixelDrawer, picked
 from lidarsynth.networks.wall_lines import WallMemory
 
-SHARP, HEAT = 0.85, 0.9  # of draws: so that steps are as in streets (docs/generation.md)
+SHARP, HEAT = 0.85, 0.87  # of draws: so that steps are as in streets (docs/generation.md)
 
 
 class ColumnTransformer(PixelDrawer):
@@ -126,7 +126,7 @@ def draw(
 
     known  grids, and which of their pixels (B, 16, 128) bool stay as they are; None = all are drawn
     sharp  the scale of what strays from its hypothesis, of that of recorded scans, whose noise is in it
-    heat   of ranges and of whether rays return: below 1, the likeliest are chosen more often
+    heat   of ranges: below 1, the likeliest are chosen more often
     """
     count, device = len(rays), rays.device
     chance = torch.stack([torch.rand(5, ROWS, COLUMNS, generator=one) for one in rng]).to(device).clamp(0.001, 0.999)
@@ -160,7 +160,7 @@ def draw(
             copies = torch.stack([shades[0][i], shades[1][i], lower], -1)
             of_shade = network.shades(drawn, code, expected[0], copies, copied)
             lower = picked(*of_shade, u[:, 3:5], 1, 1, TONES)
-            back = ((u[:, 0] < (drawn.returns / heat).sigmoid()) & (ray[:, 6] < 0.5)).float()
+            back = ((u[:, 0] < drawn.returns.sigmoid()) & (ray[:, 6] < 0.5)).float()
             pixel = _as_known(Grid(code * back, lower * back, back), known, i, j)
             lower, near = pixel.shade, [nearness(pixel.code, pixel.returned, ray), *near]
             beneath = torch.cat([relative(pixel, ray), beneath[:, :-3]], 1)
