@@ -11,7 +11,7 @@ drawn as generation draws them. Against the first, all others:
 - the power of waves of ln range along the turn, relative, by their length in degrees: below 1, too smooth;
 - the share of neighbours along a ring that are more than 2, 16 and 50 % nearer or farther, relative.
 
-Half a minute a sensor: what to look at after every change of drafts or columns, before scans are judged.
+A minute of a core a sensor: what to look at after every change of drafts or columns, before scans are judged.
 """
 
 from __future__ import annotations

@@ -272,7 +272,7 @@ def _settings(job: Job, model: ScanModel | None, out: Path, many: Many, ending: 
 
 def _told_by(metadata: Path) -> str:
     """The digits of a `.json` of an Ouster, wherever it is; of a bag that holds one, which may be large, its name."""
-    if metadata.suffix.lower() != ".json":
+    if metadata.suffix.lower() != ".json" or not metadata.is_file():
         return metadata.name
     return blake2b(metadata.read_bytes(), digest_size=8).hexdigest()
 

@@ -150,8 +150,8 @@ def _chosen(
 ) -> Grid:
     """Grids (B, 16, 128) drawn after drafts, each one of `choice`, by the odds that the judge gives it as a street's.
 
-    So drawn ones come nearer to streets in all respects (importance resampling, Rubin 1987); the best of them are
-    nearer in how streets run, and farther in how open they are.
+    That is importance resampling (Rubin 1987), which nears streets in all respects as far as the judge is right; the
+    best of them would be too much alike.
     """
     assert network.columns is not None
     one_by_one = rng if choice == 1 else [each for one in rng for each in _offspring(one, choice)]
