@@ -8,8 +8,9 @@ drawn as generation draws them. Against the first, all others:
 - the distance of numbers that each scene has (Wasserstein's, in standard deviations of the streets'): shares of its
   rays that meet something above the ground nearer than 3, 6, 10 and 25 m, and that return, the mean of ln range, and
   how far it is to what stands at either side (the nearer, the farther), ahead and behind;
-- the power of waves of ln range along the turn, relative, by their length in degrees: below 1, too smooth;
-- the share of neighbours along a ring that are more than 2, 16 and 50 % nearer or farther, relative.
+- the power of waves of ln range along the turn, relative, longer than 120 degrees, than 60, 30, 15 and 8, and down to
+  5.6: below 1, too smooth;
+- the share of neighbours along a ring whose ln ranges differ by more than 0.02, 0.16 and 0.5, relative.
 
 A minute of a core a sensor: what to look at after every change of drafts or columns, before scans are judged.
 """
@@ -18,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -27,14 +27,15 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from lidarsynth.diffusion.samplers import generators, noise_like
+from lidarsynth.diffusion.schedule import flow
 from lidarsynth.networks.coarse_unet import left_filled
 from lidarsynth.networks.column_neighbours import Grid
 from lidarsynth.networks.column_transformer import draw
-from lidarsynth.networks.drafts import drafted
+from lidarsynth.networks.drafts import BOUND, drafted
 from lidarsynth.networks.rays import decode_range
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.images import grid_of
-from lidarsynth.systems.cascade.layout import DRAFT, draft, told_of, velocity
+from lidarsynth.systems.cascade.layout import DRAFT, draft, told_of
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.weights.load import load
 
@@ -91,7 +92,7 @@ def layouts(model: CascadeModel, count: int, seed: int) -> Iterator[tuple[str, T
         rays, standing = model._grid_rays(rows, columns, count=len(rng))
         x_0 = network.coarse.encode(metres[part], true.shade[part], standing)
         t = torch.full((len(rng),), DRAFT)
-        alpha, sigma = velocity(network, rays, guided=False).schedule.at(t, x_0)[1:]
+        _, alpha, sigma = flow(BOUND).at(t, x_0)
         perfect = drafted(network.coarse, alpha * x_0 + sigma * noise_like(x_0, rng), t, rays, standing)
         for kind, after in zip(drawn, (perfect, draft(network, rays, standing, rng)), strict=True):
             kind.append(draw(network.columns, rays, after, rng))
@@ -103,17 +104,18 @@ def report(model: CascadeModel, count: int, seed: int) -> Iterator[str]:
     """A line for each kind of layouts but the streets'."""
     elevation = np.deg2rad(np.asarray(model.sensor.elevations)[grid_of(model.sensor)[0]])[:, None]
     flat = np.where(elevation < -0.005, model.sensor.mount / np.sin(-elevation).clip(1e-3), np.inf)
-    numbers, power, steps = partial(scene_numbers, elevation=elevation, flat=flat), None, None
-    of_streets = scale = np.zeros(0)
-    for word, metres in layouts(model, count, seed):
-        found = numbers(metres.numpy())
-        if power is None or steps is None:
-            of_streets, scale, power, steps = found, found.std(0) + 1e-6, waves(metres), edges(metres)
-            continue
-        far = [wasserstein_distance(*pair) for pair in zip(found.T, of_streets.T, strict=True)] / scale
-        yield (f"{word:18} {far.mean():.3f} ({' '.join(f'{one:.2f}' for one in far)}); waves "
-               f"{' '.join(f'{one:.2f}' for one in waves(metres) / power)}; edges "
-               f"{' '.join(f'{one:.2f}' for one in edges(metres) / steps)}")  # fmt: skip
+    kinds = layouts(model, count, seed)
+    _, streets = next(kinds)
+    expected = scene_numbers(streets.numpy(), elevation, flat)
+    for word, metres in kinds:
+        pairs = zip(scene_numbers(metres.numpy(), elevation, flat).T, expected.T, strict=True)
+        far = [wasserstein_distance(*pair) for pair in pairs] / (expected.std(0) + 1e-6)
+        yield (f"{word:18} {far.mean():.3f} ({_listed(far)}); waves {_listed(waves(metres) / waves(streets))}; "
+               f"edges {_listed(edges(metres) / edges(streets))}")  # fmt: skip
+
+
+def _listed(numbers: np.ndarray) -> str:
+    return " ".join(f"{one:.2f}" for one in numbers)
 
 
 def main() -> None:

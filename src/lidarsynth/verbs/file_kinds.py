@@ -46,12 +46,12 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
     """
     model = path.name in (WEIGHTS, RECORD) or (path.is_dir() and (path / RECORD).exists())
     model = model or path.suffix.lower() in MODELS
-    named = path.name.lower().endswith((*READERS, *KINDS, *STREAMS)) or is_capture(path)
-    if named and not model and not path.exists():
+    absent = not path.exists()
+    if absent and not model and (path.name.lower().endswith((*READERS, *KINDS, *STREAMS)) or is_capture(path)):
         raise FileError(f"{path}: expected a file, found no file or folder of that name")
-    if reading.metadata is not None and not (path.exists() and (is_bag(path) or is_capture(path))):
+    if reading.metadata is not None and (absent or not (is_bag(path) or is_capture(path))):
         raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found another kind of file or word")
-    if model or not path.exists():
+    if model or absent:
         return None
     if path.is_dir():
         if not any(path.iterdir()):
