@@ -31,7 +31,7 @@ from lidarsynth.systems.cascade.images import grid_of, noisy
 from lidarsynth.systems.cascade.layout import DRAFT, draft, one_thread
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.naming import FAIR, weights
-from lidarsynth.systems.cascade.surfaces import straightened
+from lidarsynth.systems.cascade.surfaces import across_rings, straightened
 from lidarsynth.systems.denser import spread
 from lidarsynth.weights.load import load_parts
 
@@ -146,6 +146,52 @@ def test_generated_grids_get_flat_ground_and_upright_walls_and_keep_their_edges(
     assert after.mean() < 0.5 * before.mean() and np.quantile(after, 0.99) < np.quantile(before, 0.99)
     again = straightened(torch.from_numpy(truth)[None], rows, sensor).numpy()[0]
     np.testing.assert_allclose(again, truth, rtol=0.03)
+
+
+def rings_of_ground(sensor: Sensor, rows: np.ndarray, kerb: float) -> np.ndarray:
+    """(R, 128) metres of ground that is flat but for a kerb so many metres high, 6 m to the left of the sensor."""
+    down = -np.radians(np.asarray(sensor.elevations))[rows][:, None]
+    azimuth = np.pi - 2 * np.pi * np.arange(128) / 128
+    low, high = sensor.mount / np.sin(down), (sensor.mount - kerb) / np.sin(down)
+    return np.where(high * np.cos(down) * np.sin(azimuth) > 6.0, high, low)
+
+
+def test_kerbs_keep_their_edge_where_grids_have_little_noise():
+    sensor, rows = SENSORS["hdl-64e-kitti"], np.arange(24, 64, 2)
+    truth = rings_of_ground(sensor, rows, 0.15)
+    noisy = torch.from_numpy(truth * (1 + 0.001 * np.random.default_rng(0).standard_normal(truth.shape)))[None]
+    off = {
+        edges: np.abs(straightened(noisy, rows, sensor, edges=edges).numpy()[0] / truth - 1) for edges in (True, False)
+    }
+    assert np.quantile(off[True], 0.99) < 0.01 < np.quantile(off[False], 0.99)
+    right = np.s_[1:-1, 70:120]
+    assert np.median(off[True][right]) < 0.8 * np.median(np.abs(noisy.numpy()[0] / truth - 1)[right])
+
+
+def test_rings_of_ground_lose_what_is_of_one_ring_alone_and_keep_kerbs_and_walls():
+    sensor, rows = SENSORS["hdl-64e-kitti"], np.arange(20, 64)
+    truth = rings_of_ground(sensor, rows, 0.15)
+    truth[:, 100:104] = 4.0  # a wall
+    made = truth * (1 + 0.003 * np.random.default_rng(0).standard_normal(len(rows)))[:, None]
+    made[:, 100:104] = truth[:, 100:104]
+    humped = made.copy()
+    humped[25, 60:70] *= 0.9
+    humped[30, 10] = 0
+    found = across_rings(torch.from_numpy(humped)[None], rows, sensor).numpy()[0]
+    inner = np.s_[1:-1]
+    steps = [np.abs(np.diff(np.log(part[inner, 40:90] / truth[inner, 40:90]), axis=0)) for part in (made, found)]
+    assert steps[1].mean() < 0.6 * steps[0].mean() and steps[1].max() < 0.03
+    assert np.quantile(np.abs(found / np.where(humped > 0, truth, 1) - 1)[humped > 0], 0.98) < 0.01
+    np.testing.assert_allclose(found[:, 100:104], truth[:, 100:104], rtol=1e-4)
+    np.testing.assert_array_equal(found == 0, humped == 0)
+
+
+def test_rings_of_ground_that_are_far_apart_stay_as_they_are():
+    sensor = SENSORS["hdl-32e"]
+    rows = np.arange(12, 32)
+    metres = torch.from_numpy(rings_of_ground(sensor, rows, 0.15))[None]
+    metres[:, 8] *= 0.95
+    assert_close(across_rings(metres, rows, sensor), metres, rtol=1e-4, atol=0)
 
 
 def test_grids_of_a_dome_keep_their_ranges_where_beams_look_straight_up():

@@ -31,17 +31,34 @@ def rng(seed: int = 0) -> torch.Generator:
 
 def test_what_is_beside_a_crown_is_seen_through_it_and_nothing_is_lost_on_average():
     image = scene(LEAVES, WALL)
-    found, even = through_foliage(image, image.reflectance, NONE, rng())
     edge = SENSOR.width // 2
-    beside = found.label[:, edge : edge + REACH] == LEAVES
+    labels = np.stack([through_foliage(image, image.reflectance, NONE, rng(k))[0].label for k in range(8)])
+    beside = labels[..., edge : edge + REACH] == LEAVES
     assert 0.2 * PIERCED < beside.mean() < 0.8 * PIERCED
-    through = found.label[:, edge - REACH : edge] == WALL
+    through = labels[..., edge - REACH : edge] == WALL
     assert abs(through.mean() - beside.mean()) < 0.05
+    found, even = through_foliage(image, image.reflectance, NONE, rng())
     inside = found.label[:, edge - 100 : edge - REACH]
     assert (inside == LEAVES).all()
     assert ((found.label == WALL) == (found.range == 8)).all()  # ranges, labels and reflectances go together
     np.testing.assert_array_equal(even, found.reflectance)
     np.testing.assert_allclose(even, found.range / 100, rtol=1e-6)
+
+
+def test_what_is_seen_through_a_crown_has_a_height():
+    """Beams that are close together go the same way, those of a sensor of few beams each their own."""
+    alike = []
+    for name in ("hdl-64e-kitti", "hdl-32e"):
+        sensor = SENSORS[name]
+        label = np.full((sensor.height, sensor.width), LEAVES)
+        label[:, : sensor.width // 2] = WALL
+        metres = np.where(label == WALL, 8.0, 4.0).astype(np.float32)
+        image = RangeImage(metres, metres / 10, metres > 0, sensor, label)
+        found, _ = through_foliage(image, image.reflectance, np.zeros(label.shape, bool), rng())
+        moved = [(found.label != label)[:, sensor.width // 2 + column] for column in range(3)]
+        pairs = np.mean([(one[1:] & one[:-1]).mean() for one in moved])
+        alike.append(pairs / np.mean([one.mean() ** 2 for one in moved]))  # 1, if each went its own way
+    assert alike[0] > 3 and alike[1] < 2
 
 
 def test_the_sky_is_seen_through_crowns_but_roads_and_cars_stay_as_they_are():

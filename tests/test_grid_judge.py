@@ -9,14 +9,15 @@ from torch import Tensor, nn
 
 import lidarsynth as ls
 from lidarsynth.diffusion.samplers import generators
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.record import Experiment, Model
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import CoarseUNet, grid_rays
-from lidarsynth.networks.column_neighbours import Grid
+from lidarsynth.networks.column_neighbours import Grid, known_grid
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.fill_unet import FillUNet
-from lidarsynth.networks.grid_judge import GridJudge
+from lidarsynth.networks.grid_judge import GridJudge, openness
 from lidarsynth.systems.cascade import layout
+from lidarsynth.systems.cascade.family import build
 from lidarsynth.systems.cascade.images import grid_of
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.verbs.generation import Drawing
@@ -74,6 +75,34 @@ def test_it_learns_to_tell_two_kinds_of_grids():
         loss.backward()
         optimizer.step()
     assert loss.item() < 0.1
+
+
+def test_openness_tells_how_near_things_stand_and_what_returns():
+    rows, columns = np.arange(0, 32, 2), np.arange(0, 256, 2)
+    rays = grid_rays(SENSOR, np.zeros((32, 256), bool), rows, columns)[0][None]
+    elevation = np.radians(np.asarray(SENSOR.elevations))[rows][:, None]
+    flat = np.where(elevation < 0, SENSOR.mount / np.maximum(np.sin(-elevation), 1e-3), 100.0)
+    metres = np.broadcast_to(np.minimum(flat, 100.0), (16, 128)).copy()
+    plain = known_grid(torch.from_numpy(metres).float()[None], torch.zeros(1, 16, 128))
+    assert openness(plain, rays)[0, :5].tolist() == pytest.approx([0, 0, 0, 0, 1])
+    metres[:4, :32] = 5.0  # of sixteen beams the upper four, a quarter of the turn
+    metres[0, 64:] = 0
+    numbers = openness(known_grid(torch.from_numpy(metres).float()[None], torch.zeros(1, 16, 128)), rays)[0]
+    assert numbers[:5].tolist() == pytest.approx([0, 0.25, 0.25, 0.25, 1 - 1 / 32], abs=1e-4)
+    assert numbers[5].item() == pytest.approx(np.log(metres[metres > 0]).mean(), rel=1e-3)
+
+
+def test_odds_lose_what_they_owe_to_openness():
+    grid, rays = random_grid(6, 3)
+    torch.manual_seed(2)
+    plain, less = GridJudge(16), GridJudge(16, (0.5, 0, 0, 0, -2.0, 0.1))
+    less.load_state_dict(plain.state_dict())
+    numbers = openness(grid, rays)
+    owed = 0.5 * numbers[:, 0] - 2 * numbers[:, 4] + 0.1 * numbers[:, 5]
+    torch.testing.assert_close(less(grid, rays), plain(grid, rays) - owed)
+    torch.testing.assert_close(less.of_all(grid, rays), plain(grid, rays))
+    with pytest.raises(ValueError, match=r"model.judge_openness: expected six numbers or none, found \(1.0,\)"):
+        build(Experiment("small", model=Model(judge_channels=16, judge_openness=(1.0,))), SENSOR)
 
 
 def test_the_best_of_each_scans_own_draws_is_kept(monkeypatch: pytest.MonkeyPatch):

@@ -59,6 +59,7 @@ class Model:
     between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none
     beam_channels: int = within(0, 0, 8192)  # cascade: width of what draws the beams between those, 0 = none
     judge_channels: int = within(0, 0, 8192)  # cascade: width of what chooses among drawn grids, in eights, 0 = none
+    judge_openness: tuple[float, ...] = within((), -1e4, 1e4)  # cascade: what its odds owe to six numbers of openness
     likeliest: bool = False  # cascade: a fill of its own for the image of least error; samples are by the other
     likeliest_blocks: tuple[int, ...] = within((1, 1, 2, 2), 1, 64)  # cascade: of that fill, at each level
     own_classes: bool = False  # cascade with a base: its network of classes goes on too, and is kept with it

@@ -27,8 +27,8 @@ from lidarsynth.systems.system import System
 def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     """All networks; none knows a sensor.
 
-    Raises ValueError for other numbers of blocks from level to level of the coarse stage, and for other than four of
-    the likeliest fill.
+    Raises ValueError for other numbers of blocks from level to level of the coarse stage, for other than four of the
+    likeliest fill, and for slopes of openness other than six.
     """
     model, width = experiment.model, experiment.model.base_channels
     if len(set(model.num_residual_blocks)) > 1:
@@ -36,6 +36,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
                          f"{model.num_residual_blocks}")  # fmt: skip
     if len(model.likeliest_blocks) != 4:
         raise ValueError(f"model.likeliest_blocks: expected four numbers, found {model.likeliest_blocks}")
+    if len(model.judge_openness) not in (0, 6):
+        raise ValueError(f"model.judge_openness: expected six numbers or none, found {model.judge_openness}")
     coarse, guide = (
         CoarseUNet(channels, model.channel_multipliers, model.num_residual_blocks[0]) if channels else None
         for channels in (width, model.guide_channels)
@@ -49,7 +51,7 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     between = BetweenColumns(model.between_channels) if model.between_channels else None
     beams = BetweenBeams(model.beam_channels) if model.beam_channels else None
     classes = ClassUNet(model.class_channels, classes=model.classes) if model.classes else None
-    judge = GridJudge(model.judge_channels) if model.judge_channels else None
+    judge = GridJudge(model.judge_channels, model.judge_openness) if model.judge_channels else None
     inside = ClassUNet(model.inside_channels) if model.classes and model.inside_channels else None
     drawn = ClassUNet(model.drawn_channels, classes=model.classes) if model.classes and model.drawn_channels else None
     return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside, drawn)

@@ -3,6 +3,7 @@ behind it, and both stand beside each other in an image. Measured in docs/genera
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,10 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.systems.cascade.images import texture, textured
 
-# Share of the rays in and beside crowns that meet what a ray beside them meets, and how far beside at most: degrees on
-# the ring, and beams. Chosen by street-2, of streets told their own layouts and of drawn ones (docs/generation.md).
-PIERCED, ASIDE, BEAMS = 0.2, 1.8, 1
+# Share of the rays in and beside crowns that meet what a ray beside them meets, how far beside at most: degrees on the
+# ring, and beams, and in how many degrees of elevation all rays of a column go the same way, as twigs and gaps have a
+# size. Chosen by street-2, of streets told their own layouts and of drawn ones (docs/generation.md).
+PIERCED, ASIDE, BEAMS, TALL = 0.2, 1.8, 1, 1.2
 LEAFY = CLASS_NUMBER["vegetation"]
 STANDING = [CLASS_NUMBER[name] for name in ("vegetation", "building", "fence", "trunk", "pole", "traffic-sign")]
 
@@ -38,7 +40,7 @@ def through_foliage(
     if image.label is None:
         return image, even
     height, width = image.shape
-    chance, up, aside = torch.rand(3, height, width, generator=rng).numpy()
+    chance, up, aside = _together(torch.rand(3, height, width, generator=rng).numpy(), image.sensor.elevations, rng)
     reach = max(1, round(ASIDE / 360 * width))
     rows = (np.arange(height)[:, None] + _step(up, BEAMS)).clip(0, height - 1)
     columns = (np.arange(width) + _step(aside, reach)) % width
@@ -52,6 +54,13 @@ def through_foliage(
 
     parts = {name: taken(getattr(image, name)) for name in ("range", "reflectance", "mask", "label")}
     return replace(image, **parts), taken(even)
+
+
+def _together(chances: np.ndarray, elevations: Sequence[float], rng: torch.Generator) -> np.ndarray:
+    """Chances (N, H, W), alike in rays of a column that are within the same TALL degrees, from any of them on."""
+    columns = np.arange(chances.shape[2])
+    piece = np.floor(np.asarray(elevations)[:, None] / TALL + torch.rand(len(columns), generator=rng).numpy())
+    return chances[:, np.cumsum(np.diff(piece, axis=0, prepend=piece[:1]) != 0, 0), columns]
 
 
 def _step(chance: np.ndarray, most: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from lidarsynth.streets.hdl64e import unevenness
 from lidarsynth.systems.cascade.examples import read_at
 from lidarsynth.systems.cascade.facades import with_facades
 from lidarsynth.systems.cascade.hanging import landed
-from lidarsynth.systems.cascade.surfaces import along_rings, evened, straightened
+from lidarsynth.systems.cascade.surfaces import across_rings, along_rings, evened, straightened
 
 STEPS_DEFAULT = 16
 # Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
@@ -197,6 +197,7 @@ def detailed(
     grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
     grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
     if len(rows) > ROWS:
+        grid = known_grid(across_rings(_metres(grid), rows, sensor), grid.shade)
         grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
     grid = landed(grid, rng)
     shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
