@@ -197,7 +197,7 @@ def detailed(
     grid, columns = _finer(network, grid, rows, columns, rays_of, sensor.width, rng)
     grid, rows = _taller(network, grid, rows, columns, rays_of, rng)
     if len(rows) > ROWS:
-        grid = known_grid(across_rings(_metres(grid), rows, sensor), grid.shade)
+        grid = _in_line(grid, rows, sensor)
         grid, rows = _whole(grid, rows, columns, rays_of, sensor.height)
     grid = landed(grid, rng)
     shade, order = evened(grid, rays_of(rows, columns)[0]), np.argsort(columns)
@@ -244,6 +244,11 @@ def _taller(
         told, rows = rays_of(rows, columns)[0], with_between(rows)
         grid = interleaved(grid, draw_beams(network.beams, grid, told, rays_of(rows[1::2], columns)[0], rng))
     return grid, rows
+
+
+def _in_line(grid: Grid, rows: np.ndarray, sensor: Sensor) -> Grid:
+    """The grid with its beams straight with those above and below."""
+    return known_grid(across_rings(_metres(grid), rows, sensor), grid.shade)
 
 
 def _whole(grid: Grid, rows: np.ndarray, columns: np.ndarray, rays_of: RaysOf, height: int) -> tuple[Grid, np.ndarray]:
