@@ -32,6 +32,7 @@ from lidarsynth.networks.coarse_unet import left_filled
 from lidarsynth.networks.column_neighbours import Grid
 from lidarsynth.networks.column_transformer import draw
 from lidarsynth.networks.drafts import BOUND, drafted
+from lidarsynth.networks.grid_judge import NEAR, STANDS
 from lidarsynth.networks.rays import decode_range
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.images import grid_of
@@ -40,7 +41,7 @@ from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.weights.load import load
 
 SEED, TOGETHER, EACH = 4711, 32, 16  # of held-out streets, and every so many of their images is another street's
-NEAR, EDGES, STANDS = (3, 6, 10, 25), (0.02, 0.16, 0.5), 0.85  # metres; of ln range; of the way to flat ground
+EDGES = (0.02, 0.16, 0.5)  # of ln range
 WAVES = (1, 3, 6, 12, 24, 45, 65)  # waves a turn, of bands
 NOTHING = 80.0  # metres to what stands where nothing does
 

@@ -176,6 +176,39 @@ def test_grids_are_as_tall_as_the_sensor_has_beams(
     assert not metres[:, np.ix_(chosen, places)[0][:, 0] == beams - 1][..., blocked[-1, places]].any()
 
 
+@pytest.mark.parametrize(("beams", "straightened"), [(16, []), (32, [31]), (64, [61])])
+def test_drawn_beams_are_put_in_line_with_the_grids(
+    network: BetweenBeams, beams: int, straightened: list[int], monkeypatch: pytest.MonkeyPatch
+):
+    """What was drawn between beams is straightened with them before those beyond go on with it."""
+    seen: list[int] = []
+
+    def half_as_far(metres: torch.Tensor, rows: np.ndarray, sensor: Sensor) -> torch.Tensor:
+        seen.append(len(rows))
+        return metres / 2
+
+    torch.manual_seed(1)
+    sensor = Sensor("any", tuple(np.linspace(6, -24, beams).tolist()), 512, 0.5, 120.0, mount=1.8)
+    rows, columns = grid_rows(beams), grid_columns(512)
+    between = BetweenColumns(16, layers=1, blocks=1).eval()
+    cascade = Cascade(CoarseUNet(16, (1, 1, 1, 1), 1), FillUNet((16, 16), (1, 1)), None, None, between, network)
+    grid = known_grid(torch.full((2, 16, 128), 5.0), torch.full((2, 16, 128), 0.3))
+
+    def rays_of(chosen: np.ndarray, which: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        told, standing = grid_rays(sensor, np.zeros((beams, 512), bool), chosen, which)
+        return told.expand(2, -1, -1, -1), standing.expand(2, -1, -1)
+
+    monkeypatch.setattr(layout, "landed", lambda grid, rng: grid)
+    parts = (grid, (rows, columns), rays_of, sensor, np.zeros((beams, 1), np.float32))
+    plain = layout.detailed(cascade, *parts, rngs())[0]
+    monkeypatch.setattr(layout, "across_rings", half_as_far)
+    moved = layout.detailed(cascade, *parts, rngs())[0]
+    assert seen == straightened
+    own = slice(None) if not straightened else slice(1, 1 + straightened[0])
+    expected = plain[:, own] / (2 if straightened else 1)
+    assert (moved[:, own] - expected).abs().le(1e-3 * expected + 1e-3).float().mean() > 0.99  # a code has a least range
+
+
 def test_what_is_beyond_goes_on_with_the_plane_or_stands_upright():
     for normal, level in (((0.0, 0.0, 1.0), -1.8), ((1.0, 0.4, 0.0), 9.0)):
         whole = seen(normal, level)

@@ -14,7 +14,6 @@ from lidarsynth.networks.fill_unet import ring
 from lidarsynth.networks.rays import decode_range
 
 INPUTS, GROUPS, REACHES = 14, 8, (1, 2, 4, 8, 16, 32)  # columns to either side, doubled as far as a turn
-
 NEAR, STANDS = (3, 6, 10, 25), 0.85  # of `openness`: metres, and the share of the way to flat ground
 
 

@@ -13,7 +13,7 @@ from lidarsynth.networks.column_neighbours import Grid
 # columns that are straight already, and from beam to beam, where the foot of a wall is no slope; all chosen by street-2
 # (docs/generation.md). A step between beams that is less than GROUND of flat ground's is none of the ground.
 ROUNDS, NEAR, FINE, CORNER, GROUND = 4, 0.04, 0.0035, 0.03, 0.3
-# The same from beam to beam on the ground, within LOW of flat ground's nearness, where a kerb is 2 to 10 % of the
+# The same from beam to beam on the ground, within LOW of flat ground's nearness, where a kerb of 12 cm is 7 % of the
 # range; and between what was drawn between beams that are straight already, on the ground and elsewhere, where so many
 # degrees hold three beams: farther apart, surfaces differ by more than what is drawn errs.
 LOW, KERB, BUMP, DENT, CLOSE = 0.2, 0.006, 0.008, 0.004, (2.0, 1.0)
