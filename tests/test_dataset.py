@@ -299,6 +299,17 @@ def test_a_disk_that_fills_up_keeps_what_is_whole(tmp_path: Path, monkeypatch: p
     assert verify(tmp_path) == 200
 
 
+def test_a_disk_that_fills_up_at_once_keeps_nothing_unfinished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(*_: object) -> None:
+        (tmp_path / f".0000064.{'a' * 16}.part").touch()  # another worker's, which is ended at once
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match=r"room for .* MiB more"):
+        list(write_cache(tmp_path, image, 200, SENSOR, WHAT, name))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_damage_is_found_and_mended(tmp_path: Path):
     list(write_cache(tmp_path, image, 200, SENSOR, WHAT, name))
     before = state(tmp_path)

@@ -111,8 +111,7 @@ def _write(
             yield done
     finally:
         entries.close()
-        if index["shards"]:
-            close_index(folder, index)
+        close_index(folder, index)
 
 
 @dataclass(frozen=True)

@@ -104,9 +104,11 @@ def _begun(path: Path) -> bool:
 
 
 def close_index(folder: Path, index: dict[str, Any]) -> None:
-    """Write the index when all shards are; a killed call's worker may have outlived the sweep of `open_index`."""
+    """Write the index of what is stored, if anything is, and sweep away what workers that were ended left unfinished;
+    a killed call's may have outlived the sweep of `open_index`."""
     sweep(folder)
-    write_index(folder, index)
+    if index["shards"]:
+        write_index(folder, index)
 
 
 def write_index(folder: Path, index: dict[str, Any]) -> None:
