@@ -101,7 +101,7 @@ def test_rays_along_the_side_of_a_place_do_not_meet_it() -> None:
     metres = np.linalg.norm(seen, axis=1)
     rays = seen / metres[:, None]
     yes, shape = np.ones(30, bool), module.KINDS[0].shapes[0]
-    place = best_place(shape, 2, [seen], View(rays, metres, yes, ~yes, yes.astype(np.float32)), -1.8, None)
+    place = best_place(shape, 2, [seen], View(rays, metres, yes, ~yes, ~yes, yes.astype(np.float32)), -1.8, None)
     assert np.isfinite(place).all()
     assert place.share == 1
 
@@ -118,6 +118,37 @@ def test_a_car_is_found_where_it_stands(x: float, y: float, yaw: float) -> None:
     assert abs((place.yaw - yaw + np.pi / 2) % np.pi - np.pi / 2) < 0.12
     assert place.share > 0.9
     assert place.cost < 0.3
+
+
+def test_a_car_of_which_most_does_not_return_is_found_by_what_it_swallows() -> None:
+    """Black on the road beside a heap: before, no car was put there, as it would have hidden what is farther."""
+    x, y, yaw = 9.0, 3.0, 0.4
+    image = scene(SENSOR, standing("car", 1, x, y, yaw))
+    rows, columns = np.nonzero(image.label == CAR)
+    dark = columns > np.quantile(columns, 0.35)
+    metres, mask = image.range.copy(), image.mask.copy()
+    metres[rows[dark], columns[dark]], mask[rows[dark], columns[dark]] = 0, False
+    canvas = module._canvas(replace(image, range=metres, mask=mask, label=np.where(mask, image.label, 0)))
+    at = max(module._suggestions(canvas, module.KINDS[0]), key=len)
+    seen = canvas.points.reshape(-1, 3)[at]
+    view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount, longer=1)
+    blind = view._replace(lost=np.zeros_like(view.lost))
+    found, missed = (best_place(module.KINDS[0].shapes[0], 24, [seen], each, -SENSOR.mount, None)
+                     for each in (view, blind))  # fmt: skip
+    assert view.lost @ view.weight > 0.5 * (view.own @ view.weight)
+    assert np.hypot(found.x - x, found.y - y) < 0.7
+    assert found.cost < 0.4 < missed.cost
+
+
+def test_what_does_not_return_elsewhere_is_not_swallowed() -> None:
+    image = scene(SENSOR, standing("car", 1, 9.0, 3.0, 0.4))
+    canvas = module._canvas(image)
+    (at,) = module._suggestions(canvas, module.KINDS[0])
+    middle = np.median(canvas.points.reshape(-1, 3)[at], 0)
+    before = module._swallowed(canvas, at, middle, -SENSOR.mount)
+    rows, columns = np.divmod(at, SENSOR.width)
+    canvas.metres[rows.max() - 3 :, columns.min() - 40 : columns.min() - 10] = 0
+    np.testing.assert_array_equal(module._swallowed(canvas, at, middle, -SENSOR.mount), before)
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (12.0, -6.0)])
@@ -195,8 +226,9 @@ def test_a_heap_that_is_no_car_becomes_what_is_beside_it() -> None:
 
 
 @pytest.mark.parametrize("turned", [0, 512])
-def test_what_a_heap_lost_goes_with_it_and_the_sky_stays(turned: int) -> None:
+def test_what_a_heap_lost_goes_with_it_and_the_sky_stays(turned: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Holes in a heap ahead or behind, across the seam of the image, are filled; what is beside and above it is not."""
+    monkeypatch.setattr(module, "KINDS", tuple(kind._replace(most=0) for kind in module.KINDS))  # no place is good
     points_of, rng = SENSOR.points(np.full((SENSOR.height, SENSOR.width), 12.0, np.float32)), np.random.default_rng(5)
     heap = (np.abs(points_of[..., 1]) < 4) & (points_of[..., 0] > 0) & (np.abs(points_of[..., 2] + 1) < 0.7)
     inner = (np.abs(points_of[..., 1]) < 2.5) & (points_of[..., 0] > 0) & (np.abs(points_of[..., 2] + 1) < 0.4)

@@ -38,12 +38,14 @@ def two_boxes(
 
 class View(NamedTuple):
     """N rays, (N, 3), from the origin through some of what a thing may hide; metres (N,), inf for none; own (N,) bool:
-    they met what suggests the thing; ground (N,) bool; weight (N,): how many rays each one stands for."""
+    they met what suggests the thing; ground (N,) bool; lost (N,) bool: what the thing may have swallowed; weight (N,):
+    how many rays each one stands for."""
 
     rays: np.ndarray
     metres: np.ndarray
     own: np.ndarray
     ground: np.ndarray
+    lost: np.ndarray
     weight: np.ndarray
 
 
@@ -60,8 +62,9 @@ class Place(NamedTuple):
 
 
 # Of each ray, in what a missed one of the thing's own costs: one that ends so many metres off; one that hides what is
-# farther; one that ends inside, or where something else is; then, how far off a return may be.
-OFF, HIDES, INSIDE, ANOTHER, ABOUT = 2.0, 0.35, 0.6, 0.5, 1.0
+# farther; one that ends inside, or where something else is; one that did not return, and that it misses; then, how far
+# off a return may be.
+OFF, HIDES, INSIDE, ANOTHER, LOST, ABOUT = 2.0, 0.35, 0.6, 0.5, 0.15, 1.0
 GAP, BEHIND = 0.3, 0.15  # metres
 ENDS = (0.06, 0.94)  # quantiles of what is seen of a thing
 ASKEW = 0.15  # cost of standing at 45 degrees to everything around
@@ -137,7 +140,7 @@ def _costs(
     met, left = _through(places, shape.boxes, view.rays, level)
     hit, off = np.isfinite(met), np.abs(np.minimum(met, 1e4) - np.minimum(view.metres, 2e4))
     missed = np.where(hit, np.minimum(off / OFF, 1), 1) * view.own
-    hides = hit & ~view.own & (view.metres > met + GAP)
+    hides = hit & ~view.own & ~view.lost & (view.metres > met + GAP)
     inside = hides & (view.metres < left - BEHIND) & ~view.ground
     another = hit & ~view.own & ~view.ground & (off <= GAP)
     wrong = (HIDES * hides + INSIDE * inside + ANOTHER * another) @ view.weight
@@ -145,7 +148,7 @@ def _costs(
     near = within(ends, places, shape, BESIDE) & view.own
     own = np.maximum(near @ view.weight, 1)
     cost, share = ((missed * near) @ view.weight + wrong) / own, (hit & near & (off < ABOUT)) @ view.weight / own
-    total = missed @ view.weight + wrong
+    total = missed @ view.weight + wrong + LOST * (~hit & view.lost) @ view.weight
     if axis is not None:
         askew = ASKEW * np.abs((places[:, 2] - axis + np.pi / 4) % (np.pi / 2) - np.pi / 4) / (np.pi / 4)
         total, cost = total + askew * own, cost + askew

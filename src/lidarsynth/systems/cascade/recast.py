@@ -52,9 +52,9 @@ class Kind(NamedTuple):
 KINDS = (
     Kind("car", (two_boxes("car", 4.3, 1.74, 0.9, 1.46, (-1.93, 0.95, 0.15), 0.0),
                  two_boxes("van", 4.9, 1.94, 0.95, 2.0, (-2.45, 1.76, 0.05), 1.6)),
-         "paint", 24, 0.3, 40.0, 0.9, 0.4, 1.6),
+         "paint", 24, 0.3, 40.0, 1.5, 0.2, 1.6),
     Kind("person", (two_boxes("person", 0.5, 0.55, 0.8, 1.75, (-0.2, 0.2, 0.12), 0.0),),
-         "cloth", 1, 0.12, 25.0, 1.3, 0.3, 0.5),
+         "cloth", 1, 0.12, 25.0, 1.8, 0.2, 0.5),
 )  # fmt: skip
 GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
 STANDING = np.array([CLASS_NUMBER[w] for w in ("building", "fence", "car")])
@@ -67,8 +67,12 @@ TIGHT = 0.4  # metres beside one of several things that are in a row, within whi
 SIZE = (0.97, 1.03)  # things are so much smaller or larger
 TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
 OCCLUDED = 0.3  # metres nearer than a thing that hide it
+SURE = (0.9, 0.4)  # the most that a place costs, and the least share of its rays, that is good enough for a wall, too
 WALL = (0.4, 1.7)  # metres, standard deviations across and along, of returns that are of a wall
 BESIDE = 3  # columns beside a heap's that are as lost as its own
+# Metres beside a thing and above its ground up to which what does not return may be of it; beams and columns, of which
+# pixels that are so far apart hang together.
+DARK, DARK_TALL, DARK_STEPS = 1.5, 1.5, ((0, 1), (0, 2), *((1, side) for side in range(-2, 3)))
 # Columns, and metres between their returns, that tell in which direction something stands.
 ALONG, APART = 3, (0.05, 1.5)
 
@@ -143,16 +147,22 @@ def _suggestions(canvas: _Canvas, kind: Kind) -> list[np.ndarray]:
     if not len(at):
         return []
     cells = np.floor(canvas.points.reshape(-1, 3)[at, :2] / CELL).astype(np.int64)
-    key, cell = np.unique(cells @ [1 << 20, 1], return_inverse=True)
+    thing = _pieces(cells @ [1 << 20, 1], [x * (1 << 20) + y for x in range(4) for y in range(-3, 4)])
+    things = [at[thing == number] for number in np.flatnonzero(np.bincount(thing) >= FEW)]
+    return sorted(things, key=lambda each: float(np.median(canvas.metres.flat[each])))
+
+
+def _pieces(cells: np.ndarray, steps: list[int]) -> np.ndarray:
+    """(n,) which piece each is of, of what is in cells (n,), those of which that are one of these steps apart are of
+    one piece."""
+    key, cell = np.unique(cells, return_inverse=True)
     one, other = [], []
-    for step in (x * (1 << 20) + y for x in range(4) for y in range(-3, 4)):
+    for step in steps:
         there = np.searchsorted(key, key + step).clip(max=len(key) - 1)
         beside = np.flatnonzero(key[there] == key + step)
         one.append(beside)
         other.append(there[beside])
-    thing = connected(np.concatenate(one), np.concatenate(other), len(key))[cell.ravel()]
-    things = [at[thing == number] for number in np.flatnonzero(np.bincount(thing) >= FEW)]
-    return sorted(things, key=lambda each: float(np.median(canvas.metres.flat[each])))
+    return connected(np.concatenate(one), np.concatenate(other), len(key))[cell.ravel()]
 
 
 def _thing(
@@ -173,10 +183,11 @@ def _thing(
     shapes = [shape for shape in kind.shapes if top >= shape.tall]
     places = [best_place(shape, kind.turns, parts, view, level, axis if kind.turns > 1 else None) for shape in shapes]
     place, shape = min(zip(places, shapes, strict=True), key=lambda both: both[0].total)
+    if (place.cost > SURE[0] or place.share < SURE[1]) and _a_wall(points):
+        return None
     if place.cost > kind.most or place.share < kind.least:
-        if not _a_wall(points):
-            gone = _with_lost(canvas, at)
-            _fill(canvas, gone, gone, level, rng)
+        gone = _with_lost(canvas, at)
+        _fill(canvas, gone, gone, level, rng)
         return None
     there = np.array([[place.x, place.y, place.yaw]])
     mine = at[within(points, there, shape, kind.margin if len(parts) == 1 else TIGHT)[0]]
@@ -254,9 +265,25 @@ def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float, lon
     ])  # fmt: skip
     of = np.concatenate(chosen)
     metres = canvas.metres.flat[of]
+    lost = np.isin(of, _swallowed(canvas, at, middle, level))
     ground = GROUND[canvas.label.flat[of]] | (canvas.points.reshape(-1, 3)[of, 2] < level + LOW)
     metres = np.where(metres > 0, metres, np.float32(np.inf)).astype(np.float32)
-    return View(canvas.rays.reshape(-1, 3)[of], metres, np.arange(len(of)) < len(chosen[0]), ground, weight)
+    return View(canvas.rays.reshape(-1, 3)[of], metres, np.arange(len(of)) < len(chosen[0]), ground, lost, weight)
+
+
+def _swallowed(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> np.ndarray:
+    """Pixels about as high as a thing that did not return and hang together with those that suggest it: its panes and
+    its dark paint would not have returned."""
+    points, away, width = canvas.points.reshape(-1, 3)[at], float(np.hypot(*middle[:2])), canvas.sensor.width
+    ahead = np.arctan2(middle[1], middle[0])
+    low, high = _span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
+    wider = np.arctan2(DARK, max(away, DARK))
+    heights = np.arctan2(level, max(away - 1, 1)), np.arctan2(level + DARK_TALL, max(away, 1))
+    window = _window(canvas, ahead, (low - wider, high + wider), heights)
+    both = np.concatenate([at, window[canvas.metres.flat[window] == 0]])
+    column = (both % width - at[0] % width + width // 2) % width
+    piece = _pieces(2 * width * (both // width) + column, [2 * width * down + side for down, side in DARK_STEPS])
+    return both[len(at) :][np.isin(piece[len(at) :], piece[: len(at)])]
 
 
 def _span(angles: np.ndarray) -> tuple[float, float]:
