@@ -120,15 +120,20 @@ def test_a_car_is_found_where_it_stands(x: float, y: float, yaw: float) -> None:
     assert place.cost < 0.3
 
 
-def test_a_car_of_which_most_does_not_return_is_found_by_what_it_swallows() -> None:
-    """Black on the road beside a heap: before, no car was put there, as it would have hidden what is farther."""
-    x, y, yaw = 9.0, 3.0, 0.4
+def dark_car(x: float, y: float, yaw: float) -> RangeImage:
+    """A car of which the left third returns alone."""
     image = scene(SENSOR, standing("car", 1, x, y, yaw))
     rows, columns = np.nonzero(image.label == CAR)
     dark = columns > np.quantile(columns, 0.35)
     metres, mask = image.range.copy(), image.mask.copy()
     metres[rows[dark], columns[dark]], mask[rows[dark], columns[dark]] = 0, False
-    canvas = module._canvas(replace(image, range=metres, mask=mask, label=np.where(mask, image.label, 0)))
+    return replace(image, range=metres, mask=mask, label=np.where(mask, image.label, 0))
+
+
+def test_a_car_of_which_most_does_not_return_is_found_by_what_it_swallows() -> None:
+    """Black on the road beside a heap: before, no car was put there, as it would have hidden what is farther."""
+    x, y, yaw = 9.0, 3.0, 0.4
+    canvas = module._canvas(dark_car(x, y, yaw))
     at = max(module._suggestions(canvas, module.KINDS[0]), key=len)
     seen = canvas.points.reshape(-1, 3)[at]
     view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount, longer=1)
@@ -141,11 +146,11 @@ def test_a_car_of_which_most_does_not_return_is_found_by_what_it_swallows() -> N
 
 
 def test_what_does_not_return_elsewhere_is_not_swallowed() -> None:
-    image = scene(SENSOR, standing("car", 1, 9.0, 3.0, 0.4))
-    canvas = module._canvas(image)
-    (at,) = module._suggestions(canvas, module.KINDS[0])
+    canvas = module._canvas(dark_car(9.0, 3.0, 0.4))
+    at = max(module._suggestions(canvas, module.KINDS[0]), key=len)
     middle = np.median(canvas.points.reshape(-1, 3)[at], 0)
     before = module._swallowed(canvas, at, middle, -SENSOR.mount)
+    assert len(before) > 100
     rows, columns = np.divmod(at, SENSOR.width)
     canvas.metres[rows.max() - 3 :, columns.min() - 40 : columns.min() - 10] = 0
     np.testing.assert_array_equal(module._swallowed(canvas, at, middle, -SENSOR.mount), before)

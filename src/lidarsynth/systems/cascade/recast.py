@@ -153,8 +153,7 @@ def _suggestions(canvas: _Canvas, kind: Kind) -> list[np.ndarray]:
 
 
 def _pieces(cells: np.ndarray, steps: list[int]) -> np.ndarray:
-    """(n,) which piece each is of, of what is in cells (n,), those of which that are one of these steps apart are of
-    one piece."""
+    """(n,) numbers of the pieces that cells (n,) are of: those that are one of these steps apart are of one."""
     key, cell = np.unique(cells, return_inverse=True)
     one, other = [], []
     for step in steps:
