@@ -113,6 +113,21 @@ def test_sigterm_ends_as_it_did_where_a_command_is_done():
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+def test_the_same_sigterm_once_more_does_not_kill_what_python_is_taking_apart():
+    """On a busy machine the second of two came so late; handlers are gone by then."""
+    lines = """
+import os, signal
+from lidarsynth.cli.terminal import answer
+class Last:
+    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.SIGTERM):
+        kill(pid, number)
+last = Last()
+answer(lambda: os.kill(os.getpid(), signal.SIGTERM))
+"""
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (143, "lidarsynth: stopped by SIGTERM\n")
+
+
 def test_the_same_sigterm_once_more_does_not_kill_what_is_about_to_exit():
     try:
         with pytest.raises(SystemExit, match="143"):

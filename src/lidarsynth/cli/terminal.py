@@ -223,7 +223,8 @@ def _warned() -> Iterator[None]:
 @contextmanager
 def _terminable() -> Iterator[None]:
     """SIGTERM (of timeout, Slurm, a machine that goes down) raises KeyboardInterrupt(SIGTERM): what ends well by Ctrl-C
-    ends well by it, too. Once it has come, it stays so: the same one once more must not kill a process that exits."""
+    ends well by it, too. Once that has ended, it is ignored: the same one once more must not kill a process that exits,
+    and Python takes handlers away before it is gone, but leaves what is ignored."""
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield
         return
@@ -239,8 +240,7 @@ def _terminable() -> Iterator[None]:
     try:
         yield
     finally:
-        if last == -math.inf:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if last == -math.inf else signal.SIG_IGN)
 
 
 def _sayable(error: UnicodeError) -> tuple[str, int]:
