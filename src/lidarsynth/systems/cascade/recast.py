@@ -70,8 +70,7 @@ OCCLUDED = 0.3  # metres nearer than a thing that hide it
 SURE = (0.9, 0.4)  # the most that a place costs, and the least share of its rays, that is good enough for a wall, too
 WALL = (0.4, 1.7)  # metres, standard deviations across and along, of returns that are of a wall
 BESIDE = 3  # columns beside a heap's that are as lost as its own
-# Metres beside a thing and above its ground up to which what does not return may be of it; beams and columns, of which
-# pixels that are so far apart hang together.
+# Metres beside a thing, and above its ground, where it may have swallowed rays; beams and columns that hang together.
 DARK, DARK_TALL, DARK_STEPS = 1.5, 1.5, ((0, 1), (0, 2), *((1, side) for side in range(-2, 3)))
 # Columns, and metres between their returns, that tell in which direction something stands.
 ALONG, APART = 3, (0.05, 1.5)
@@ -247,9 +246,7 @@ def _axis(canvas: _Canvas) -> float | None:
 
 def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float, longer: float) -> View:
     """Some of the rays around what the pixels `at` suggest, up to MOST times as many where that is `longer`."""
-    points, away = canvas.points.reshape(-1, 3)[at], float(np.hypot(*middle[:2]))
-    ahead = np.arctan2(middle[1], middle[0])
-    low, high = _span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
+    away, (ahead, low, high) = float(np.hypot(*middle[:2])), _seen(canvas, at, middle)
     wider, seen = np.arctan2(WIDER, max(away, WIDER)), canvas.elevation.flat[at]
     top = max(np.arctan2(level + TALLER, max(away - 2, 1)), seen.max())
     bottom = min(np.arctan2(level, max(away - 3, 1)), seen.min())
@@ -263,19 +260,17 @@ def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float, lon
         for some, (group, _) in zip(chosen, groups, strict=True)
     ])  # fmt: skip
     of = np.concatenate(chosen)
-    metres = canvas.metres.flat[of]
+    metres = np.where(canvas.metres.flat[of] > 0, canvas.metres.flat[of], np.inf).astype(np.float32)
     lost = np.isin(of, _swallowed(canvas, at, middle, level))
     ground = GROUND[canvas.label.flat[of]] | (canvas.points.reshape(-1, 3)[of, 2] < level + LOW)
-    metres = np.where(metres > 0, metres, np.float32(np.inf)).astype(np.float32)
     return View(canvas.rays.reshape(-1, 3)[of], metres, np.arange(len(of)) < len(chosen[0]), ground, lost, weight)
 
 
 def _swallowed(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> np.ndarray:
-    """Pixels about as high as a thing that did not return and hang together with those that suggest it: its panes and
-    its dark paint would not have returned."""
-    points, away, width = canvas.points.reshape(-1, 3)[at], float(np.hypot(*middle[:2])), canvas.sensor.width
-    ahead = np.arctan2(middle[1], middle[0])
-    low, high = _span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
+    """Pixels (m,) about as high as a thing that did not return and hang together with those that suggest it, `at` (n,):
+    its panes and its dark paint would not have returned. middle (3,), level: of the thing and its ground, metres."""
+    away, width = float(np.hypot(*middle[:2])), canvas.sensor.width
+    ahead, low, high = _seen(canvas, at, middle)
     wider = np.arctan2(DARK, max(away, DARK))
     heights = np.arctan2(level, max(away - 1, 1)), np.arctan2(level + DARK_TALL, max(away, 1))
     window = _window(canvas, ahead, (low - wider, high + wider), heights)
@@ -283,6 +278,12 @@ def _swallowed(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float
     column = (both % width - at[0] % width + width // 2) % width
     piece = _pieces(2 * width * (both // width) + column, [2 * width * down + side for down, side in DARK_STEPS])
     return both[len(at) :][np.isin(piece[len(at) :], piece[: len(at)])]
+
+
+def _seen(canvas: _Canvas, at: np.ndarray, middle: np.ndarray) -> tuple[float, float, float]:
+    """Azimuth of a thing's middle (3,), and from where to where around it its pixels `at` (n,) are seen, radians."""
+    points, ahead = canvas.points.reshape(-1, 3)[at], float(np.arctan2(middle[1], middle[0]))
+    return ahead, *_span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
 
 
 def _span(angles: np.ndarray) -> tuple[float, float]:
