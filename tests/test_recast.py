@@ -257,6 +257,16 @@ def test_columns_that_are_gone_are_as_those_beyond_the_nearer_end_of_the_gap() -
     np.testing.assert_array_equal(module._mirrored(np.array([0, 11]), np.array([1, 2, 3, 9, 10]), 12), [1, 10])
 
 
+def test_a_heap_below_the_ground_goes() -> None:
+    drawn = blob(scene(SENSOR, standing("car", 0, 7.0, 3.0, 0.0)), CAR)
+    there = drawn.label == CAR
+    below = replace(drawn, range=np.where(there & (SENSOR.directions()[..., 2] < -0.1), 3 * drawn.range, drawn.range))
+    below = replace(below, label=np.where(there & (below.range == drawn.range), 0, below.label))
+    assert points(below, CAR)[:, 2].max() < -SENSOR.mount
+    found = recast(below, np.random.default_rng(0))
+    assert (below.label == CAR).sum() > 200 and not (found.label == CAR).any()
+
+
 def test_a_wall_that_is_called_a_car_stays_as_it_was_drawn() -> None:
     rays = SENSOR.directions()
     metres = 9 / np.maximum(rays[..., 0], 0.1)

@@ -9,11 +9,11 @@ import numpy as np
 
 class Shape(NamedTuple):
     """What things of one kind are like: two boxes one upon the other, (2, 2, 3) least and greatest x, y, z in metres,
-    0 on the ground; `words` of `streets.objects`; tall: returns of a higher one reach so far up, else 0."""
+    0 on the ground; `words` of `streets.objects`; tall: how far up returns of a higher one reach at least."""
 
     words: str
     boxes: np.ndarray
-    tall: float = 0.0
+    tall: float = -np.inf
 
     @property
     def size(self) -> np.ndarray:
@@ -22,7 +22,13 @@ class Shape(NamedTuple):
 
 
 def two_boxes(
-    words: str, length: float, width: float, waist: float, height: float, upper: tuple[float, float, float], tall: float
+    words: str,
+    length: float,
+    width: float,
+    waist: float,
+    height: float,
+    upper: tuple[float, float, float],
+    tall: float = -np.inf,
 ) -> Shape:
     """A thing of so many metres; waist: height at which the upper box stands on the lower one.
 

@@ -50,10 +50,10 @@ class Kind(NamedTuple):
 
 # Chosen on 96 generated scans (docs/generation.md).
 KINDS = (
-    Kind("car", (two_boxes("car", 4.3, 1.74, 0.9, 1.46, (-1.93, 0.95, 0.15), 0.0),
+    Kind("car", (two_boxes("car", 4.3, 1.74, 0.9, 1.46, (-1.93, 0.95, 0.15)),
                  two_boxes("van", 4.9, 1.94, 0.95, 2.0, (-2.45, 1.76, 0.05), 1.6)),
          "paint", 24, 0.3, 40.0, 1.5, 0.2, 1.6),
-    Kind("person", (two_boxes("person", 0.5, 0.55, 0.8, 1.75, (-0.2, 0.2, 0.12), 0.0),),
+    Kind("person", (two_boxes("person", 0.5, 0.55, 0.8, 1.75, (-0.2, 0.2, 0.12)),),
          "cloth", 1, 0.12, 25.0, 1.8, 0.2, 0.5),
 )  # fmt: skip
 GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
