@@ -125,6 +125,13 @@ def test_a_sample_has_the_texture_of_the_class_that_was_drawn_and_the_likeliest_
     assert read[:, 256:].std() > 1.5 * read[:, :256].std()
 
 
+def test_noise_stays_within_the_limits_of_the_sensor():
+    sensor = SENSORS["vlp-16"]
+    ends = np.resize(np.float32([sensor.min_range, sensor.max_range]), (16, sensor.width))
+    seen = noisy(RangeImage(ends, ends / 200, ends > 0, sensor), rng(0)).range
+    assert seen.min() >= np.float32(sensor.min_range) and seen.max() <= sensor.max_range and (seen != ends).any()
+
+
 def test_a_drawn_scan_is_rough_where_greenery_is_seen_in_it(monkeypatch: pytest.MonkeyPatch):
     """Whatever the fill drew, the classes that are seen in the result decide, and are its labels."""
     model = ls.load("default").into("vlp-16")

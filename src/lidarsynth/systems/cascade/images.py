@@ -102,7 +102,8 @@ def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
     if image.label is not None:
         noise = noise + _straying(texture(image.label), image.sensor, rng)
     label = None if image.label is None else image.label % TEXTURE
-    return replace(image, range=np.clip(image.range + noise, image.sensor.min_range, None) * image.mask, label=label)
+    limits = image.sensor.min_range, image.sensor.max_range
+    return replace(image, range=np.clip(image.range + noise, *limits) * image.mask, label=label)
 
 
 def textured(drawn: list[RangeImage], even: np.ndarray, rng: list[torch.Generator]) -> list[RangeImage]:
