@@ -80,7 +80,10 @@ class AnySensorModel(ScanModel, ABC):
         """
         if not self.own:
             if times is not None:
-                raise ValueError(f"expected times as many beams or images of {self.sensor.name}, found both")
+                raise ValueError(
+                    f"expected times as many beams or images of {self.sensor.name}, found both: for the former, ask a "
+                    "model without into, and name the scan's sensor as sensor_in"
+                )
             return super().upsampled(scan, how, sensor_in, on_step)
         if how.precision is not None:
             model = self.at_precision(how.precision)

@@ -28,7 +28,7 @@ def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:
     if sensor_in is None:
         sensor_in, reason = recognise(scan)
         if sensor_in is None:
-            raise ValueError(f"expected a known sensor or the word for it (--from), found {reason}")
+            raise ValueError(reason.replace("--sensor", "--from, or sensor_in"))
         return as_scanned(scan, get_sensor(sensor_in))
     return get_sensor(sensor_in)
 
