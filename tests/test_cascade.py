@@ -681,6 +681,8 @@ def test_a_draft_is_noise_led_half_way_each_by_its_own_generator(model: CascadeM
     quiet = draft(network, rays, standing, generators(5, 3), t=0.05)
     noise = (three[:, :2] - three[:, 2:4]).std(), (quiet[:, :2] - quiet[:, 2:4]).std()
     assert noise[1] < noise[0] / 4  # x_t and the mean of what it may become are the nearer, the less noise is left
+    quick = draft(network, rays, standing, generators(5, 3), precision="bf16")
+    assert 0 < (quick - three).abs().mean() < 0.01 and quick.dtype == torch.float32
 
 
 def test_threads_are_as_before_when_columns_are_drawn():

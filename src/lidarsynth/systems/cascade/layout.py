@@ -77,13 +77,20 @@ def to_draft(schedule: Schedule, steps: int, t: float = DRAFT) -> Tensor:
     return schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64)).clamp(max=1)
 
 
-def draft(network: Cascade, rays: Tensor, standing: Tensor, rng: list[torch.Generator], t: float = DRAFT) -> Tensor:
+def draft(
+    network: Cascade,
+    rays: Tensor,
+    standing: Tensor,
+    rng: list[torch.Generator],
+    t: float = DRAFT,
+    precision: str = "fp32",
+) -> Tensor:
     """(B, 7, 16, 128) what `drafted` says of noise that was led to time t, for rays (B, 8, 16, 128) of standing
-    elevations (B, 16, 128) in radians, each by a generator of its own."""
-
+    elevations (B, 16, 128) in radians, each by a generator of its own; the coarse network's products in `precision`."""
     x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
-    *_, last = sample(velocity(network, rays, guided=True), x_1, DRAFTING, DRAFT_STEPS, rng, partial(to_draft, t=t))
-    return drafted(network.coarse, last.x_s, last.s, rays, standing)
+    with torch.autocast(rays.device.type, torch.bfloat16, enabled=precision == "bf16"):
+        *_, last = sample(velocity(network, rays, guided=True), x_1, DRAFTING, DRAFT_STEPS, rng, partial(to_draft, t=t))
+        return drafted(network.coarse, last.x_s, last.s, rays, standing)
 
 
 def times(count: int, tell: Callable[[], object]) -> Callable[[], None]:
@@ -118,24 +125,28 @@ def grids(
     how: tuple[str, int],
     on_step: Callable[[], None],
     choice: int = 1,
+    precision: str = "fp32",
 ) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
     """Metres, 0 for no return, and reflectance, each (B, R, C), and the rows (R,) and columns (C,) that were drawn:
     those given, and what is between them where the network draws them.
 
     how     as `sampling` says; on_step  called after each
     choice  of so many drawn column by column one is kept, by the odds of the network's judge that it is a street's
+    precision  of the coarse network's products: fp32 | bf16
     """
     (told, standing), (sampler, steps) = rays_of(rows, columns), how
     if sampler == BY_COLUMNS:
         assert network.columns is not None
         with one_thread():
-            grid = _chosen(network, told, standing, rng, on_step, choice if network.judge is not None else 1)
+            some = choice if network.judge is not None else 1
+            grid = _chosen(network, told, standing, rng, on_step, some, precision)
             return detailed(network, grid, (rows, columns), rays_of, sensor, unevenness(sensor), rng)
     dim = torch.from_numpy(unevenness(sensor)[rows]).to(told.device)
     x_0 = x_1 = noise_like(torch.zeros(len(told), 3, ROWS, COLUMNS, device=told.device), rng)
-    for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
-        x_0 = state.x_s
-        on_step()
+    with torch.autocast(told.device.type, torch.bfloat16, enabled=precision == "bf16"):
+        for state in sample(velocity(network, told, guided=True), x_1, STEPS[sampler], steps, rng, even_log_snr):
+            x_0 = state.x_s
+            on_step()
     metres, shade = network.coarse.decode(network.settled(x_0, told), standing, dim)
     return straightened(metres, rows, sensor), shade, rows, columns
 
@@ -147,6 +158,7 @@ def _chosen(
     rng: list[torch.Generator],
     on_step: Callable[[], None],
     choice: int,
+    precision: str,
 ) -> Grid:
     """Grids (B, 16, 128) drawn after drafts, each one of `choice`, by the odds that the judge gives it as a street's.
 
@@ -156,7 +168,7 @@ def _chosen(
     assert network.columns is not None
     one_by_one = rng if choice == 1 else [each for one in rng for each in _offspring(one, choice)]
     told, standing = (part.repeat_interleave(choice, 0) for part in (told, standing))
-    after = draft(network, told, standing, one_by_one)
+    after = draft(network, told, standing, one_by_one, precision=precision)
     grid = draw(network.columns, told, after, one_by_one, on_step)
     if choice == 1:
         return grid

@@ -74,7 +74,7 @@ class CascadeModel(AnySensorModel):
     network.classes  an image -> the class of each return
     own              whether scans are completed, and made denser, in the sensor that made them: until `into`
     labelled         whether its images have classes: after `with_labels`
-    precision        of the fill's matrix products: fp32 | bf16
+    precision        of the matrix products of the fill, and of the coarse stage in generation: fp32 | bf16
     response         how the sensor reports what it sees, as found out from the scan at hand
     grain            how much of each kind of noise its samples take
     layouts          drawn for each generated scan, of which one is kept, by its odds as a street's: see `choosing`
@@ -154,7 +154,8 @@ class CascadeModel(AnySensorModel):
         rays_of = partial(self._grid_rays, count=count)
         for start in range(first - first % count, n, count):  # whole blocks, so that a scan is the same bit by bit
             rng, wanted = generators(seed, count, offset=start), parts(first - start, min(count, n - start), size)
-            grid = grids(self.network, self.sensor, rows, columns, rays_of, rng, how, times(len(wanted), tell), choice)
+            parts_of = self.network, self.sensor, rows, columns, rays_of, rng, how, times(len(wanted), tell), choice
+            grid = grids(*parts_of, self.precision)
             for part in wanted:
                 yield from self._filled_grids(grid[0][part], grid[1][part], *grid[2:], rng[part])
                 tell()
