@@ -20,7 +20,7 @@ from lidarsynth.systems.cascade import layout
 from lidarsynth.systems.cascade.family import build
 from lidarsynth.systems.cascade.images import grid_of
 from lidarsynth.systems.cascade.model import CascadeModel
-from lidarsynth.verbs.generation import Drawing
+from lidarsynth.verbs.generation import Drawing, precision_of
 
 SENSOR = ls.Sensor("small", tuple(np.linspace(5, -25, 32).tolist()), 256, 0.5, 120.0, mount=1.8)
 
@@ -157,6 +157,16 @@ def test_a_chosen_scan_is_the_same_however_many_are_made():
     (plain,), (one,) = without.generate(1, seed=5), model.choosing(1).generate(1, seed=5)
     np.testing.assert_array_equal(one.range, plain.range)
     assert (plain.mask != three[0].mask).any()
+
+
+def test_scans_differ_by_precision_and_folders_know_it():
+    quick = Drawing("default", precision="bf16").of(cascade(None))
+    assert precision_of(quick) == {"precision": "bf16"} and precision_of(Drawing().of(quick)) == {}
+    assert precision_of(Drawing("bilinear", precision="auto").of(ls.load("bilinear"))) == {}
+    (exact,), (near,) = (model.generate(1, seed=5) for model in (cascade(None), quick))
+    assert (exact.range != near.range).any()
+    with pytest.raises(ValueError, match="expected precision fp32, or a cascade such as default for bf16"):
+        Drawing("bilinear", precision="bf16").of(ls.load("bilinear"))
 
 
 def test_what_cannot_choose_says_so():

@@ -6,7 +6,18 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from lidarsynth.cli.arguments import Count, Device, Format, GenerationSteps, Picture, Sampler, SensorWord, Source, arg
+from lidarsynth.cli.arguments import (
+    Count,
+    Device,
+    Format,
+    GenerationSteps,
+    Picture,
+    Precision,
+    Sampler,
+    SensorWord,
+    Source,
+    arg,
+)
 from lidarsynth.cli.terminal import at_least, load_with_bar, say, scan_bar, step_bar, warn
 from lidarsynth.lidar.plural import plural
 
@@ -29,6 +40,7 @@ def generate(
     seed: Annotated[int, arg(help="scan i depends on seed + i only.")] = 0,
     batch_size: Annotated[int, arg(help="scans at once on a GPU; a CPU makes them one by one.")] = 4,
     device: Device = "cpu",
+    precision: Precision = "fp32",
     workers: Annotated[
         int | None, arg(metavar="INT", help="processes; default one per core, where each has a block of scans to draw.")
     ] = None,
@@ -37,12 +49,21 @@ def generate(
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.generation import Drawing, claim, endings_of, generate_into, missing, processes, steps_of
+    from lidarsynth.verbs.generation import (
+        Drawing,
+        claim,
+        endings_of,
+        generate_into,
+        missing,
+        precision_of,
+        processes,
+        steps_of,
+    )
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
     endings = endings_of(format, labels, picture)
-    source = Drawing(model, device, sensor, labels, layouts)
+    source = Drawing(model, device, sensor, labels, layouts, precision)
     loaded = source.of(load_with_bar(model, device))
     calls = loaded.generation_steps(steps, sampler)
     used = loaded.sampler_used(steps, sampler)
@@ -50,6 +71,7 @@ def generate(
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
     settings |= {"labels": True} if labels else {}
     settings |= {} if layouts is None else {"layouts": layouts}
+    settings |= precision_of(loaded)
     with only_writer(out, "generation"):
         claim(out, settings, loaded.sampler_used(steps))
         if sampler is None and used != loaded.sampler_used():

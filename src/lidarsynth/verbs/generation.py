@@ -49,6 +49,11 @@ def steps_of(model: ScanModel, steps: int | None = None, sampler: str | None = N
     return {"steps": calls}
 
 
+def precision_of(model: ScanModel) -> dict[str, str]:
+    """What a folder records of a model's products, where these are not in float32: scans differ by it."""
+    return {"precision": model.precision} if isinstance(model, CascadeModel) and model.precision != "fp32" else {}
+
+
 def claim(folder: Path, settings: dict[str, Any], sampler: str | None = None) -> None:
     """Begin a folder of generated scans, or go on with one that was begun with the same settings.
 
@@ -128,13 +133,15 @@ def cut(runs: list[range], together: int) -> list[range]:
 
 
 class Drawing(NamedTuple):
-    """Which model draws, as `load` takes it, and scans of which sensor, with labels or without, of how many layouts."""
+    """Which model draws, as `load` takes it, and scans of which sensor, with labels or without, of how many layouts,
+    with which products."""
 
     model: str = "default"
     device: str = "cpu"
     sensor: str | None = None
     labels: bool = False
     layouts: int | None = None
+    precision: str = "fp32"
 
     def of(self, model: ScanModel) -> ScanModel:
         """A loaded model with images of that sensor, with labels or without."""
@@ -144,6 +151,7 @@ class Drawing(NamedTuple):
                 raise ValueError(f"expected a model that chooses among layouts, such as default, found "
                                  f"{model.experiment.name}")  # fmt: skip
             model = model.choosing(self.layouts)
+        model = model.at_precision(self.precision)
         return model.with_labels() if self.labels else model
 
 

@@ -158,7 +158,7 @@ def _chosen(
     rng: list[torch.Generator],
     on_step: Callable[[], None],
     choice: int,
-    precision: str,
+    precision: str = "fp32",
 ) -> Grid:
     """Grids (B, 16, 128) drawn after drafts, each one of `choice`, by the odds that the judge gives it as a street's.
 
@@ -168,7 +168,7 @@ def _chosen(
     assert network.columns is not None
     one_by_one = rng if choice == 1 else [each for one in rng for each in _offspring(one, choice)]
     told, standing = (part.repeat_interleave(choice, 0) for part in (told, standing))
-    after = draft(network, told, standing, one_by_one, precision=precision)
+    after = draft(network, told, standing, one_by_one, DRAFT, precision)
     grid = draw(network.columns, told, after, one_by_one, on_step)
     if choice == 1:
         return grid
