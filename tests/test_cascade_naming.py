@@ -25,6 +25,7 @@ from lidarsynth.systems.cascade.naming import (
     named,
     of_pieces,
     of_surfaces,
+    sketched,
     weights,
 )
 from lidarsynth.systems.cascade.response import AS_STREETS
@@ -239,6 +240,23 @@ def test_what_gets_more_is_named_more_often():
     assert (more == green).sum() > (plain == green).sum()
     kept = more != green
     np.testing.assert_array_equal(more[kept], plain[kept])
+
+
+def test_more_may_be_of_each_row_and_greenery_gets_it_above_the_horizon():
+    torch.manual_seed(3)
+    network, images, green = ClassUNet(8).eval(), [kerb(WIDE)], CLASS_NUMBER["vegetation"]
+    rows = np.where(np.arange(WIDE.height) < 10, 9.0, 0.0)
+    plain, more, all_of_them = (named(network, images, AS_STREETS, WIDE, more=told, alone=True)[0].label
+                                for told in (None, {"vegetation": rows}, {"vegetation": 9.0}))  # fmt: skip
+    assert plain is not None and more is not None and all_of_them is not None
+    np.testing.assert_array_equal(more[:10], all_of_them[:10])
+    np.testing.assert_array_equal(more[10:], plain[10:])
+    assert (more[:10] == green).sum() > (plain[:10] == green).sum()
+    greener = sketched(SENSORS["os1-64"])["vegetation"]
+    up = np.asarray(SENSORS["os1-64"].elevations)
+    assert isinstance(greener, np.ndarray) and (np.diff(greener) <= 0).all()
+    assert np.ptp(greener[up < 2]) == 0 and greener[up > 6] == pytest.approx(greener[-1] + 1)
+    np.testing.assert_array_equal(sketched(SENSORS["hdl-64e-kitti"])["vegetation"], greener[-1])
 
 
 def test_pixels_of_a_surface_are_named_together_and_edges_stay():

@@ -48,7 +48,7 @@ from lidarsynth.systems.cascade.images import (
 )
 from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, one_thread, sampling, times, told_of
-from lidarsynth.systems.cascade.naming import GROWING, RARER, SKETCHED, class_of_points, named
+from lidarsynth.systems.cascade.naming import GROWING, RARER, class_of_points, named, sketched
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast
 from lidarsynth.systems.cascade.request import calls, resolved
@@ -246,7 +246,7 @@ class CascadeModel(AnySensorModel):
         drawn, shades = self._whole(metres, reflectance, rows, columns, rng)
         if self.network.classes is None:
             return self._named(grown(drawn, shades, self._blocked, rng))
-        network, more = self.network.drawn, SKETCHED
+        network, more = self.network.drawn, sketched(self.sensor)
         if network is None:  # one that has seen recorded scans alone: calm between the beams of the grid
             network, more = self.network.classes, RARER | (GROWING if len(rows) > ROWS else {})
         recorded = textured(drawn, shades, rng)

@@ -46,9 +46,11 @@ ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no
 # than streets have, and as much of leaves. Chosen by street-2 (docs/generation.md).
 GROWING = {"vegetation": -0.1, "terrain": 1.6}
 # Logits that these get from a network that has learned from scans in the making: layouts that are drawn suggest more
-# people, lorries and parking, and less grass, than streets' own (docs/generation.md).
-SKETCHED = {"person": -1.0, "truck": -1.6, "parking": -0.4, "terrain": 0.6, "fence": 0.4, "building": 0.2,
-            "pole": 0.2, "trunk": 0.15}  # fmt: skip
+# people, lorries and parking, and less grass, than streets' own; so much more does greenery where rays look so many
+# degrees up, or more, and none below the first of them: there it is taken for buildings (docs/generation.md).
+SKETCHED = {"person": -0.7, "truck": -1.0, "parking": -0.4, "terrain": 0.6, "fence": 0.4, "building": 0.2,
+            "pole": 0.2, "trunk": 0.15, "traffic-sign": 0.3, "vegetation": -0.1}  # fmt: skip
+GREENER, ABOVE = 1.0, (2.0, 6.0)
 # Logits that these get in generated scans, being so much rarer in the streets that layouts have learned than in those
 # of the network of classes (docs/generation.md).
 RARER = {"bicycle": -1.0, "motorcycle": -4.0, "truck": -1.5, "other-vehicle": -0.9, "person": -1.1,
@@ -107,18 +109,18 @@ def named(
     sensor: Sensor,
     precision: str = "fp32",
     least: float = 0.0,
-    more: Mapping[str, float] | None = None,
+    more: Mapping[str, float | np.ndarray] | None = None,
     alone: bool = False,
     inside: ClassUNet | None = None,
 ) -> list[RangeImage]:
     """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
     there is none, or where the network is less sure of it than `least`.
 
-    more    is added to the logits of these classes
+    more    is added to the logits of these classes, of each row (H,) or of all
     alone   each pixel by itself, instead of with those beside it on its surface
     inside  says of images of the insides of buildings what is there, furniture of class 0
     """
-    off = _fair(weights())
+    off = np.tile(_fair(weights())[:, None], sensor.height)
     for word, logit in (more or {}).items():
         off[CLASS_NUMBER[word]] -= logit
     rays, device, labels = response.told(rays_told(sensor)), next(network.parameters()).device, []
@@ -131,13 +133,20 @@ def named(
     return [replace(image, label=label) for image, label in zip(images, labels, strict=True)]
 
 
+def sketched(sensor: Sensor) -> dict[str, float | np.ndarray]:
+    """Logits that classes get in scans in the making of a sensor, of all rows or of each (H,)."""
+    up = np.interp(sensor.elevations, ABOVE, (0.0, GREENER))
+    return SKETCHED | {"vegetation": SKETCHED["vegetation"] + up}
+
+
 def _fair(weight: np.ndarray) -> np.ndarray:
     """(20,) what is taken off the logits of a network that has learned with these weights."""
     return FAIR * np.log(weight)
 
 
 def _without(logits: Tensor, off: np.ndarray) -> Tensor:
-    return logits - torch.from_numpy(off)[:, None, None].float()
+    """Logits (20, H, W) less what is to be taken off, (20,) or (20, H)."""
+    return logits - torch.from_numpy(off.reshape(len(off), -1, 1)).float()
 
 
 def _outside(network: ClassUNet, told: Tensor, image: RangeImage, off: np.ndarray, alone: bool = False) -> Tensor:
