@@ -49,36 +49,27 @@ def generate(
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
     from lidarsynth.files.lock import only_writer
     from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs.generation import (
-        Drawing,
-        claim,
-        endings_of,
-        generate_into,
-        missing,
-        precision_of,
-        processes,
-        steps_of,
-    )
+    from lidarsynth.verbs import generation
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
-    endings = endings_of(format, labels, picture)
-    source = Drawing(model, device, sensor, labels, layouts, precision)
+    endings = generation.endings_of(format, labels, picture)
+    source = generation.Drawing(model, device, sensor, labels, layouts, precision)
     loaded = source.of(load_with_bar(model, device))
     calls = loaded.generation_steps(steps, sampler)
     used = loaded.sampler_used(steps, sampler)
-    settings = {"weights": fingerprint(loaded), "format": format} | steps_of(loaded, steps, sampler)
+    settings = {"weights": fingerprint(loaded), "format": format} | generation.steps_of(loaded, steps, sampler)
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
     settings |= {"labels": True} if labels else {}
     settings |= {} if layouts is None else {"layouts": layouts}
-    settings |= precision_of(loaded)
+    settings |= generation.precision_of(loaded)
     with only_writer(out, "generation"):
-        claim(out, settings, loaded.sampler_used(steps))
+        generation.claim(out, settings, loaded.sampler_used(steps))
         if sampler is None and used != loaded.sampler_used():
             warn(f"with steps scans are drawn by {used}, not by {loaded.sampler_used()}, whose are nearer to streets")
-        runs, size = missing(out, count, endings), loaded.at_once(batch_size)
-        workers = processes(loaded, runs, workers)
-        make = partial(generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)
+        runs, size = generation.missing(out, count, endings), loaded.at_once(batch_size)
+        workers = generation.processes(loaded, runs, workers)
+        make = partial(generation.generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)
         if workers < 2:
             with step_bar("generate", sum(-(-len(run) // size) for run in runs) * calls) as on_step:
                 new = sum(1 for _ in make(on_step))
