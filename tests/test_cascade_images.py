@@ -18,7 +18,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.hanging import landed
 from lidarsynth.systems.cascade.images import TEXTURE, agreed, as_read, grid_of, noisy, with_doubts
 from lidarsynth.systems.cascade.model import CascadeModel
-from lidarsynth.systems.cascade.surfaces import along_rings, evened
+from lidarsynth.systems.cascade.surfaces import along_rings, evened, paved
 
 
 def test_the_noise_of_returning_is_alike_around():
@@ -94,6 +94,25 @@ def test_what_stands_before_a_wall_does_not_melt_into_it():
     found = along_rings(metres * noise)
     assert (found / metres - 1).abs().max() < 0.02
     assert (found / metres - 1)[..., 20:90].std() < 0.5 * (noise - 1).std()
+
+
+def test_paved_ground_is_level_and_kerbs_and_grass_stay():
+    sensor = replace(SENSORS["vlp-16"], width=512)
+    metres, shape = np.full((16, 512), 8.0, np.float32), (16, 512)
+    metres[:, 100:200] = 7.7  # a sidewalk beside the road
+    metres[3, 300] = 0  # no return
+    metres *= 1 + 0.001 * np.random.default_rng(0).standard_normal(shape).astype(np.float32)
+    label = np.full(shape, CLASS_NUMBER["road"])
+    label[:, 100:200], label[:, 400:] = CLASS_NUMBER["sidewalk"], CLASS_NUMBER["terrain"]
+    found = paved(RangeImage(metres, np.zeros(shape, np.float32), metres > 0, sensor, label)).range
+    edge = np.isin(np.arange(512), [0, 99, 100, 199, 200, 299, 300, 301, 399])
+    level = ~edge & (np.arange(512) < 400)
+    steps, before = (np.abs(np.diff(part[:3], axis=1)[:, level[1:] & level[:-1]]) for part in (found, metres))
+    assert steps.mean() < 0.4 * before.mean()
+    assert np.abs(found / np.maximum(metres, 1) - metres / np.maximum(metres, 1)).max() < 0.005  # no slope at the kerb
+    assert np.array_equal(found == 0, metres == 0)
+    assert_close(found[:, 400:], metres[:, 400:], rtol=1e-6, atol=0)
+    assert_close(found[:, [99, 100, 199, 200]], metres[:, [99, 100, 199, 200]], rtol=1e-6, atol=0)
 
 
 def test_classes_are_drawn_by_their_chances_and_alike_side_by_side():

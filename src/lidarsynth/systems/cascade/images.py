@@ -41,7 +41,7 @@ OBSERVED, TUNED = Grain((1.0, 1.0, 1.0), ground=0.6), Grain((1.0, 1.0, 1.0), gro
 # arm or a window's frame before or behind it: of shares of the rays. Chosen by street-2 (docs/generation.md); streets
 # have 0.08 for leaves, 0.035 for grass and 0.02 for bark, and shapes for the rest.
 STRAYING = {"vegetation": ((1.0, 0.08),), "terrain": ((1.0, 0.031),), "trunk": ((0.9, 0.025), (0.1, 0.08)),
-            "building": ((0.92, 0.0), (0.08, 0.045)), "person": ((0.7, 0.0), (0.3, 0.04))}  # fmt: skip
+            "building": ((0.94, 0.0), (0.06, 0.065)), "person": ((0.7, 0.0), (0.3, 0.04))}  # fmt: skip
 UPRIGHT = 3.0  # degrees of elevation in which rays of a column stray alike from a building: frames and sills are edges
 ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about are drawn alike: things are whole
 # The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it

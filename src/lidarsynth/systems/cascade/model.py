@@ -55,6 +55,7 @@ from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.shading import shaded
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
+from lidarsynth.systems.cascade.surfaces import paved
 from lidarsynth.systems.cascade.unit import as_streets
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.filling import Filling, whole
@@ -242,7 +243,7 @@ class CascadeModel(AnySensorModel):
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
     ) -> list[RangeImage]:
         """Grids (B, R, C) as whole images, with the texture of the classes that the fill draws, then of those that are
-        seen in the result, by which surfaces are shaded, too, and cars and people cast anew."""
+        seen in the result, by which surfaces are level and shaded, too, and cars and people cast anew."""
         drawn, shades = self._whole(metres, reflectance, rows, columns, rng)
         if self.network.classes is None:
             return self._named(grown(drawn, shades, self._blocked, rng))
@@ -252,7 +253,7 @@ class CascadeModel(AnySensorModel):
         recorded = textured(drawn, shades, rng)
         seen = named(network, recorded, self.response, self.sensor, self.precision, more=more, alone=True)
         shades = np.stack([shaded(even, image, self.tuned) for even, image in zip(shades, seen, strict=True)])
-        drawn = [replace(a, label=b.label) for a, b in zip(drawn, seen, strict=True)]
+        drawn = [paved(replace(a, label=b.label)) for a, b in zip(drawn, seen, strict=True)]
         cast = all_recast(grown(drawn, shades, self._blocked, rng), rng)
         if self.network.drawn is None:
             return as_cast(self._named(cast), cast)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.column_neighbours import Grid
+from lidarsynth.systems.cascade.images import texture
 
 # Rounds; the share of the range within which a return is of its neighbours' surface, between what was drawn between
 # columns that are straight already, and from beam to beam, where the foot of a wall is no slope; all chosen by street-2
@@ -22,6 +27,7 @@ EDGE, ONE_SIDED = 0.03, 1 / 3
 # Of `evened`: differences of reflectance that are speckle, on the ground and elsewhere; of the range code, on flat
 # ground and to the neighbours along a ring.
 ALIKE, FLAT, BESIDE = (0.04, 0.08), 0.02, 0.1
+PAVED = [CLASS_NUMBER[name] for name in ("road", "parking", "sidewalk")]
 
 
 def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor, edges: bool = False) -> Tensor:
@@ -45,10 +51,24 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor, edges: bool =
 
 def along_rings(metres: Tensor) -> Tensor:
     """`straightened` along rings alone, for what was drawn between columns that are straight already."""
+    return _along_rings(metres, torch.ones_like(metres, dtype=torch.bool))
+
+
+def paved(image: RangeImage) -> RangeImage:
+    """A sample in the making (H, W), metres, with labels, `along_rings` where both neighbours on the ring are of the
+    same paved class: what a fill draws waves there by as much again as a sensor's noise. Kerbs stay."""
+    assert image.label is not None
+    label = texture(image.label)
+    inside = np.isin(label, PAVED) & (label == np.roll(label, 1, 1)) & (label == np.roll(label, -1, 1))
+    metres = torch.from_numpy((image.range * image.mask).astype(np.float32))
+    return replace(image, range=_along_rings(metres[None], torch.from_numpy(inside)[None])[0].numpy())
+
+
+def _along_rings(metres: Tensor, chosen: Tensor) -> Tensor:
     returned = metres > 0
     inverse = returned / metres.clamp_min(0.1)
     for _ in range(ROUNDS):
-        inverse = _along_ring(inverse, FINE)
+        inverse = torch.where(chosen, _along_ring(inverse, FINE), inverse)
     return torch.where(returned, 1 / inverse.clamp_min(1e-6), 0)
 
 
