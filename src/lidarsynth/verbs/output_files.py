@@ -36,8 +36,9 @@ def works(
     named = bool(out.suffix or out.is_file())
     one = inputs.single and named and (_is(WRITERS, out) or not out.is_dir())
     if not one and _names_a_file(out):
+        scans = "the scans of a folder" if inputs.count == 1 else f"{inputs.count or 'several'} scans"
         raise ValueError(
-            f"{out}: expected the name of a folder for {inputs.count or 'several'} scans, found that of a file; "
+            f"{out}: expected the name of a folder for {scans}, found that of a file; "
             f"written are {', '.join(WRITERS)} of one scan, and {' and '.join(FORMATS)} of a bag"
         )
     part, parts = shard
