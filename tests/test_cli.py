@@ -343,6 +343,12 @@ def test_complete_takes_several_scans_or_a_folder(run: Run, tiny: Path, tmp_path
     for pattern, found in (("*.gz", "c.bin.gz"), ("m*", "more"), ("*.las", "none")):
         refused(run("complete", scans / pattern, "--out", tmp_path / "z", *words), f"of this pattern, found {found}\n")
     assert not (tmp_path / "z").exists()
+    for name in ("one", "two", "empty"):
+        (tmp_path / "days" / name).mkdir(parents=True)
+    write(tmp_path / "days" / "one" / "a.ply", street())
+    write(tmp_path / "days" / "two" / "b.bin", street())
+    assert run("complete", tmp_path / "days" / "*", "--out", tmp_path / "z", *words).code == 0  # a folder of none aside
+    assert list(files(tmp_path / "z")) == ["a.ply", "b.ply", "report.json"]
 
 
 def test_nothing_is_put_before_a_point_beyond_the_range_limits(run: Run, tiny: Path, tmp_path: Path):

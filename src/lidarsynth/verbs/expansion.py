@@ -48,13 +48,17 @@ def all_expanded(paths: Sequence[Path], earlier: EarlierResults | None) -> tuple
 
 
 def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], list[Path]]:
-    """The path, the files of a folder, or those that a glob finds; of a folder without scans its bags and captures.
-    Beside them, scans as `Inputs.below`."""
+    """The path, the files of a folder, or those that a glob finds, where these are folders alone theirs; of a folder
+    without scans its bags and captures. Beside them, scans as `Inputs.below`."""
     if not path.exists() and any(c in str(path) for c in MAGIC):
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
         scans, bags = [p for p in found if is_scan(p)], {p for p in found if p.is_dir() and is_bag(p)}
         streams = sorted((p for p in found if is_stream(p) and p.parent not in bags), key=by_number)
         if not (scans or streams):
+            folders = [p for p in found if is_folder(p) and (has_scans(p) or streams_below(p))]
+            if folders:
+                parts = [_expanded(folder, earlier) for folder in folders]
+                return [p for part in parts for p in part[0]], [p for part in parts for p in part[1]]
             others = ", ".join(p.name for p in found[:NAMED]) + (", ..." if found[NAMED:] else "")
             raise ValueError(f"{path}: expected scans, bags or captures of this pattern, found {others or 'none'}")
         fixed = Path(*takewhile(lambda part: not any(c in part for c in MAGIC), path.parts))
