@@ -348,7 +348,10 @@ def test_complete_takes_several_scans_or_a_folder(run: Run, tiny: Path, tmp_path
     write(tmp_path / "days" / "one" / "a.ply", street())
     write(tmp_path / "days" / "two" / "b.bin", street())
     assert run("complete", tmp_path / "days" / "*", "--out", tmp_path / "z", *words).code == 0  # a folder of none aside
-    assert list(files(tmp_path / "z")) == ["a.ply", "b.ply", "report.json"]
+    (tmp_path / "days" / "one" / "one2").mkdir()
+    write(tmp_path / "days" / "one" / "one2" / "c.ply", street())
+    within = run("complete", tmp_path / "days" / "**" / "one*", "--out", tmp_path / "w", *words)  # one in the other
+    assert within.code == 0 and list(files(tmp_path / "w")) == ["a.ply", "c.ply", "report.json"]
 
 
 def test_nothing_is_put_before_a_point_beyond_the_range_limits(run: Run, tiny: Path, tmp_path: Path):

@@ -56,6 +56,7 @@ def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], l
         streams = sorted((p for p in found if is_stream(p) and p.parent not in bags), key=by_number)
         if not (scans or streams):
             folders = [p for p in found if is_folder(p) and (has_scans(p) or streams_below(p))]
+            folders = [p for p in folders if not any(other in p.parents for other in folders)]
             if folders:
                 parts = [_expanded(folder, earlier) for folder in folders]
                 return [p for part in parts for p in part[0]], [p for part in parts for p in part[1]]

@@ -56,7 +56,7 @@ def along_rings(metres: Tensor) -> Tensor:
 
 def paved(image: RangeImage) -> RangeImage:
     """A sample in the making (H, W), metres, with labels, `along_rings` where both neighbours on the ring are of the
-    same paved class: what a fill draws waves there by as much again as a sensor's noise. Kerbs stay."""
+    same paved class: what a fill draws waves there by a third of a sensor's noise. Kerbs stay."""
     assert image.label is not None
     label = texture(image.label)
     inside = np.isin(label, PAVED) & (label == np.roll(label, 1, 1)) & (label == np.roll(label, -1, 1))
