@@ -49,9 +49,15 @@ def straightened(metres: Tensor, rows: np.ndarray, sensor: Sensor, edges: bool =
     return upright(away, height) / cosine
 
 
-def along_rings(metres: Tensor) -> Tensor:
-    """`straightened` along rings alone, for what was drawn between columns that are straight already."""
-    return _along_rings(metres, torch.ones_like(metres, dtype=torch.bool))
+def along_rings(metres: Tensor, chosen: Tensor | None = None) -> Tensor:
+    """Metres (B, R, C), 0 for no return, `straightened` along rings alone, for what was drawn between columns that are
+    straight already; of `chosen` (B, R, C) bool alone, None = all."""
+    returned = metres > 0
+    inverse = returned / metres.clamp_min(0.1)
+    for _ in range(ROUNDS):
+        nearer = _along_ring(inverse, FINE)
+        inverse = nearer if chosen is None else torch.where(chosen, nearer, inverse)
+    return torch.where(returned, 1 / inverse.clamp_min(1e-6), 0)
 
 
 def paved(image: RangeImage) -> RangeImage:
@@ -61,15 +67,7 @@ def paved(image: RangeImage) -> RangeImage:
     label = texture(image.label)
     inside = np.isin(label, PAVED) & (label == np.roll(label, 1, 1)) & (label == np.roll(label, -1, 1))
     metres = torch.from_numpy((image.range * image.mask).astype(np.float32))
-    return replace(image, range=_along_rings(metres[None], torch.from_numpy(inside)[None])[0].numpy())
-
-
-def _along_rings(metres: Tensor, chosen: Tensor) -> Tensor:
-    returned = metres > 0
-    inverse = returned / metres.clamp_min(0.1)
-    for _ in range(ROUNDS):
-        inverse = torch.where(chosen, _along_ring(inverse, FINE), inverse)
-    return torch.where(returned, 1 / inverse.clamp_min(1e-6), 0)
+    return replace(image, range=along_rings(metres[None], torch.from_numpy(inside)[None])[0].numpy())
 
 
 def across_rings(metres: Tensor, rows: np.ndarray, sensor: Sensor) -> Tensor:
