@@ -15,6 +15,7 @@ from lidarsynth.streets.raycast import Caster, FewTriangles
 from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.systems.cascade import recast as module
+from lidarsynth.systems.cascade.canvas import canvas_of, mirrored
 from lidarsynth.systems.cascade.placing import View, best_place
 from lidarsynth.systems.cascade.recast import as_cast, recast
 
@@ -109,7 +110,7 @@ def test_rays_along_the_side_of_a_place_do_not_meet_it() -> None:
 @pytest.mark.parametrize(("x", "y", "yaw"), [(9.0, 3.0, 0.4), (-7.0, -6.0, 1.3), (4.0, 14.0, 2.6)])
 def test_a_car_is_found_where_it_stands(x: float, y: float, yaw: float) -> None:
     image = scene(SENSOR, standing("car", 1, x, y, yaw))
-    canvas = module._canvas(image)
+    canvas = canvas_of(image)
     (at,) = module._suggestions(canvas, module.KINDS[0])
     seen = canvas.points.reshape(-1, 3)[at]
     view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount, longer=1)
@@ -133,7 +134,7 @@ def dark_car(x: float, y: float, yaw: float) -> RangeImage:
 def test_a_car_of_which_most_does_not_return_is_found_by_what_it_swallows() -> None:
     """Black on the road beside a heap: before, no car was put there, as it would have hidden what is farther."""
     x, y, yaw = 9.0, 3.0, 0.4
-    canvas = module._canvas(dark_car(x, y, yaw))
+    canvas = canvas_of(dark_car(x, y, yaw))
     at = max(module._suggestions(canvas, module.KINDS[0]), key=len)
     seen = canvas.points.reshape(-1, 3)[at]
     view = module._view(canvas, at, np.median(seen, 0), -SENSOR.mount, longer=1)
@@ -146,7 +147,7 @@ def test_a_car_of_which_most_does_not_return_is_found_by_what_it_swallows() -> N
 
 
 def test_what_does_not_return_elsewhere_is_not_swallowed() -> None:
-    canvas = module._canvas(dark_car(9.0, 3.0, 0.4))
+    canvas = canvas_of(dark_car(9.0, 3.0, 0.4))
     at = max(module._suggestions(canvas, module.KINDS[0]), key=len)
     middle = np.median(canvas.points.reshape(-1, 3)[at], 0)
     before = module._swallowed(canvas, at, middle, -SENSOR.mount)
@@ -191,7 +192,7 @@ def test_a_row_of_parked_cars_that_was_drawn_as_one_heap_becomes_cars() -> None:
         drawn = replace(drawn, range=metres)
     between = (np.abs(points_of(drawn)[..., 0]) < 6) & (np.abs(points_of(drawn)[..., 1] - 4.2) < 1.2)
     drawn = replace(drawn, label=np.where(between, CAR, drawn.label))  # the road between them, too: one heap
-    assert sum(len(at) > 500 for at in module._suggestions(module._canvas(drawn), module.KINDS[0])) == 1
+    assert sum(len(at) > 500 for at in module._suggestions(canvas_of(drawn), module.KINDS[0])) == 1
     found = recast(drawn, np.random.default_rng(0))
     for there in mine:
         assert (found.label == CAR)[there].mean() > 0.35  # panes hardly return
@@ -252,9 +253,9 @@ def test_what_a_heap_lost_goes_with_it_and_the_sky_stays(turned: int, monkeypatc
 
 def test_columns_that_are_gone_are_as_those_beyond_the_nearer_end_of_the_gap() -> None:
     left = np.array([0, 1, 2, 3, 9, 10, 11])
-    found = module._mirrored(np.array([4, 5, 6, 7, 8]), left, 12)
+    found = mirrored(np.array([4, 5, 6, 7, 8]), left, 12)
     np.testing.assert_array_equal(found, [3, 2, 1, 10, 9])
-    np.testing.assert_array_equal(module._mirrored(np.array([0, 11]), np.array([1, 2, 3, 9, 10]), 12), [1, 10])
+    np.testing.assert_array_equal(mirrored(np.array([0, 11]), np.array([1, 2, 3, 9, 10]), 12), [1, 10])
 
 
 def test_a_heap_below_the_ground_goes() -> None:

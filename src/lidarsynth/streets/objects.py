@@ -9,6 +9,9 @@ import numpy as np
 from lidarsynth.streets import people, shapes, wayside, works
 from lidarsynth.streets.shapes import Mesh, box, extrusion, frustum, join, leaves, moved, wheel
 
+# Fences: height in metres, bars in two metres, metres of each, and whether there are none but posts and rails.
+FENCES = ((1.1, 14, 0.05, False), (1.3, 9, 0.11, False), (1.8, 18, 0.035, False), (0.8, 0, 0.0, True))
+
 
 def _wheels(label: str, axles: tuple[float, ...], radius: float, track: float) -> list[Mesh]:
     tyre = wheel(radius, 0.24, "tyre", label)
@@ -224,6 +227,11 @@ def fence(height: float, bars: int, thick: float, posts_only: bool = False) -> M
     return join(*parts)
 
 
+def garden_wall(height: float) -> Mesh:
+    """Two metres of wall along x."""
+    return box((-1.01, 1.01), (-0.12, 0.12), (-0.3, height), "wall", "fence")
+
+
 def guard_rail() -> Mesh:
     """Two metres of crash barrier along x."""
     corner = np.array([[-1.01, 0.04, 0.45], [1.01, 0.04, 0.45], [1.01, 0, 0.6], [-1.01, 0, 0.6]])
@@ -318,10 +326,8 @@ def _kinds() -> dict[str, list[Mesh]]:
         "thicket": [bush(rng, rng.uniform(3, 6), rng.uniform(2, 3.5), 320, 0.32) for _ in range(6)],
         "hedge": [hedge(rng, h, d) for h, d in ((0.9, 0.6), (1.4, 0.8), (1.9, 0.9), (2.3, 1.1))],
         "wild hedge": [wild_hedge(rng, h, d) for h, d in ((1.6, 1.2), (2.2, 1.6), (2.8, 1.8), (3.4, 2.2), (4.2, 2.6))],
-        "fence": [fence(1.1, 14, 0.05), fence(1.3, 9, 0.11), fence(1.8, 18, 0.035), fence(0.8, 0, 0, posts_only=True)],
-        "garden wall": [
-            box((-1.01, 1.01), (-0.12, 0.12), (-0.3, h), "wall", "fence") for h in (0.5, 0.9, 1.3, 1.8, 2.2)
-        ],
+        "fence": [fence(*how) for how in FENCES],
+        "garden wall": [garden_wall(height) for height in (0.5, 0.9, 1.3, 1.8, 2.2)],
         "lamp": [pole(6.0, 0.08), pole(7.0, 0.11), pole(9.0, 0.16)],
         "guard rail": [guard_rail()],
         "bollard": [pole(0.9, 0.06), pole(1.0, 0.09)],

@@ -37,11 +37,14 @@ class Grain(NamedTuple):
 # learned from scans of the sensor, all of it.
 GENERATED, SPECKLE, REALISED = Grain((1.0, 0.5, 0.0), (0.5, 0.4, 0.6)), Grain((1.0, 0.0, 0.0)), Grain((0.4, 0.4, 0.8))
 OBSERVED, TUNED = Grain((1.0, 1.0, 1.0), ground=0.6), Grain((1.0, 1.0, 1.0), ground=1.0)
-# Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf, a stalk, an
-# arm or a window's frame before or behind it: of shares of the rays. Chosen by street-2 (docs/generation.md); streets
-# have 0.08 for leaves, 0.035 for grass and 0.02 for bark, and shapes for the rest.
+# Metres, standard deviation along the ray of what misses the surface that the fill has drawn, for a leaf, a stalk or an
+# arm before or behind it: of shares of the rays. Chosen by street-2 (docs/generation.md); streets have 0.08 for leaves,
+# 0.035 for grass and 0.02 for bark, and shapes for the rest.
 STRAYING = {"vegetation": ((1.0, 0.08),), "terrain": ((1.0, 0.031),), "trunk": ((0.9, 0.025), (0.1, 0.08)),
-            "building": ((0.94, 0.0), (0.06, 0.065)), "person": ((0.7, 0.0), (0.3, 0.04))}  # fmt: skip
+            "person": ((0.7, 0.0), (0.3, 0.04))}  # fmt: skip
+# The same of buildings, whose windows and sills are edges, which the more rays meet the farther apart these are: the
+# least and the greatest share, and how much it rises per metre from so many on, in a turn of TURN columns.
+FRAMES, WINDOWS, RISING, NEARBY, TURN = 0.045, (0.02, 0.3), 0.009, 5.0, 1024
 UPRIGHT = 3.0  # degrees of elevation in which rays of a column stray alike from a building: frames and sills are edges
 ALIKE = 32  # parts of the turn in which classes that the fill is in doubt about are drawn alike: things are whole
 # The label of a sample in the making: the likeliest class, and so many times the one that was drawn, whose texture it
@@ -100,7 +103,7 @@ def noisy(image: RangeImage, rng: torch.Generator) -> RangeImage:
     also with the roughness of what grows, and then with the likeliest class alone."""
     noise = torch.randn(image.shape, generator=rng).numpy() * range_noise(image.range) + shifts(image.sensor)
     if image.label is not None:
-        noise = noise + _straying(texture(image.label), image.sensor, rng)
+        noise = noise + _straying(texture(image.label), image.range, image.sensor, rng)
     label = None if image.label is None else image.label % TEXTURE
     limits = image.sensor.min_range, image.sensor.max_range
     return replace(image, range=np.clip(image.range + noise, *limits) * image.mask, label=label)
@@ -117,19 +120,21 @@ def texture(label: np.ndarray) -> np.ndarray:
     return np.where(label < TEXTURE, label, label // TEXTURE)
 
 
-def _straying(label: np.ndarray, sensor: Sensor, rng: torch.Generator) -> np.ndarray:
-    """(H, W) metres: how far each ray strays from what is of a class (H, W)."""
+def _straying(label: np.ndarray, away: np.ndarray, sensor: Sensor, rng: torch.Generator) -> np.ndarray:
+    """(H, W) metres: how far each ray strays from what is of a class (H, W), so many metres away (H, W)."""
     unit, chance = torch.randn(label.shape, generator=rng).numpy(), torch.rand(label.shape, generator=rng).numpy()
     metres = np.zeros(label.shape, np.float32)
-    bands = np.unique(np.floor(np.asarray(sensor.elevations) / UPRIGHT), return_index=True, return_inverse=True)
-    first = bands[1][bands[2]]  # row of each one's band
     for name, some in STRAYING.items():
         before, here = 0.0, label == CLASS_NUMBER[name]
-        how, off = (chance[first], unit[first]) if name == "building" else (chance, unit)
         for share, rough in some:
-            strays = here & (before <= how) & (how < before + share)
-            metres[strays] = rough * off[strays]
+            strays = here & (before <= chance) & (chance < before + share)
+            metres[strays] = rough * unit[strays]
             before += share
+    bands = np.unique(np.floor(np.asarray(sensor.elevations) / UPRIGHT), return_index=True, return_inverse=True)
+    first = bands[1][bands[2]]  # row of each one's band
+    share = np.clip(WINDOWS[0] + RISING * (away - NEARBY) * TURN / sensor.width, *WINDOWS)
+    strays = (label == CLASS_NUMBER["building"]) & (chance[first] < share)
+    metres[strays] = FRAMES * unit[first][strays]
     return metres
 
 

@@ -8,25 +8,20 @@ beside it, as does all of it where no place is good enough, but for walls. Measu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from lidarsynth.lidar.pieces import connected
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
-from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.streets.ground import Ground
-from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
-from lidarsynth.streets.materials import MATERIALS
+from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.objects import cars_and_people
-from lidarsynth.streets.raycast import FewTriangles
-from lidarsynth.streets.sensor_model import RESPONSE, Returns, range_noise, sense
+from lidarsynth.streets.sensor_model import Returns, range_noise
 from lidarsynth.streets.shapes import Mesh, moved
-from lidarsynth.streets.turn import sensor_pose
-from lidarsynth.streets.world import THING, THINGS, World
+from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, canvas_of, mirrored, pieces, tint_of
+from lidarsynth.systems.cascade.fences import cast_fences
 from lidarsynth.systems.cascade.hanging import beside, one_surface
 from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes, within
 
@@ -56,16 +51,16 @@ KINDS = (
     Kind("person", (two_boxes("person", 0.5, 0.55, 0.8, 1.75, (-0.2, 0.2, 0.12)),),
          "cloth", 1, 0.12, 25.0, 1.8, 0.2, 0.5),
 )  # fmt: skip
-GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
 STANDING = np.array([CLASS_NUMBER[w] for w in ("building", "fence", "car")])
 ROAD = CLASS_NUMBER["road"]
-CELL, FEW = 0.4, 20  # metres, in which returns of one thing are within two cells of others; returns
-AROUND, LOW = 6.0, 0.2  # metres around a thing where the ground is looked for, and above it that are ground
+REACH, LOW = (
+    4,
+    0.2,
+)  # cells by which returns of one thing are apart, less than that; metres above ground that are ground
 WIDER, TALLER = 2.5, 2.2  # metres beside and above a thing that are looked at
 OWN, OTHERS, MOST = 220, 340, 2.5  # rays that are looked at, of a thing's and of the others; how many times as many
 TIGHT = 0.4  # metres beside one of several things that are in a row, within which returns are of it
 SIZE = (0.97, 1.03)  # things are so much smaller or larger
-TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
 OCCLUDED = 0.3  # metres nearer than a thing that hide it
 SURE = (0.9, 0.4)  # the most that a place costs, and the least share of its rays, that is good enough for a wall, too
 WALL = (0.4, 1.7)  # metres, standard deviations across and along, of returns that are of a wall
@@ -74,22 +69,6 @@ BESIDE = 3  # columns beside a heap's that are as lost as its own
 DARK, DARK_TALL, DARK_STEPS = 1.5, 1.5, ((0, 1), (0, 2), *((1, side) for side in range(-2, 3)))
 # Columns, and metres between their returns, that tell in which direction something stands.
 ALONG, APART = 3, (0.05, 1.5)
-
-
-@dataclass
-class _Canvas:
-    """A scan in the making: metres (H, W), 0 for no return, reflectance, label; points (H, W, 3), rays (H, W, 3) and
-    where these start, (H, 3), of a frame that stands upright; their azimuth and elevation, (H, W) radians."""
-
-    sensor: Sensor
-    metres: np.ndarray
-    reflectance: np.ndarray
-    label: np.ndarray
-    points: np.ndarray
-    rays: np.ndarray
-    starts: np.ndarray
-    azimuth: np.ndarray
-    elevation: np.ndarray
 
 
 def all_recast(images: list[RangeImage], rng: list[torch.Generator]) -> list[RangeImage]:
@@ -110,70 +89,36 @@ def as_cast(named: list[RangeImage], cast: list[RangeImage]) -> list[RangeImage]
 
 
 def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
-    """The image (H, W), metres and reflectance in [0, 1], with labels (H, W), whose cars and people have the shapes of
-    streets'; as it is, where nothing suggests any."""
-    canvas = _canvas(image)
+    """The image (H, W), metres and reflectance in [0, 1], with labels (H, W), whose cars, people and fences have the
+    shapes of streets'; as it is, where nothing suggests any."""
+    canvas = canvas_of(image)
     axis = _axis(canvas)
     for kind in KINDS:
         todo = _suggestions(canvas, kind)
         while todo:
             rest = _thing(canvas, kind, todo.pop(0), axis, rng)
             todo += [rest] if rest is not None else []
-    mask = canvas.metres > 0
-    return replace(image, range=canvas.metres, reflectance=canvas.reflectance, mask=mask, label=canvas.label)
+    cast_fences(canvas, rng)
+    return canvas.on(image)
 
 
-def _canvas(image: RangeImage) -> _Canvas:
-    assert image.label is not None
-    sensor, label = image.sensor, np.where(image.mask, image.label, 0)
-    rays, starts = sensor.directions(), np.zeros((sensor.height, 3), np.float32)
-    starts[:, 2] = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
-    rays, starts = (_upright(sensor, part) for part in (rays, starts))
-    metres, reflectance = image.range * image.mask, image.reflectance * image.mask
-    points = _upright(sensor, sensor.points(metres))
-    angles = np.arctan2(rays[..., 1], rays[..., 0]), np.arcsin(rays[..., 2].clip(-1, 1))
-    return _Canvas(sensor, metres, reflectance, label, points, rays, starts, *angles)
-
-
-def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of the sensor's frame, of one that is not tilted."""
-    return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3].T.astype(np.float32) if any(sensor.tilt) else vectors
-
-
-def _suggestions(canvas: _Canvas, kind: Kind) -> list[np.ndarray]:
-    """Places in the flattened image of the returns of each thing of a kind, FEW at least, the nearest first."""
-    at = np.flatnonzero(canvas.label == CLASS_NUMBER[kind.name])
-    if not len(at):
-        return []
-    cells = np.floor(canvas.points.reshape(-1, 3)[at, :2] / CELL).astype(np.int64)
-    thing = _pieces(cells @ [1 << 20, 1], [x * (1 << 20) + y for x in range(4) for y in range(-3, 4)])
-    things = [at[thing == number] for number in np.flatnonzero(np.bincount(thing) >= FEW)]
+def _suggestions(canvas: Canvas, kind: Kind) -> list[np.ndarray]:
+    """Places of the returns of each thing of a kind, the nearest first."""
+    things = canvas.things(CLASS_NUMBER[kind.name], REACH)
     return sorted(things, key=lambda each: float(np.median(canvas.metres.flat[each])))
 
 
-def _pieces(cells: np.ndarray, steps: list[int]) -> np.ndarray:
-    """(n,) numbers of the pieces that cells (n,) are of: those that are one of these steps apart are of one."""
-    key, cell = np.unique(cells, return_inverse=True)
-    one, other = [], []
-    for step in steps:
-        there = np.searchsorted(key, key + step).clip(max=len(key) - 1)
-        beside = np.flatnonzero(key[there] == key + step)
-        one.append(beside)
-        other.append(there[beside])
-    return connected(np.concatenate(one), np.concatenate(other), len(key))[cell.ravel()]
-
-
 def _thing(
-    canvas: _Canvas, kind: Kind, at: np.ndarray, axis: float | None, rng: np.random.Generator
+    canvas: Canvas, kind: Kind, at: np.ndarray, axis: float | None, rng: np.random.Generator
 ) -> np.ndarray | None:
     """Casts what the pixels `at` (n,) suggest; which of them may be of another one, None for none or too few."""
-    points = canvas.points.reshape(-1, 3)[at]
+    points = canvas.points_at(at)
     metres, sensor = canvas.metres.flat[at], canvas.sensor
     step = np.abs(np.gradient(np.radians(sensor.elevations)))[at // sensor.width] * (2 * np.pi / sensor.width)
     middle = np.median(points, 0)
     if (step * metres**2).sum() < kind.area or np.hypot(*middle[:2]) > kind.reach:
         return None
-    level = _level(canvas, middle)
+    level = canvas.level(middle)
     long = length(points) / LONG if kind.turns > 1 else 0
     parts = parts_of(points, FEW) if long >= 1 else [points]
     view = _view(canvas, at, middle, level, long if len(parts) > 1 else 1)
@@ -190,7 +135,7 @@ def _thing(
     there = np.array([[place.x, place.y, place.yaw]])
     mine = at[within(points, there, shape, kind.margin if len(parts) == 1 else TIGHT)[0]]
     shade = float(np.median(canvas.reflectance.flat[mine if len(mine) else at]))
-    found, rays = _cast(canvas, _mesh(kind, shape, place, level, rng), _tint(kind, shade, rng), rng)
+    found, rays = canvas.cast(_mesh(kind, shape, place, level, rng), tint_of(kind.material, shade, rng), rng)
     _put(canvas, found, rays, mine, level, rng)
     rest = at[~np.isin(at, mine)]
     return rest if len(rest) >= FEW and len(mine) else None
@@ -202,7 +147,7 @@ def _a_wall(points: np.ndarray) -> bool:
     return bool(thin < WALL[0] and long > WALL[1])
 
 
-def _with_lost(canvas: _Canvas, at: np.ndarray) -> np.ndarray:
+def _with_lost(canvas: Canvas, at: np.ndarray) -> np.ndarray:
     """Pixels `at` (n,), and those that these enclose, along their rings and from beam to beam, and that did not return:
     of a heap they would have been."""
     width = canvas.sensor.width
@@ -222,15 +167,7 @@ def _between(there: np.ndarray, axis: int) -> np.ndarray:
     return before & np.flip(behind, axis)
 
 
-def _level(canvas: _Canvas, middle: np.ndarray) -> float:
-    """Height of the ground around a thing, metres above the sensor's origin."""
-    x, y = (canvas.points[..., axis] - middle[axis] for axis in (0, 1))
-    near = x * x + y * y < AROUND**2
-    ground = canvas.points[..., 2][near & GROUND[canvas.label] & (canvas.metres > 0)]
-    return float(np.median(ground)) if len(ground) >= FEW else -canvas.sensor.mount
-
-
-def _axis(canvas: _Canvas) -> float | None:
+def _axis(canvas: Canvas) -> float | None:
     """Direction in which most of what stands does, radians, or at a right angle to it; None where too little does."""
     stands = np.isin(canvas.label, STANDING)
     along = np.roll(canvas.points[..., :2], -ALONG, 1) - canvas.points[..., :2]
@@ -244,13 +181,13 @@ def _axis(canvas: _Canvas) -> float | None:
     return float(np.angle((length * np.exp(4j * np.arctan2(along[:, 1], along[:, 0]))).sum())) / 4
 
 
-def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float, longer: float) -> View:
+def _view(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float, longer: float) -> View:
     """Some of the rays around what the pixels `at` suggest, up to MOST times as many where that is `longer`."""
-    away, (ahead, low, high) = float(np.hypot(*middle[:2])), _seen(canvas, at, middle)
+    away, (ahead, low, high) = float(np.hypot(*middle[:2])), canvas.seen(at, middle)
     wider, seen = np.arctan2(WIDER, max(away, WIDER)), canvas.elevation.flat[at]
     top = max(np.arctan2(level + TALLER, max(away - 2, 1)), seen.max())
     bottom = min(np.arctan2(level, max(away - 3, 1)), seen.min())
-    window = _window(canvas, ahead, (low - wider, high + wider), (bottom, top))
+    window = canvas.window(ahead, (low - wider, high + wider), (bottom, top))
     own = np.isin(window, at)
     more = min(longer, MOST)
     groups = [(window[which], int(more * most)) for which, most in ((own, OWN), (~own, OTHERS))]
@@ -262,45 +199,22 @@ def _view(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float, lon
     of = np.concatenate(chosen)
     metres = np.where(canvas.metres.flat[of] > 0, canvas.metres.flat[of], np.inf).astype(np.float32)
     lost = np.isin(of, _swallowed(canvas, at, middle, level))
-    ground = GROUND[canvas.label.flat[of]] | (canvas.points.reshape(-1, 3)[of, 2] < level + LOW)
+    ground = GROUND[canvas.label.flat[of]] | (canvas.points_at(of)[:, 2] < level + LOW)
     return View(canvas.rays.reshape(-1, 3)[of], metres, np.arange(len(of)) < len(chosen[0]), ground, lost, weight)
 
 
-def _swallowed(canvas: _Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> np.ndarray:
+def _swallowed(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> np.ndarray:
     """Pixels (m,) about as high as a thing that did not return and hang together with those that suggest it, `at` (n,):
     its panes and its dark paint would not have returned. middle (3,), level: of the thing and its ground, metres."""
     away, width = float(np.hypot(*middle[:2])), canvas.sensor.width
-    ahead, low, high = _seen(canvas, at, middle)
+    ahead, low, high = canvas.seen(at, middle)
     wider = np.arctan2(DARK, max(away, DARK))
     heights = np.arctan2(level, max(away - 1, 1)), np.arctan2(level + DARK_TALL, max(away, 1))
-    window = _window(canvas, ahead, (low - wider, high + wider), heights)
+    window = canvas.window(ahead, (low - wider, high + wider), heights)
     both = np.concatenate([at, window[canvas.metres.flat[window] == 0]])
     column = (both % width - at[0] % width + width // 2) % width
-    piece = _pieces(2 * width * (both // width) + column, [2 * width * down + side for down, side in DARK_STEPS])
+    piece = pieces(2 * width * (both // width) + column, [2 * width * down + side for down, side in DARK_STEPS])
     return both[len(at) :][np.isin(piece[len(at) :], piece[: len(at)])]
-
-
-def _seen(canvas: _Canvas, at: np.ndarray, middle: np.ndarray) -> tuple[float, float, float]:
-    """Azimuth of a thing's middle (3,), and from where to where around it its pixels `at` (n,) are seen, radians."""
-    points, ahead = canvas.points.reshape(-1, 3)[at], float(np.arctan2(middle[1], middle[0]))
-    return ahead, *_span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
-
-
-def _span(angles: np.ndarray) -> tuple[float, float]:
-    """Least and greatest of angles around the one ahead, radians."""
-    around = (angles + np.pi) % (2 * np.pi) - np.pi
-    return float(around.min()), float(around.max())
-
-
-def _window(
-    canvas: _Canvas, ahead: float, azimuths: tuple[float, float], elevations: tuple[float, float]
-) -> np.ndarray:
-    """Places in the flattened image of the rays that go between two azimuths, radians to the left of `ahead`, and two
-    elevations, and that nothing blocks."""
-    around = (canvas.azimuth - ahead + np.pi) % (2 * np.pi) - np.pi
-    between = (around >= azimuths[0]) & (around <= azimuths[1])
-    between &= (canvas.elevation >= elevations[0]) & (canvas.elevation <= elevations[1])
-    return np.flatnonzero(between & ~hidden(canvas.sensor))
 
 
 def _mesh(kind: Kind, shape: Shape, place: Place, level: float, rng: np.random.Generator) -> Mesh:
@@ -312,38 +226,8 @@ def _mesh(kind: Kind, shape: Shape, place: Place, level: float, rng: np.random.G
     return moved(replace(mesh, corners=mesh.corners * larger), place.x, place.y, level, yaw=yaw)
 
 
-def _tint(kind: Kind, shade: float, rng: np.random.Generator) -> float:
-    """How much brighter than its material usually is one is that reads `shade` on average."""
-    of = MATERIALS[kind.material]
-    signal = float(np.interp(shade, RESPONSE[1], RESPONSE[0])) + of.gloss / 2
-    return float(np.clip((signal - of.signal) / of.spread + rng.normal(0, 0.5), *TINT))
-
-
-def _cast(canvas: _Canvas, mesh: Mesh, tint: float, rng: np.random.Generator) -> tuple[Returns, np.ndarray]:
-    """What the rays around a thing bring back of it, and their places (N,) in the flattened image."""
-    sensor, corners = canvas.sensor, mesh.corners.reshape(-1, 3)
-    ahead = np.arctan2(*corners.mean(0)[[1, 0]])
-    low, high = _span(np.arctan2(corners[:, 1], corners[:, 0]) - ahead)
-    heights = np.arctan2(corners[:, 2], np.hypot(corners[:, 0], corners[:, 1]))
-    at = _window(canvas, ahead, (low - 0.01, high + 0.01), (heights.min() - 0.02, heights.max() + 0.02))
-    number = np.cumsum(~hidden(sensor)) - 1
-    each = Lasers(*(part[number[at]] for part in lasers(sensor)))
-    starts, rays = canvas.starts[at // sensor.width], canvas.rays.reshape(-1, 3)[at]
-    return sense(_world(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
-
-
-def _world(mesh: Mesh, tint: float) -> World:
-    """A world of one thing, `tint` in spreads of its materials."""
-    count = len(mesh)
-    kinds, tints = np.full(count, THING, np.uint8), np.full(count, tint, np.float32)
-    none, thing = np.full(count, -1, np.int16), np.zeros(count, np.int32)
-    nowhere, alone = np.zeros((0, 12), np.float32), np.zeros(1, THINGS)
-    told = mesh.corners, kinds, mesh.material, mesh.label, tints, none, nowhere
-    return World(*told, ground=Ground(()), poses=np.zeros((1, 6)), thing=thing, things=alone)
-
-
 def _put(
-    canvas: _Canvas, found: Returns, at: np.ndarray, mine: np.ndarray, level: float, rng: np.random.Generator
+    canvas: Canvas, found: Returns, at: np.ndarray, mine: np.ndarray, level: float, rng: np.random.Generator
 ) -> None:
     """The thing in the scan, where nothing nearer hides it and rays do not go through it; what else was drawn of it,
     pixels `mine`, is as it is beside it."""
@@ -354,17 +238,12 @@ def _put(
     hidden_there = ~own & ~ground & (there < found.surface - OCCLUDED)
     through = ~own & (found.face < 0) & (there > found.surface + OCCLUDED)
     put = np.isfinite(found.surface) & ~hidden_there & ~through
-    returned = put & (found.distance >= canvas.sensor.min_range)
     left = mine[~np.isin(mine, at[put])]
     _fill(canvas, left, np.concatenate([at[put], mine]), level, rng)
-    for whole, values in ((canvas.metres, found.distance), (canvas.reflectance, found.reflectance),
-                          (canvas.label, found.label)):  # fmt: skip
-        whole.flat[at[put]] = np.where(returned, values, 0)[put]
-    cast = at[put]
-    canvas.points.reshape(-1, 3)[cast] = _upright(canvas.sensor, canvas.sensor.points(canvas.metres, cast))
+    canvas.put_returns(at, found, put)
 
 
-def _fill(canvas: _Canvas, left: np.ndarray, taken: np.ndarray, level: float, rng: np.random.Generator) -> None:
+def _fill(canvas: Canvas, left: np.ndarray, taken: np.ndarray, level: float, rng: np.random.Generator) -> None:
     """Pixels `left` (n,) as the farther of the next ones of their row is that are not `taken`, or the ground before it,
     as bright as the ground beside it."""
     width, free = canvas.sensor.width, ~hidden(canvas.sensor)
@@ -385,16 +264,6 @@ def _fill(canvas: _Canvas, left: np.ndarray, taken: np.ndarray, level: float, rn
         there = metres <= canvas.sensor.max_range
         noise = range_noise(np.where(there, metres, 0)) * rng.standard_normal(len(gone))
         flat = others[GROUND[canvas.label[row, others]] & (canvas.metres[row, others] > 0)]
-        as_bright = np.where(ground < behind, _mirrored(gone, flat, width), farther) if len(flat) else farther
-        canvas.metres[row, gone] = np.where(there, metres + noise, 0)
-        canvas.reflectance[row, gone] = np.where(there, canvas.reflectance[row, as_bright], 0)
-        canvas.label[row, gone] = np.where(there, np.where(ground < behind, ROAD, canvas.label[row, farther]), 0)
-    canvas.points.reshape(-1, 3)[left] = _upright(canvas.sensor, canvas.sensor.points(canvas.metres, left))
-
-
-def _mirrored(gone: np.ndarray, left: np.ndarray, width: int) -> np.ndarray:
-    """For each column that is gone the one of all that are left, rising, as far beyond the nearer end of the gap."""
-    after = np.searchsorted(left, gone)
-    a, b, share = beside(gone, left, width)
-    there = np.where(share <= 0.5, after - (gone - a) % width, after - 1 + (b - gone) % width)
-    return left[there % len(left)]
+        as_bright = np.where(ground < behind, mirrored(gone, flat, width), farther) if len(flat) else farther
+        label = np.where(ground < behind, ROAD, canvas.label[row, farther])
+        canvas.put(row * width + gone, np.where(there, metres + noise, 0), canvas.reflectance[row, as_bright], label)

@@ -1,0 +1,168 @@
+"""A generated scan on which things of the streets are cast: what is seen where, what a thing brings back, what is set
+in its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarsynth.lidar.pieces import connected
+from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.ground import Ground
+from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
+from lidarsynth.streets.materials import MATERIALS
+from lidarsynth.streets.raycast import FewTriangles
+from lidarsynth.streets.sensor_model import RESPONSE, Returns, sense
+from lidarsynth.streets.shapes import Mesh
+from lidarsynth.streets.turn import sensor_pose
+from lidarsynth.streets.world import THING, THINGS, World
+from lidarsynth.systems.cascade.hanging import beside
+
+GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
+CELL, FEW = 0.4, 20  # metres of a cell of `pieces`; returns that are enough for a thing
+AROUND = 6.0  # metres around a thing where the ground is looked for
+TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
+
+
+@dataclass
+class Canvas:
+    """A scan in the making: metres (H, W), 0 for no return, reflectance, label; points (H, W, 3), rays (H, W, 3) and
+    where these start, (H, 3), of a frame that stands upright; their azimuth and elevation, (H, W) radians.
+
+    `at` (N,) are places in the flattened image.
+    """
+
+    sensor: Sensor
+    metres: np.ndarray
+    reflectance: np.ndarray
+    label: np.ndarray
+    points: np.ndarray
+    rays: np.ndarray
+    starts: np.ndarray
+    azimuth: np.ndarray
+    elevation: np.ndarray
+
+    def on(self, image: RangeImage) -> RangeImage:
+        """The image (H, W) that the canvas was made of, as it is now."""
+        return replace(image, range=self.metres, reflectance=self.reflectance, mask=self.metres > 0, label=self.label)
+
+    def points_at(self, at: np.ndarray) -> np.ndarray:
+        """Points (N, 3), metres."""
+        return self.points.reshape(-1, 3)[at]
+
+    def things(self, of: int, reach: int) -> list[np.ndarray]:
+        """Places of the returns of each thing of a class, FEW at least: those less than `reach` cells from others."""
+        at = np.flatnonzero(self.label == of)
+        if not len(at):
+            return []
+        cells = np.floor(self.points_at(at)[:, :2] / CELL).astype(np.int64)
+        steps = [x * (1 << 20) + y for x in range(reach) for y in range(1 - reach, reach)]
+        thing = pieces(cells @ [1 << 20, 1], steps)
+        return [at[thing == number] for number in np.flatnonzero(np.bincount(thing) >= FEW)]
+
+    def level(self, middle: np.ndarray) -> float:
+        """Height of the ground around a thing's middle (3,), metres above the sensor's origin."""
+        x, y = (self.points[..., axis] - middle[axis] for axis in (0, 1))
+        near = x * x + y * y < AROUND**2
+        ground = self.points[..., 2][near & GROUND[self.label] & (self.metres > 0)]
+        return float(np.median(ground)) if len(ground) >= FEW else -self.sensor.mount
+
+    def window(self, ahead: float, azimuths: tuple[float, float], elevations: tuple[float, float]) -> np.ndarray:
+        """Places of the rays that go between two azimuths, radians to the left of `ahead`, and two elevations, and that
+        nothing blocks."""
+        around = (self.azimuth - ahead + np.pi) % (2 * np.pi) - np.pi
+        between = (around >= azimuths[0]) & (around <= azimuths[1])
+        between &= (self.elevation >= elevations[0]) & (self.elevation <= elevations[1])
+        return np.flatnonzero(between & ~hidden(self.sensor))
+
+    def seen(self, at: np.ndarray, middle: np.ndarray) -> tuple[float, float, float]:
+        """Azimuth of a middle (3,), and from where to where around it the points `at` are seen, radians."""
+        points, ahead = self.points_at(at), float(np.arctan2(middle[1], middle[0]))
+        return ahead, *span(np.arctan2(points[:, 1], points[:, 0]) - ahead)
+
+    def cast(self, mesh: Mesh, tint: float, rng: np.random.Generator) -> tuple[Returns, np.ndarray]:
+        """What the rays around a thing, `tint` spreads brighter than usual, bring back of it, and their places (N,)."""
+        sensor, corners = self.sensor, mesh.corners.reshape(-1, 3)
+        ahead = np.arctan2(*corners.mean(0)[[1, 0]])
+        low, high = span(np.arctan2(corners[:, 1], corners[:, 0]) - ahead)
+        heights = np.arctan2(corners[:, 2], np.hypot(corners[:, 0], corners[:, 1]))
+        at = self.window(ahead, (low - 0.01, high + 0.01), (heights.min() - 0.02, heights.max() + 0.02))
+        number = np.cumsum(~hidden(sensor)) - 1
+        each = Lasers(*(part[number[at]] for part in lasers(sensor)))
+        starts, rays = self.starts[at // sensor.width], self.rays.reshape(-1, 3)[at]
+        return sense(_world(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
+
+    def put(self, at: np.ndarray, metres: np.ndarray, reflectance: np.ndarray, label: np.ndarray) -> None:
+        """Sets what rays bring back, (N,) each, 0 for no return."""
+        for whole, values in ((self.metres, metres), (self.reflectance, reflectance), (self.label, label)):
+            whole.flat[at] = np.where(metres > 0, values, 0)
+        self.points.reshape(-1, 3)[at] = _upright(self.sensor, self.sensor.points(self.metres, at))
+
+    def put_returns(self, at: np.ndarray, found: Returns, where: np.ndarray) -> None:
+        """`put` of what `cast` found at `at` (N,), `where` (N,) bool it is seen."""
+        metres = np.where(found.distance >= self.sensor.min_range, found.distance, 0)
+        self.put(at[where], metres[where], found.reflectance[where], found.label[where])
+
+
+def canvas_of(image: RangeImage) -> Canvas:
+    """A canvas of an image (H, W), metres and reflectance in [0, 1], with labels (H, W)."""
+    assert image.label is not None
+    sensor, label = image.sensor, np.where(image.mask, image.label, 0)
+    rays, starts = sensor.directions(), np.zeros((sensor.height, 3), np.float32)
+    starts[:, 2] = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
+    rays, starts = (_upright(sensor, part) for part in (rays, starts))
+    metres, reflectance = image.range * image.mask, image.reflectance * image.mask
+    points = _upright(sensor, sensor.points(metres))
+    angles = np.arctan2(rays[..., 1], rays[..., 0]), np.arcsin(rays[..., 2].clip(-1, 1))
+    return Canvas(sensor, metres, reflectance, label, points, rays, starts, *angles)
+
+
+def pieces(cells: np.ndarray, steps: list[int]) -> np.ndarray:
+    """(n,) numbers of the pieces that cells (n,) are of: those that are one of these steps apart are of one."""
+    key, cell = np.unique(cells, return_inverse=True)
+    one, other = [], []
+    for step in steps:
+        there = np.searchsorted(key, key + step).clip(max=len(key) - 1)
+        beside = np.flatnonzero(key[there] == key + step)
+        one.append(beside)
+        other.append(there[beside])
+    return connected(np.concatenate(one), np.concatenate(other), len(key))[cell.ravel()]
+
+
+def span(angles: np.ndarray) -> tuple[float, float]:
+    """Least and greatest of angles around the one ahead, radians."""
+    around = (angles + np.pi) % (2 * np.pi) - np.pi
+    return float(around.min()), float(around.max())
+
+
+def tint_of(material: str, shade: float, rng: np.random.Generator) -> float:
+    """How much brighter than its material usually is a thing is that reads `shade` on average, in its spreads."""
+    of = MATERIALS[material]
+    signal = float(np.interp(shade, RESPONSE[1], RESPONSE[0])) + of.gloss / 2
+    return float(np.clip((signal - of.signal) / of.spread + rng.normal(0, 0.5), *TINT))
+
+
+def mirrored(gone: np.ndarray, left: np.ndarray, width: int) -> np.ndarray:
+    """For each column that is gone the one of all that are left, rising, as far beyond the nearer end of the gap."""
+    after = np.searchsorted(left, gone)
+    a, b, share = beside(gone, left, width)
+    there = np.where(share <= 0.5, after - (gone - a) % width, after - 1 + (b - gone) % width)
+    return left[there % len(left)]
+
+
+def _world(mesh: Mesh, tint: float) -> World:
+    """A world of one thing, `tint` in spreads of its materials."""
+    count = len(mesh)
+    kinds, tints = np.full(count, THING, np.uint8), np.full(count, tint, np.float32)
+    none, thing = np.full(count, -1, np.int16), np.zeros(count, np.int32)
+    nowhere, alone = np.zeros((0, 12), np.float32), np.zeros(1, THINGS)
+    told = mesh.corners, kinds, mesh.material, mesh.label, tints, none, nowhere
+    return World(*told, ground=Ground(()), poses=np.zeros((1, 6)), thing=thing, things=alone)
+
+
+def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of the sensor's frame, of one that is not tilted."""
+    return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3].T.astype(np.float32) if any(sensor.tilt) else vectors
