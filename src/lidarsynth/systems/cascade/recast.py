@@ -1,9 +1,10 @@
-"""Cars and people of generated scans, cast as streets have them where the networks have drawn something like one.
+"""Cars and people of generated scans, cast as streets have them where the networks have drawn something like one; then
+fences (`fences.py`).
 
-What is drawn of a car is often a heap and hardly ever has the outline of one: the columns of
-a layout are 2.8 degrees apart. So where the classes say car or person, one of the streets' own shapes is put where it
-explains most (`placing.py`), its rays are cast and read as streets' are, and what else was drawn of it becomes what is
-beside it, as does all of it where no place is good enough, but for walls. Measured in docs/generation.md.
+What is drawn of a car is often a heap and hardly ever has the outline of one: the columns of a layout are 2.8 degrees
+apart. So where the classes say car or person, one of the streets' own shapes is put where it explains most
+(`placing.py`), its rays are cast and read as streets' are, and what else was drawn of it becomes what is beside it, as
+does all of it where no place is good enough, but for walls. Measured in docs/generation.md.
 """
 
 from __future__ import annotations
