@@ -163,7 +163,7 @@ def test_rays_reach_a_line_where_it_is() -> None:
 def test_how_solid_a_fence_is_says_how_many_rays_end_on_it() -> None:
     for mesh, solid in ((garden_wall(1.3), True), (fence(*FENCES[0]), False)):
         canvas = canvas_of(scene(SENSOR, row(mesh, -6, 6), house()))
-        (at,) = canvas.things(FENCE, 4)
+        (at,) = canvas.things(FENCE)
         ((chosen, line),) = _lines(canvas.points_at(at)[:, :2].astype(float), np.random.default_rng(0))
         run = _run(canvas, at[chosen], line)
         assert run is not None

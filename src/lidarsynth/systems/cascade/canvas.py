@@ -23,7 +23,8 @@ from lidarsynth.streets.world import THING, THINGS, World
 from lidarsynth.systems.cascade.hanging import beside
 
 GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
-CELL, FEW = 0.4, 20  # metres of a cell of `pieces`; returns that are enough for a thing
+# Metres of a cell; returns of one thing are less than so many cells from others; and so many are enough for one.
+CELL, REACH, FEW = 0.4, 4, 20
 AROUND = 6.0  # metres around a thing where the ground is looked for
 TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
 
@@ -59,13 +60,22 @@ class Canvas:
         """Points (N, 3), metres."""
         return self.points.reshape(-1, 3)[at]
 
-    def things(self, of: int, reach: int) -> list[np.ndarray]:
-        """Places of the returns of each thing of a class, FEW at least: those less than `reach` cells from others."""
+    def rays_at(self, at: np.ndarray) -> np.ndarray:
+        """Rays (N, 3) of length 1."""
+        return self.rays.reshape(-1, 3)[at]
+
+    def to_ground(self, at: np.ndarray, level: float) -> np.ndarray:
+        """(N,) metres along rays to flat ground at a height, metres above the sensor's origin; infinite for none."""
+        down = self.rays_at(at)[:, 2]
+        return np.where(down < -0.01, level / np.minimum(down, -0.01), np.inf)
+
+    def things(self, of: int) -> list[np.ndarray]:
+        """Places (n,) of the returns of each thing of a class, FEW at least: what hangs together, seen from above."""
         at = np.flatnonzero(self.label == of)
         if not len(at):
             return []
         cells = np.floor(self.points_at(at)[:, :2] / CELL).astype(np.int64)
-        steps = [x * (1 << 20) + y for x in range(reach) for y in range(1 - reach, reach)]
+        steps = [x * (1 << 20) + y for x in range(REACH) for y in range(1 - REACH, REACH)]
         thing = pieces(cells @ [1 << 20, 1], steps)
         return [at[thing == number] for number in np.flatnonzero(np.bincount(thing) >= FEW)]
 
@@ -101,7 +111,7 @@ class Canvas:
         at = self.window(ahead, (low - 0.01, high + 0.01), (heights.min() - 0.02, heights.max() + 0.02))
         number = np.cumsum(~hidden(sensor)) - 1
         each = Lasers(*(part[number[at]] for part in lasers(sensor)))
-        starts, rays = self.starts[at // sensor.width], self.rays.reshape(-1, 3)[at]
+        starts, rays = self.starts[at // sensor.width], self.rays_at(at)
         return sense(_world(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
 
     def put(self, at: np.ndarray, metres: np.ndarray, reflectance: np.ndarray, label: np.ndarray) -> None:

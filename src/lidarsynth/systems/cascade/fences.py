@@ -24,7 +24,6 @@ from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, mirrored, tin
 from lidarsynth.systems.cascade.images import STRAYING
 
 FENCE, TERRAIN = CLASS_NUMBER["fence"], CLASS_NUMBER["terrain"]
-REACH = 4  # cells by which returns of one fence are apart, less than that
 # Lines of a thing at most, and pairs of returns that are tried for each; metres from a line within which returns are of
 # it, and within which no other is looked for; the share of a thing's returns that a line has at least.
 LINES, TRIES, NEAR, TAKEN, PART = 4, 80, 0.2, 1.0, 0.25
@@ -79,7 +78,7 @@ class Run(NamedTuple):
 
 def cast_fences(canvas: Canvas, rng: np.random.Generator) -> None:
     """Casts all that the canvas's labels say is a fence and that stands in a line; what does not stays as it is."""
-    for thing in canvas.things(FENCE, REACH):
+    for thing in canvas.things(FENCE):
         at = thing[canvas.label.flat[thing] == FENCE]
         for chosen, line in _lines(canvas.points_at(at)[:, :2].astype(float), rng):
             run = _run(canvas, at[chosen], line)
@@ -137,7 +136,7 @@ def _run(canvas: Canvas, at: np.ndarray, line: Line) -> Run | None:
         rays, of = _rays_to(canvas, at, line, first, level, height, away)
         of = np.where(np.isin(of, pieces), of, -1)
         own, metres = np.isin(rays, drawn), canvas.metres.flat[rays]
-        hidden = ~own & (metres > 0) & (metres < line.reached(canvas.rays.reshape(-1, 3)[rays]) - HIDDEN)
+        hidden = ~own & (metres > 0) & (metres < line.reached(canvas.rays_at(rays)) - HIDDEN)
         all_of, own_of = (np.bincount(of[k & (of >= 0)], minlength=pieces.max() + 1) for k in (~hidden, own))
         pieces = pieces[own_of[pieces] >= np.maximum(COVERED * all_of[pieces], 1)]
         if not len(pieces) or np.isin(piece, pieces).sum() < FEW:
@@ -167,7 +166,7 @@ def _rays_to(
     elevations = np.arctan2(low, near if low < 0 else far), np.arctan2(high, far if high < 0 else near)
     ahead, *azimuths = canvas.seen(at, np.median(canvas.points_at(at), 0))
     rays = canvas.window(ahead, (azimuths[0], azimuths[1]), elevations)
-    ways = canvas.rays.reshape(-1, 3)[rays]
+    ways = canvas.rays_at(rays)
     length = line.reached(ways)
     length = np.where(np.isfinite(length), length, 0)
     spots = ways * length[:, None]
@@ -233,7 +232,7 @@ def _open(canvas: Canvas, left: np.ndarray, taken: np.ndarray, run: Run, rng: np
     that, as bright as what is seen of either; `taken` tell nothing."""
     if not len(left):
         return
-    width, rays = canvas.sensor.width, canvas.rays.reshape(-1, 3)[left]
+    width, rays = canvas.sensor.width, canvas.rays_at(left)
     rows, columns = np.divmod(left, width)
     level = np.hypot(rays[:, 0], rays[:, 1])
     free = canvas.metres > 0
@@ -248,8 +247,7 @@ def _open(canvas: Canvas, left: np.ndarray, taken: np.ndarray, run: Run, rng: np
         good = (source < 0) & (top[columns] >= above) & free.flat[at] & ~GROUND[canvas.label.flat[at]]
         good &= away > run.line.reached(rays) * level + BEYOND
         behind, source = np.where(good, away, behind), np.where(good, at, source)
-    down = np.minimum(rays[:, 2], -0.01)
-    ground = np.where(rays[:, 2] < -0.01, run.level / down, np.inf)
+    ground = canvas.to_ground(left, run.level)
     metres, on_ground = np.minimum(behind / level, ground), ground < behind / level
     source = np.where(on_ground, _ground_beside(canvas, free, rows, columns), source)
     there = (metres <= canvas.sensor.max_range) & (source >= 0)

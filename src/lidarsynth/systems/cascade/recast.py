@@ -54,10 +54,7 @@ KINDS = (
 )  # fmt: skip
 STANDING = np.array([CLASS_NUMBER[w] for w in ("building", "fence", "car")])
 ROAD = CLASS_NUMBER["road"]
-REACH, LOW = (
-    4,
-    0.2,
-)  # cells by which returns of one thing are apart, less than that; metres above ground that are ground
+LOW = 0.2  # metres above the ground around a thing that are ground
 WIDER, TALLER = 2.5, 2.2  # metres beside and above a thing that are looked at
 OWN, OTHERS, MOST = 220, 340, 2.5  # rays that are looked at, of a thing's and of the others; how many times as many
 TIGHT = 0.4  # metres beside one of several things that are in a row, within which returns are of it
@@ -105,7 +102,7 @@ def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
 
 def _suggestions(canvas: Canvas, kind: Kind) -> list[np.ndarray]:
     """Places of the returns of each thing of a kind, the nearest first."""
-    things = canvas.things(CLASS_NUMBER[kind.name], REACH)
+    things = canvas.things(CLASS_NUMBER[kind.name])
     return sorted(things, key=lambda each: float(np.median(canvas.metres.flat[each])))
 
 
@@ -201,7 +198,7 @@ def _view(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float, long
     metres = np.where(canvas.metres.flat[of] > 0, canvas.metres.flat[of], np.inf).astype(np.float32)
     lost = np.isin(of, _swallowed(canvas, at, middle, level))
     ground = GROUND[canvas.label.flat[of]] | (canvas.points_at(of)[:, 2] < level + LOW)
-    return View(canvas.rays.reshape(-1, 3)[of], metres, np.arange(len(of)) < len(chosen[0]), ground, lost, weight)
+    return View(canvas.rays_at(of), metres, np.arange(len(of)) < len(chosen[0]), ground, lost, weight)
 
 
 def _swallowed(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> np.ndarray:
@@ -259,8 +256,7 @@ def _fill(canvas: Canvas, left: np.ndarray, taken: np.ndarray, level: float, rng
         ends = [np.where(end > 0, end, np.inf) for end in ends]
         farther = np.where(ends[0] >= ends[1], before, after)
         behind = np.where(both, plane, np.maximum(*ends))
-        down = canvas.rays[row, gone, 2]
-        ground = np.where(down < -0.01, level / np.minimum(down, -0.01), np.inf)
+        ground = canvas.to_ground(row * width + gone, level)
         metres = np.minimum(behind, ground)
         there = metres <= canvas.sensor.max_range
         noise = range_noise(np.where(there, metres, 0)) * rng.standard_normal(len(gone))
