@@ -27,11 +27,10 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from lidarsynth.diffusion.samplers import generators, noise_like
-from lidarsynth.diffusion.schedule import flow
 from lidarsynth.networks.coarse_unet import left_filled
 from lidarsynth.networks.column_neighbours import Grid
 from lidarsynth.networks.column_transformer import draw
-from lidarsynth.networks.drafts import BOUND, drafted
+from lidarsynth.networks.drafts import drafted
 from lidarsynth.networks.grid_judge import NEAR, STANDS
 from lidarsynth.networks.rays import decode_range
 from lidarsynth.streets.reader import SyntheticStreets
@@ -93,7 +92,7 @@ def layouts(model: CascadeModel, count: int, seed: int) -> Iterator[tuple[str, T
         rays, standing = model._grid_rays(rows, columns, count=len(rng))
         x_0 = network.coarse.encode(metres[part], true.shade[part], standing)
         t = torch.full((len(rng),), DRAFT)
-        _, alpha, sigma = flow(BOUND).at(t, x_0)
+        _, alpha, sigma = network.coarse.schedule.at(t, x_0)
         perfect = drafted(network.coarse, alpha * x_0 + sigma * noise_like(x_0, rng), t, rays, standing)
         for kind, after in zip(drawn, (perfect, draft(network, rays, standing, rng)), strict=True):
             kind.append(draw(network.columns, rays, after, rng))

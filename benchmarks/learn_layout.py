@@ -1,13 +1,13 @@
 """The coarse stage or the columns of a cascade go on with streets as plain sensors see them, of known beams or not.
 
-python benchmarks/learn_layout.py MODEL OUT --part columns|coarse [--scans 5760] [--steps 4000] [--seed 9711]
+python benchmarks/learn_layout.py MODEL OUT --part columns|coarse [--scans 5760] [--steps 4000] [--noisiest 10]
 
 A virtual sensor sees better or worse than others, and reports reflectance in its own way. Who asks for scans of an
 OS1-64 means one sensor, that of `streets`: of the scans a third are of KITTI's, two fifths of the other known ones, the
 rest of beams that nobody has built, all mounted and seeing as in `streets`. A sixteenth is held out. Writes the folder
 OUT, the model with what has learned; prints how held-out grids are judged before and after: by the columns, negative
 log-likelihoods of returning, range and reflectance, in nats a pixel; by the coarse stage, squared errors of the
-velocity at times 0.3, 0.53, 0.75, 0.95 and 0.99. Two scans are of each street: by more of them, the coarse stage learns
+velocity at log_snr from -0.23 to -10. Two scans are of each street: by more of them, the coarse stage learns
 by heart how open the streets of a sensor are. A step takes 0.6 (coarse, 32 grids) to 0.8 s (columns, 16) of a core in
 bfloat16.
 """
@@ -26,15 +26,15 @@ import numpy as np
 import torch
 from learn_judge import descend
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from lidarsynth.diffusion.denoiser import Denoiser
 from lidarsynth.diffusion.schedule import flow
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.coarse_unet import COLUMNS
+from lidarsynth.networks.coarse_unet import BOUND, COLUMNS, ROWS, CoarseUNet
 from lidarsynth.networks.column_neighbours import known_grid, spoilt
-from lidarsynth.networks.drafts import BOUND
 from lidarsynth.streets.virtual import KNOWN, VirtualSensor, VirtualStreets, draw_sensor
 from lidarsynth.streets.world import POSES
 from lidarsynth.systems.cascade.examples import grid
@@ -44,7 +44,9 @@ from lidarsynth.weights.load import load
 
 AVERAGE, OFTEN, WARM = 0.998, 100, 100
 # A little below the time to which drafts are led; the share of times above it; times at which it is judged.
-FROM, OF_DRAFTS, TIMES = 0.5, 0.8, (0.3, 0.53, 0.75, 0.95, 0.99)
+FROM, OF_DRAFTS, LOG_SNRS = 0.5, 0.8, (-0.23, -2.0, -4.0, -6.0, -8.0, -10.0)
+# Patches of which the mean error counts, too, by as much: what a scene is like as a whole is little of a pixel's error.
+SCALES = (((2, 8), 1.0), ((4, 32), 1.0), ((ROWS, COLUMNS), 3.0))
 Grids: TypeAlias = "list[Tensor]"  # as of `grids_of`
 KITTI, OTHERS = "hdl-64e-kitti", tuple(sorted({*KNOWN} - {"hdl-64e-kitti"}))
 
@@ -70,27 +72,31 @@ def of_columns(cascade: Cascade, columns: nn.Module, grids: Grids, rng: torch.Ge
         return columns(whole, rays, draft, judged, spoilt(whole, rng) if learns else whole).mean(0)
 
 
-def of_coarse(cascade: Cascade, coarse: nn.Module, grids: Grids, rng: torch.Generator, learns: bool) -> Tensor:
-    """(1,) squared errors of the velocity, four fifths of them at times of drafts; (5,) at TIMES.
+def of_coarse(cascade: Cascade, coarse: CoarseUNet, grids: Grids, rng: torch.Generator, learns: bool) -> Tensor:
+    """(1,) squared errors of the velocity, of its pixels and of means of SCALES, four fifths of them at times of
+    drafts; (6,) of its pixels at LOG_SNRS.
 
-    As drafts are: evenly in log_snr, by which half of these times are above 0.9, where it is decided how open a street
-    is.
+    As drafts are: evenly in log_snr, by which more than half of these times are above 0.9, where it is decided how open
+    a street is.
     """
     metres, reflectance, rays, standing = grids
     x_0, count = cascade.coarse.encode(metres, reflectance, standing), len(metres)
-    denoiser = Denoiser(coarse, flow(BOUND), "velocity", clip=False, condition=(rays,))
+    denoiser = Denoiser(coarse, coarse.schedule, "velocity", clip=False, condition=(rays,))
 
-    def loss(t: Tensor) -> Tensor:
+    def errors(t: Tensor) -> Tensor:
+        eps = torch.randn(x_0.shape, generator=rng)
+        log_snr, alpha, sigma = coarse.schedule.at(t, x_0)
         with torch.autocast("cpu", torch.bfloat16):
-            return denoiser.loss(x_0, t, torch.randn(x_0.shape, generator=rng), gamma=None).mean()
+            return denoiser.predict(alpha * x_0 + sigma * eps, log_snr.flatten()) - (eps - x_0)
 
     if not learns:
-        return torch.stack([loss(torch.full((count,), t)) for t in TIMES])
-    late = torch.rand(count, generator=rng) < OF_DRAFTS
-    u, schedule = torch.rand(count, generator=rng), flow(BOUND)
-    low, high = schedule.log_snr(torch.tensor([1.0, FROM], dtype=torch.float64)).tolist()
-    of_drafts = schedule.t(low + (high - low) * u.double()).float().clamp(max=1)
-    return loss(torch.where(late, of_drafts, FROM * u))[None]
+        times = coarse.schedule.t(torch.tensor(LOG_SNRS)).clamp(max=1)
+        return torch.stack([errors(t.expand(count)).square().mean() for t in times])
+    late, u = torch.rand(count, generator=rng) < OF_DRAFTS, torch.rand(count, generator=rng)
+    of_drafts = coarse.schedule.along(1, FROM, u).float().clamp(max=1)
+    off = errors(torch.where(late, of_drafts, FROM * u))
+    means = [weight * F.avg_pool2d(off, patch).square().mean() for patch, weight in SCALES]
+    return torch.stack([off.square().mean(), *means]).sum()[None]
 
 
 # Network, its loss, grids a step, rate.
@@ -139,6 +145,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=5760)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--seed", type=int, default=9711, help="of the streets")
+    parser.add_argument("--noisiest", type=float, default=10, help="-log_snr of the coarse stage's noise")
     args = parser.parse_args()
     torch.set_num_threads(1)
     model = load(args.model)
@@ -153,6 +160,10 @@ def main() -> None:
     for i in range(args.scans):
         images.append(replace(streets.image(apart * i), surface=None, label=None, xyz=None))
         print(f"{i + 1} of {args.scans} cast", end="\r", flush=True)
+    if args.part == "coarse":
+        model.network.coarse.schedule = flow(BOUND, args.noisiest)
+        trained = replace(model.experiment.model, noisiest=args.noisiest)
+        model = replace(model, experiment=replace(model.experiment, model=trained))
     network = model.network.requires_grad_(False)
     before = judged(network, args.part, images[:held])
     after = learned(network, args.part, images[held:], args.steps, lambda line: print(line, flush=True))

@@ -35,6 +35,11 @@ class Schedule:
         log_snr = self.log_snr(t).view(-1, *[1] * (x.ndim - 1))
         return log_snr, *self.alpha_sigma(log_snr)
 
+    def along(self, first: float, last: float, share: Tensor) -> Tensor:
+        """Times in float64 at these shares of the way from one time to another, even in log_snr."""
+        start, end = self.log_snr(torch.tensor([first, last], dtype=torch.float64)).tolist()
+        return self.t(start + (end - start) * share.double())
+
     def variance(self, alpha: Tensor, sigma: Tensor) -> Tensor:
         """sigma^2, for variance-preserving schedules as 1 - alpha^2.
 
@@ -99,16 +104,17 @@ def linear() -> Schedule:
     )
 
 
-def flow(bound: float = 30.0) -> Schedule:
-    """Rectified flow: alpha = 1 - t, sigma = t (Liu et al. 2022), with log_snr in [-bound, bound].
+def flow(bound: float = 30.0, noisiest: float | None = None) -> Schedule:
+    """Rectified flow: alpha = 1 - t, sigma = t (Liu et al. 2022), with log_snr in [-noisiest, bound].
 
-    The bound keeps log_snr finite for the network; at the ends it moves alpha and sigma by exp(-bound / 2) = 3e-7.
+    The bounds keep log_snr finite for the network; at the ends they move alpha and sigma by exp(-bound / 2) = 3e-7.
+    noisiest  as `bound`, where noise is strongest: None = the same
     """
-    edge = 1 / (1 + math.exp(bound / 2))
-    width = 1 - 2 * edge
+    first, last = (1 / (1 + math.exp(end / 2)) for end in (bound, bound if noisiest is None else noisiest))
+    width = 1 - first - last
     return Schedule(
-        lambda t: 2 * torch.log((edge + (1 - t) * width) / (edge + t * width)),
-        lambda log_snr: ((-log_snr / 2).sigmoid() - edge) / width,
+        lambda t: 2 * torch.log((last + (1 - t) * width) / (first + t * width)),
+        lambda log_snr: ((-log_snr / 2).sigmoid() - first) / width,
         straight,
     )
 

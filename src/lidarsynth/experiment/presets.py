@@ -195,6 +195,7 @@ def default() -> Experiment:
             num_residual_blocks=(2, 2, 2, 2),  # of the coarse stage
             coords_encoding=None,  # both are told each pixel's rays
             classes=20,
+            noisiest=10,  # at 8, a scene's openness still shows through
             column_channels=256,
             between_channels=64,
             beam_channels=56,

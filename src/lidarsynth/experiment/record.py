@@ -54,6 +54,7 @@ class Model:
     class_channels: int = within(32, 8, 8192)  # cascade: width of the network that names them
     inside_channels: int = within(0, 0, 8192)  # cascade: width of what names the insides of buildings, 0 = none
     drawn_channels: int = within(0, 0, 8192)  # cascade: width of what names scans in the making, 0 = none
+    noisiest: float = within(8.0, 8, 30)  # cascade: -log_snr of the noise that its coarse network draws grids from
     guide_channels: int = within(0, 0, 8192)  # cascade: width of the network that guides the coarse one, 0 = none
     column_channels: int = within(0, 0, 8192)  # cascade: width of the transformer that draws grids, 0 = none
     between_channels: int = within(0, 0, 8192)  # cascade: width of what draws the columns between those, 0 = none

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarsynth.diffusion.schedule import flow
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.efficient_unet import EfficientUNet
 from lidarsynth.networks.fill_unet import ring
@@ -18,6 +19,7 @@ ROWS, COLUMNS = 16, 128
 RAY_CHANNELS = 8
 LOWEST, BINS = -32, 61  # degrees of the standard's first bin, and how many of one degree there are
 STANDARD_MOUNT = 1.73  # metres
+BOUND = 8.0  # of log_snr: with less noise the network has hardly been trained
 
 
 def grid_rows(height: int, first: float = 0.5) -> np.ndarray:
@@ -58,12 +60,22 @@ class CoarseUNet(nn.Module):
     elevation (buffer `standard`), and +1 where the ray returned, -1 where not; empty pixels hold their left
     neighbour's values. Else unit noise would drown the ground, whose code spreads by 0.03 near the car and by 0.27 at
     the horizon.
+
+    noisiest  -log_snr of the noise that grids are drawn from. At 8 what many pixels have in common, how open a scene
+              is, still shows through; pure noise has none of it, and scenes drawn from it would be too much alike
     """
 
     standard: Tensor
 
-    def __init__(self, base_channels: int = 64, multipliers: tuple[int, ...] = (1, 2, 4, 4), blocks: int = 2):
+    def __init__(
+        self,
+        base_channels: int = 64,
+        multipliers: tuple[int, ...] = (1, 2, 4, 4),
+        blocks: int = 2,
+        noisiest: float = BOUND,
+    ):
         super().__init__()
+        self.schedule = flow(BOUND, noisiest)
         self.unet = EfficientUNet(
             3 + RAY_CHANNELS,
             3,

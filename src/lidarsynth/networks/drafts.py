@@ -7,11 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.schedule import flow
-from lidarsynth.networks.coarse_unet import RAY_CHANNELS, CoarseUNet
+from lidarsynth.networks.coarse_unet import BOUND, RAY_CHANNELS, CoarseUNet
 from lidarsynth.networks.fill_unet import ring
 
-BOUND = 8.0  # of log_snr: beyond it the coarse network has hardly been trained
 LEARNED = (0.25, 0.75)  # times of drafts that who draws learns to read
 DRAFT_CHANNELS, READ = 7, 48  # of a draft, and of what is read in it
 REACHES = (1, 2, 4)  # columns to either side, of the layers that read it
@@ -24,7 +22,7 @@ def drafted(coarse: CoarseUNet, x_t: Tensor, t: Tensor, rays: Tensor, standing: 
     x_0_hat, the mean of all grids that it may become; what this says of the range code, from flat ground's on, and how
     far codes of such rays spread; log_snr. rays (B, 8, 16, 128), standing (B, 16, 128) radians.
     """
-    denoiser = Denoiser(coarse, flow(BOUND), "velocity", clip=False, condition=(rays,))
+    denoiser = Denoiser(coarse, coarse.schedule, "velocity", clip=False, condition=(rays,))
     x_0_hat = denoiser(x_t, t)
     log_snr, *_ = denoiser.schedule.at(t, x_t)
     mean, spread = (part[:, :1] for part in coarse.standards(standing))

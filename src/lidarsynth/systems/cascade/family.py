@@ -38,10 +38,8 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
         raise ValueError(f"model.likeliest_blocks: expected four numbers, found {model.likeliest_blocks}")
     if len(model.judge_openness) not in (0, 6):
         raise ValueError(f"model.judge_openness: expected six numbers or none, found {model.judge_openness}")
-    coarse, guide = (
-        CoarseUNet(channels, model.channel_multipliers, model.num_residual_blocks[0]) if channels else None
-        for channels in (width, model.guide_channels)
-    )
+    shape = model.channel_multipliers, model.num_residual_blocks[0], model.noisiest
+    coarse, guide = (CoarseUNet(channels, *shape) if channels else None for channels in (width, model.guide_channels))
     assert coarse is not None
     widths = _widths(width)
     fill = FillUNet(widths, classes=model.classes)

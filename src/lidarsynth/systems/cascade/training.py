@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.schedule import flow
+from lidarsynth.diffusion.schedule import Schedule
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.networks.between_beams import BetweenBeams
@@ -18,7 +18,7 @@ from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
 from lidarsynth.networks.column_neighbours import Grid, known_grid, spoilt
 from lidarsynth.networks.column_transformer import ColumnTransformer
-from lidarsynth.networks.drafts import BOUND, LEARNED, drafted
+from lidarsynth.networks.drafts import LEARNED, drafted
 from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
@@ -42,6 +42,9 @@ from lidarsynth.training.task import Phase, Task
 
 PARTS = ("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams", "observed", "named",
          "inside")  # fmt: skip
+# Share of the times of the coarse stage that are even in log_snr, from pure noise to EARLIER, where it is decided how
+# open a scene is.
+EARLY, EARLIER = 0.2, 0.5
 FITTED = 256  # streets that the standards of the coarse stage are measured on
 
 
@@ -97,9 +100,9 @@ class LikeliestObjective(nn.Module):
 
 
 class CoarseObjective(nn.Module):
-    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023), t = sigmoid(1.1 N);
-    `guide`, that of the network that guides; `columns`, negative log-likelihoods of half of the columns; `between`, of
-    every second column of finer grids; `beams`, of every second beam of taller ones; of what there is."""
+    """`objective(batch)` -> `layout` (n,): squared error of the velocity (Lipman et al. 2023); `guide`, that of the
+    network that guides; `columns`, negative log-likelihoods of half of the columns; `between`, of every second column
+    of finer grids; `beams`, of every second beam of taller ones; of what there is."""
 
     def __init__(
         self,
@@ -116,10 +119,10 @@ class CoarseObjective(nn.Module):
         metres, reflectance, rays, standing = batch.grids
         x_0 = self.network.encode(metres, reflectance, standing)
         rngs = [sample_rng(seed, 1, 0) for seed in batch.crops.seeds]
-        t = torch.sigmoid(1.1 * torch.cat([torch.randn(1, generator=rng) for rng in rngs])).to(x_0)
+        t = layout_times(self.network.schedule, rngs).to(x_0)
         eps = torch.stack([torch.randn(x_0.shape[1:], generator=rng) for rng in rngs]).to(x_0)
         learners = {"layout": self.network, **({"guide": self.guide} if self.guide else {})}
-        denoisers = {part: Denoiser(one, flow(BOUND), "velocity", clip=False, condition=(rays,))
+        denoisers = {part: Denoiser(one, one.schedule, "velocity", clip=False, condition=(rays,))
                      for part, one in learners.items()}  # fmt: skip
         losses = {part: denoiser.loss(x_0, t, eps, gamma=None) for part, denoiser in denoisers.items()}
         if self.columns is not None:
@@ -144,8 +147,15 @@ class CoarseObjective(nn.Module):
         """(b, 7, 16, 128) drafts that become x_0, of any of the times that columns learn."""
         low, high = LEARNED
         t = (low + (high - low) * torch.rand(len(x_0), generator=rng)).to(x_0)
-        _, alpha, sigma = flow(BOUND).at(t, x_0)
+        _, alpha, sigma = self.network.schedule.at(t, x_0)
         return drafted(self.network, alpha * x_0 + sigma * eps, t, rays, standing)
+
+
+def layout_times(schedule: Schedule, rngs: Sequence[torch.Generator]) -> Tensor:
+    """(n,) times that the coarse stage learns, one of each generator: sigmoid(1.1 N), and the share EARLY."""
+    normal, early, share = (torch.cat([draw(1, generator=rng) for rng in rngs])
+                            for draw in (torch.randn, torch.rand, torch.rand))  # fmt: skip
+    return torch.where(early < EARLY, schedule.along(1, EARLIER, share).float(), torch.sigmoid(1.1 * normal))
 
 
 def _part(crops: Crops, chosen: slice) -> tuple[Known, Rays, Tensor, Tensor, Tensor]:
