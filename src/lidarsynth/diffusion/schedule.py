@@ -111,7 +111,7 @@ def flow(bound: float = 30.0, noisiest: float | None = None) -> Schedule:
     noisiest  as `bound`, where noise is strongest: None = the same
     """
     first, last = (1 / (1 + math.exp(end / 2)) for end in (bound, bound if noisiest is None else noisiest))
-    width = 1 - first - last
+    width = 1 - (first + last)
     return Schedule(
         lambda t: 2 * torch.log((last + (1 - t) * width) / (first + t * width)),
         lambda log_snr: ((-log_snr / 2).sigmoid() - first) / width,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.diffusion.denoiser import Denoiser
-from lidarsynth.diffusion.samplers import STEPS, Rng, State, even_log_snr, noise_like, sample, sde_dpmpp_2m
+from lidarsynth.diffusion.samplers import STEPS, even_log_snr, noise_like, sample, sde_dpmpp_2m
 from lidarsynth.diffusion.schedule import Schedule
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
@@ -31,10 +31,9 @@ from lidarsynth.systems.cascade.surfaces import across_rings, along_rings, evene
 
 STEPS_DEFAULT = 16
 # Time of a draft, at which columns go on: later, diffusion's own errors show, earlier, its layout is lost; steps to it.
-DRAFT, DRAFT_STEPS = 0.52, 8
-# Fresh noise of its sampler: none keeps what is wrong at first, nothing else smooths what is small. How much larger it
-# is, up to this log_snr, at which is decided how open a scene is, and then: what the network takes off too much.
-FRESH, WHOLE, LARGER = 0.5, -3.0, (1.05, 1.02)
+DRAFT, DRAFT_STEPS = 0.53, 8
+# Its sampler: a deterministic one keeps what is wrong at first, one of fresh noise alone smooths what is small.
+DRAFTING = partial(sde_dpmpp_2m, eta=0.5, s_noise=1.02)
 SMOOTH = 0.3  # natural logarithm of ranges of beams that go on as a plane
 LEVEL = 0.15  # natural logarithm of the range of flat ground by which a return on the ground may be nearer or farther
 FINEST, TALLEST = 4 * COLUMNS, 4 * ROWS - 3  # columns, and beams, with what is between
@@ -74,15 +73,8 @@ def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
 
 def to_draft(schedule: Schedule, steps: int, t: float = DRAFT) -> Tensor:
     """steps + 1 times from 1 to t, equally far apart in log_snr."""
-    return schedule.along(1, t, torch.linspace(0, 1, steps + 1, dtype=torch.float64)).clamp(max=1)
-
-
-def drafting(
-    denoiser: Denoiser, x_t: Tensor, t: Tensor, s: Tensor, rng: Rng, previous: State | None = None
-) -> tuple[Tensor, Tensor]:
-    """A step to a draft, of `samplers.sde_dpmpp_2m`."""
-    larger = LARGER[0] if float(denoiser.schedule.log_snr(t).max()) < WHOLE else LARGER[1]
-    return sde_dpmpp_2m(denoiser, x_t, t, s, rng, previous, FRESH, larger)
+    first, last = schedule.log_snr(torch.tensor([1.0, t], dtype=torch.float64)).tolist()
+    return schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64)).clamp(max=1)
 
 
 def draft(
@@ -97,7 +89,7 @@ def draft(
     elevations (B, 16, 128) in radians, each by a generator of its own; the coarse network's products in `precision`."""
     x_1 = noise_like(torch.zeros(len(rays), 3, ROWS, COLUMNS, device=rays.device), rng)
     with torch.autocast(rays.device.type, torch.bfloat16, enabled=precision == "bf16"):
-        *_, last = sample(velocity(network, rays, guided=True), x_1, drafting, DRAFT_STEPS, rng, partial(to_draft, t=t))
+        *_, last = sample(velocity(network, rays, guided=True), x_1, DRAFTING, DRAFT_STEPS, rng, partial(to_draft, t=t))
         return drafted(network.coarse, last.x_s, last.s, rays, standing)
 
 
