@@ -11,6 +11,7 @@ from lidarsynth.experiment.presets import PRESETS
 from lidarsynth.networks.coarse_unet import BOUND, CoarseUNet
 from lidarsynth.systems.cascade.layout import DRAFT, DRAFT_STEPS, DRAFTING, to_draft
 from lidarsynth.systems.cascade.training import layout_times
+from lidarsynth.weights.load import load
 
 
 def spread_of_drafts(schedule: Schedule, pixels: int, count: int = 4000) -> float:
@@ -60,3 +61,9 @@ def test_the_coarse_stage_learns_from_pure_noise_on():
 def test_new_cascades_begin_with_more_noise_and_old_records_where_they_did():
     model = PRESETS["default"]().model
     assert model.noisiest == 10 and type(model)().noisiest == BOUND
+
+
+@pytest.mark.parametrize("preset", ["tuned", "kitti"])
+def test_what_goes_on_from_the_shipped_model_draws_from_the_noise_that_this_has_learned(preset: str):
+    start, shipped = PRESETS[preset](), load("default").experiment
+    assert start.base == shipped.name and start.model.noisiest == shipped.model.noisiest
