@@ -103,8 +103,7 @@ def even_times(schedule: Schedule, steps: int) -> Tensor:
 
 def even_log_snr(schedule: Schedule, steps: int) -> Tensor:
     """steps + 1 times from 1 to 0, equally far apart in log_snr (DPM-Solver, Lu et al. 2022)."""
-    first, last = schedule.log_snr(torch.tensor([1.0, 0.0], dtype=torch.float64)).tolist()
-    times = schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64))
+    times = schedule.along(1, 0, torch.linspace(0, 1, steps + 1, dtype=torch.float64))
     times[0], times[-1] = 1, 0  # the inverse is exact to rounding only
     return times
 

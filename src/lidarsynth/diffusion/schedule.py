@@ -36,7 +36,7 @@ class Schedule:
         return log_snr, *self.alpha_sigma(log_snr)
 
     def along(self, first: float, last: float, share: Tensor) -> Tensor:
-        """Times in float64 at these shares of the way from one time to another, even in log_snr."""
+        """Times (n,) in float64 at shares (n,) in [0, 1] of the way from one time to another, even in log_snr."""
         start, end = self.log_snr(torch.tensor([first, last], dtype=torch.float64)).tolist()
         return self.t(start + (end - start) * share.double())
 

@@ -73,8 +73,7 @@ def velocity(network: Cascade, rays: Tensor, guided: bool) -> Denoiser:
 
 def to_draft(schedule: Schedule, steps: int, t: float = DRAFT) -> Tensor:
     """steps + 1 times from 1 to t, equally far apart in log_snr."""
-    first, last = schedule.log_snr(torch.tensor([1.0, t], dtype=torch.float64)).tolist()
-    return schedule.t(torch.linspace(first, last, steps + 1, dtype=torch.float64)).clamp(max=1)
+    return schedule.along(1, t, torch.linspace(0, 1, steps + 1, dtype=torch.float64)).clamp(max=1)
 
 
 def draft(
