@@ -9,7 +9,7 @@ from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
-from lidarsynth.streets.apart import boxes_on_ground, stand_apart
+from lidarsynth.streets.apart import boxes_on_ground, meet, stand_apart, what_stands
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
@@ -17,7 +17,7 @@ from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.ground import Ground
 from lidarsynth.streets.layout import build
 from lidarsynth.streets.objects import USUAL, library
-from lidarsynth.streets.passing import _to_and_fro
+from lidarsynth.streets.passing import _to_and_fro, set_apart
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.recordings import RecordedStreets
 from lidarsynth.streets.traffic import GAP, STEP, acceleration, follow
@@ -262,6 +262,26 @@ def test_nobody_in_crowded_streets_stands_in_a_pole_or_a_trunk():
         assert not (np.abs((posts - (x, y)) @ turn) < half).all(axis=1).any()
     gap = full.ground.carriageway(place[:, 0], place[:, 1])
     assert ((gap > 0) == (plain.ground.height(*place[:, :2].T) < place[:, 2] - 0.06)).mean() > 0.9  # on the kerb
+
+
+def test_who_drives_or_rides_goes_through_no_thing_and_no_house():
+    """Riders of sidewalks ride where least stands, and nothing does then; houses across a road end it."""
+    seen, kept, ended = {"bicyclist": 0, "car": 0}, 0, 0
+    for number in range(3):
+        plain = draw_drive(5, number, 10.0, Density(cyclists=3))
+        drive = set_apart(plain)
+        kept += len(drive.world.things) / len(plain.world.things) / 3
+        stands = what_stands(drive.world)
+        for time in np.arange(0, 10, 0.5):
+            now = drive.moment(time)
+            going = now.present & (drive.number >= 0) & (drive.actors.kind != "person")
+            boxes = boxes_on_ground(replace(drive.actors, place=now.place), 0.0, now.yaw)[going]
+            assert not meet(boxes[:, None], stands[None]).any()
+            for kind in seen:
+                seen[kind] += int((drive.actors.kind[going] == kind).sum())
+        road = drive.world.ground.roads[0]
+        ended += int((drive.reach[0] != (road.start, road.stop)).sum())
+    assert seen["bicyclist"] > 500 and seen["car"] > 200 and kept > 0.9 and ended > 0
 
 
 def test_who_walks_turns_where_their_way_ends():

@@ -148,11 +148,11 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
 
 def _edition(options: Options, layout: str) -> int:
     """EDITION, or one more where 2026-11-25 brought boxes that stand where seen, cyclists who roll off kerbs, or no
-    vehicles in car parks, one where label_2 lists what the camera sees alone, and one where 2026-11-28 set everyone
-    apart: other sets go on."""
+    vehicles in car parks, one where label_2 lists what the camera sees alone, one where 2026-11-28 set everyone apart,
+    and one for drives, in which nobody goes through things and houses since 2026-11-29: other sets go on."""
     drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
     apart = options.frames > 0 or options.density != TODAY
-    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + apart
+    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + apart + (options.frames > 0)
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> bool:

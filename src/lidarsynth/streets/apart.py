@@ -146,17 +146,28 @@ def _moved(box: np.ndarray, others: np.ndarray, ground: Ground, parked: bool) ->
 def what_stands(world: World) -> np.ndarray:
     """(N, 5) footprints of all that stands and is no road user, first POSTS, last walls; of trees their trunks, leaves
     aside."""
-    things = world.things
-    others = ~np.isin(things["kind"], [*POSTS, *LEAVES]) & ~np.isin(np.arange(len(things)), actors_of(world).thing)
-    found = np.concatenate([things[np.isin(things["kind"], POSTS)], things[others]])
+    return np.concatenate([bases(world, things_that_stand(world)), walls(world)])
+
+
+def things_that_stand(world: World) -> np.ndarray:
+    """Rows of `World.things` of all that stands and is no road user, first POSTS, leaves aside."""
+    kind, numbers = world.things["kind"], np.arange(len(world.things))
+    posts = np.isin(kind, POSTS)
+    others = ~posts & ~np.isin(kind, LEAVES) & ~np.isin(numbers, actors_of(world).thing)
+    return np.concatenate([numbers[posts], numbers[others]])
+
+
+def bases(world: World, rows: np.ndarray) -> np.ndarray:
+    """(N, 5) footprints of these things; of trees their trunks."""
+    found = world.things[rows]
     bounds = np.array([bounds_of(str(one["kind"]), int(one["variant"])) for one in found]).reshape(-1, 2, 3)
     low, high = (bounds[:, k, :2] * found["row"][:, 4:6] for k in (0, 1))
     tree = np.isin(found["kind"], TRUNKS)[:, None]
     middle, half = np.where(tree, 0, (low + high) / 2), np.where(tree, TRUNK, (high - low) / 2)
-    return np.concatenate([footprints(found["row"], found["row"][:, 3], middle, half), _walls(world)])
+    return footprints(found["row"], found["row"][:, 3], middle, half)
 
 
-def _walls(world: World) -> np.ndarray:
+def walls(world: World) -> np.ndarray:
     """(N, 5) footprints of the houses' walls."""
     start, end = np.moveaxis(world.corners[world.kind == FRONT, :2, :2].astype(float), 1, 0)  # as `walls_of` has them
     x, y = (end - start).T
@@ -171,14 +182,19 @@ def _with(world: World, actors: Actors, shift: np.ndarray, left: np.ndarray) -> 
     ground, by = world.ground, np.zeros((len(world.things) + 1, 3))
     rise = ground.height(*new.T) - ground.height(*old.T)
     by[actors.thing] = np.column_stack([shift, np.where(shift.any(axis=1), rise, 0)])
-    things, stays = world.things.copy(), np.ones(len(world.things) + 1, bool)
+    things, stays = world.things.copy(), np.ones(len(world.things), bool)
     things["row"][:, :3] += by[:-1]
     stays[actors.thing] = left
-    number = np.append(np.cumsum(stays[:-1]) - 1, -1).astype(np.int32)
-    kept = np.flatnonzero(stays[world.thing])
+    return only(
+        replace(world, things=things, corners=world.corners + by[world.thing].astype(np.float32)[:, None]), stays
+    )
+
+
+def only(world: World, stays: np.ndarray) -> World:
+    """The world without the things that do not stay, (T,) bool of `World.things`."""
+    number = np.append(np.cumsum(stays) - 1, -1).astype(np.int32)
+    kept = np.flatnonzero(np.append(stays, True)[world.thing])
     parts = {
         key: getattr(world, key)[kept] for key in ("corners", "kind", "material", "label", "tint", "front", "thing")
     }
-    parts["corners"] += by[parts["thing"]].astype(np.float32)[:, None]
-    parts["thing"] = number[parts["thing"]]
-    return replace(world, **parts, things=things[stays[:-1]])
+    return replace(world, **(parts | {"thing": number[parts["thing"]]}), things=world.things[stays])

@@ -53,6 +53,8 @@ class Drive:
     aside   (A,) m to the left of its road; number (A,) of its road in the ground, -1 for those that stand
     ahead   (A,) +1 or -1: whether it faces along its road or against
     turned  (steps, A) rad by which each looks elsewhere than ahead, counter-clockwise
+    reach   (R, 2) m along each road of the ground, from where to where nothing stands across it: who moves is there
+            between these alone
     own     (steps,) m of the carrier along the main road; lane, its m to the left of the centre line
     weave   (3, 3): amplitude, frequency in rad/s, phase of what the carrier's offset, pitch and roll sway by
     """
@@ -64,6 +66,7 @@ class Drive:
     number: np.ndarray
     ahead: np.ndarray
     turned: np.ndarray
+    reach: np.ndarray
     own: np.ndarray
     lane: float
     weave: np.ndarray
@@ -85,9 +88,8 @@ class Drive:
         velocity = (after[0] - before[0]) / STEP
         spin = (np.mod(after[1] - before[1] + np.pi, 2 * np.pi) - np.pi) / STEP
         s = _at(self.along, np.array([time]))[0]
-        roads = self.world.ground.roads
-        ends = np.array([(road.start, road.stop) for road in roads])[self.number]
-        present = (self.number < 0) | ((s > ends[:, 0]) & (s < ends[:, 1]))
+        half, ends = self.actors.size[:, 0] / 2, self.reach[self.number]
+        present = (self.number < 0) | ((s - half > ends[:, 0]) & (s + half < ends[:, 1]))
         return Moment(place, yaw, velocity, spin, present & (self.ahead != 0))
 
     def _placed(self, time: float) -> tuple[np.ndarray, np.ndarray]:
@@ -212,7 +214,8 @@ def _set_off(
     weave[:, 2] = rng.uniform(0, 2 * np.pi, 3)
     still = number < 0
     whole, turned = np.where(still, 0.0, track), np.zeros(track.shape, np.float32)
-    return Drive(world, actors, whole, np.where(still, 0.0, aside), number, ahead, turned, mine, lane, weave)
+    reach = np.array([(road.start, road.stop) for road in roads])
+    return Drive(world, actors, whole, np.where(still, 0.0, aside), number, ahead, turned, reach, mine, lane, weave)
 
 
 def _in_the_way(actors: Actors, aside: np.ndarray, number: np.ndarray, roads: tuple[Road, ...], lane: float, ahead):

@@ -1,5 +1,6 @@
-"""Drives in which nobody goes through anybody: the ways of vehicles and riders are kept free, and everyone who walks
-has a piece of sidewalk alone, to the ends of which they go and turn."""
+"""Drives in which nobody goes through anybody or anything: the ways of vehicles and riders are kept free and end where
+a house stands across them, and everyone who walks has a piece of sidewalk alone, to the ends of which they go and turn.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +11,16 @@ import numpy as np
 from lidarsynth.streets.actors import MARGIN, actors_of
 from lidarsynth.streets.apart import (
     CARRIER,
+    bases,
     boxes_on_ground,
     footprints,
     lane,
     meet,
     near,
+    only,
     stand_apart,
+    things_that_stand,
+    walls,
     what_stands,
 )
 from lidarsynth.streets.drive import Drive
@@ -30,13 +35,14 @@ QUEUE = 2.5  # m from one rider who waits there to the next
 HOME, CELL = 10.0, 0.25  # m that one walks to each side of where they are at first, at most; in which steps it is tried
 ENOUGH = 6.0  # m of way that nobody looks farther for
 LEAST = 1.5  # m that are worth walking
+STRIP = 0.1  # m, in which steps riders beside a road are moved to where least stands in their way
 PAUSE, TURN = 2.0, 1.5  # s at the end of one's way, of which one turns
 
 
 def set_apart(drive: Drive) -> Drive:
     """The drive in which no two boxes ever meet: those who would stand in others are moved or left out, as
     `stand_apart` has it, and so are those in the way; riders of one side go as fast as the slowest of them."""
-    drive = _abreast(drive)
+    drive = _cleared(_abreast(drive))
     walks, there = _walks(drive), (drive.number < 0) | (drive.ahead != 0)
     ways = _ways(drive, there)
     yaw = drive.moment(0.0).yaw
@@ -88,6 +94,73 @@ def _abreast(drive: Drive) -> Drive:
     return replace(drive, along=along, ahead=ahead)
 
 
+def _cleared(drive: Drive) -> Drive:
+    """The drive whose riders beside a road are where least stands in their way, without what stands in the ways still,
+    and without riders that would meet a house: they and vehicles go as far as to what closes their road."""
+    world, aside = drive.world, drive.aside.copy()
+    drive = replace(drive, reach=_reach(drive))
+    rows = things_that_stand(world)
+    standing, houses = bases(world, rows), walls(world)
+    rides = (drive.number >= 0) & (drive.ahead != 0) & _makes(drive) & (drive.actors.pace != TRAFFIC)
+    for number, road in enumerate(world.ground.roads):
+        for side in (-1, 1):
+            mine = np.flatnonzero(rides & (drive.number == number) & (np.sign(aside) == side))
+            if len(mine):
+                aside[mine] += side * _least(road, *_strip(drive, mine), side, standing, houses)
+    drive = replace(drive, aside=aside)
+    blocked = [
+        one
+        for one in np.flatnonzero(rides).tolist()
+        if meet(lane(world.ground.roads[drive.number[one]], *_strip(drive, np.array([one])))[:, None], houses).any()
+    ]
+    ahead = drive.ahead.copy()
+    ahead[blocked] = 0
+    drive = replace(drive, ahead=ahead)
+    met = meet(standing[:, None], _ways(drive, drive.ahead != 0)[None]).any(axis=1)
+    stays = np.ones(len(world.things), bool)
+    stays[rows[met]] = False
+    world = only(world, stays)
+    return replace(drive, world=world, actors=actors_of(world))
+
+
+def _least(
+    road: Road, start: float, stop: float, right: float, left: float, side: int, things: np.ndarray, houses: np.ndarray
+) -> float:
+    """m outward by which a strip of a sidewalk meets no house, if it may, and then the fewest things; the least of
+    these."""
+    room = max(road.half + road.walk - max(abs(right), abs(left)), 0.0)
+    moves, met = np.arange(0.0, room + STRIP / 2, STRIP), []
+    for move in side * moves:
+        strip = lane(road, start, stop, right + move, left + move)[:, None]
+        met.append((meet(strip, houses).any(), meet(strip, things).any(axis=0).sum()))
+    return float(moves[min(range(len(moves)), key=met.__getitem__)])
+
+
+def _reach(drive: Drive) -> np.ndarray:
+    """(R, 2) m along each road to what stands across it beyond the carrier's way, or the main road: a house, a thicket;
+    to the road's end where nothing does."""
+    world, found = drive.world, drive.reach.copy()
+    across = np.concatenate([walls(world), bases(world, np.flatnonzero(world.things["kind"] == "thicket"))])
+    main = world.ground.roads[0]
+    for number, road in enumerate(world.ground.roads):
+        pieces = lane(road, road.start, road.stop, -road.half / 2, road.half / 2)
+        ends = np.linspace(road.start, road.stop, len(pieces) + 1)
+        closed = meet(pieces[:, None], across[None]).any(axis=1)
+        inner = (-main.half - main.walk, main.half + main.walk) if number else (drive.own.min(), drive.own.max())
+        found[number, 0] = ends[1:][closed & (ends[1:] < inner[0])].max(initial=road.start)
+        found[number, 1] = ends[:-1][closed & (ends[:-1] > inner[1])].min(initial=road.stop)
+    return found
+
+
+def _strip(drive: Drive, mine: np.ndarray) -> tuple[float, float, float, float]:
+    """m along a road from where to where these actors of it go, and between which distances aside."""
+    half, track = drive.actors.size[mine] / 2 + MARGIN + GAP, drive.along[:, mine]
+    low, high = drive.reach[drive.number[mine[0]]]
+    start, stop = (track - half[:, 0]).min(), (track + half[:, 0]).max()
+    right, left = (drive.aside[mine] - half[:, 1]).min(), (drive.aside[mine] + half[:, 1]).max()
+    return max(start, low), min(stop, high), right, left
+
+
 def _ways(drive: Drive, there: np.ndarray) -> np.ndarray:
     """(N, 5) footprints of what is driven and ridden on: by the carrier, on each side of each road and sidewalk."""
     roads, wide = drive.world.ground.roads, CARRIER[1] + SWAY
@@ -100,10 +173,7 @@ def _ways(drive: Drive, there: np.ndarray) -> np.ndarray:
                 mine = np.flatnonzero(makes & among & (drive.number == number) & (np.sign(drive.aside) == side))
                 if not len(mine):
                     continue
-                half, track = drive.actors.size[mine] / 2 + MARGIN + GAP, drive.along[:, mine]
-                start, stop = (track - half[:, 0]).min(), (track + half[:, 0]).max()
-                right, left = (drive.aside[mine] - half[:, 1]).min(), (drive.aside[mine] + half[:, 1]).max()
-                found.append(lane(road, max(start, road.start), min(stop, road.stop), right, left))
+                found.append(lane(road, *_strip(drive, mine)))
     return np.concatenate(found)
 
 
