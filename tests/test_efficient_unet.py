@@ -127,6 +127,14 @@ def test_one_log_snr_serves_the_whole_batch_and_samples_are_independent():
     torch.testing.assert_close(together[1:2], net(x_t[1:2], torch.tensor([1.5])), atol=1e-5, rtol=1e-5)
 
 
+@torch.no_grad()
+def test_a_network_of_doubles_says_the_same():
+    net, x_t = randomised(EfficientUNet(**SMALL)), torch.randn(2, 2, 16, 64)
+    single, log_snr = net(x_t, torch.tensor([1.5, -3.0])), torch.tensor([1.5, -3.0], dtype=torch.float64)
+    torch.testing.assert_close(net(x_t, log_snr), single)  # times of samplers are double
+    torch.testing.assert_close(net.double()(x_t.double(), log_snr).float(), single, atol=1e-4, rtol=1e-4)
+
+
 @pytest.mark.parametrize("stem", [(1, 1), (2, 4)])
 def test_a_new_network_returns_zero_and_all_of_it_learns(stem):
     net = EfficientUNet(resolution=(16, 64), base_channels=8, num_residual_blocks=[1] * 4, stem=stem, out_channels=3)

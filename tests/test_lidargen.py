@@ -214,6 +214,12 @@ def test_a_file_of_the_published_size_loads(shapes, tmp_path):
     assert all(bool((p == 1).all()) for p in network.parameters())
     raw = read_official(file_of(tmp_path / "raw.pth", shapes, average=False))[1]
     assert all(bool((p == 0).all()) for p in raw.parameters())
+    other = file_of(tmp_path / "other.pth", shapes)
+    lists = torch.load(other, weights_only=True)
+    lists[0]["module.sigmas"] = geometric_sigmas(shapes["sigmas"][0], 50.0, 0.02)
+    torch.save(lists, other)
+    score = read_official(other)[0].score
+    assert score is not None and score.rate * score.sigma_min**2 == pytest.approx(6.2e-6)  # its step_lr
 
 
 @pytest.mark.parametrize(

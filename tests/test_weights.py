@@ -16,6 +16,9 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Data, Model
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.depth import to_x_0
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import Scan
 from lidarsynth.systems.diffusion.official_r2dm import experiment_of
 from lidarsynth.systems.table import assemble, build_network
 from lidarsynth.weights import load as weights
@@ -135,8 +138,20 @@ def test_the_published_angles_of_kitti_raw_have_a_word(tiny, tmp_path, fixture_t
         coords = torch.stack(torch.broadcast_tensors(elevation[:, None], azimuth[None]))[None]
         checkpoint = torch.load(tiny, weights_only=True)
         checkpoint["cfg"]["data"] |= {"resolution": (64, 512), "projection": "unfolding-2048"}
-        sensor = experiment_of(checkpoint, coords, "mine").data.sensor
-        assert sensor == "hdl-64e-r2dm" if word == "kitti_raw" else sensor["name"] == "mine"
+        data = experiment_of(checkpoint, coords, "mine").data
+        assert data.sensor == "hdl-64e-r2dm" if word == "kitti_raw" else data.sensor["name"] == "mine"
+        assert (data.width, data.columns) == (512, 2048)
+
+
+def test_a_scan_is_drawn_for_a_model_as_for_its_training(scan64: bytes, fixture_tensors):
+    experiment = preset("r2dm-kitti-raw")
+    model = assemble(experiment, build_network(experiment))
+    table = np.frombuffer(scan64, "<f4").reshape(-1, 4)
+    scan = Scan(table[:, :3], table[:, 3])
+    expected = fixture_tensors("projection/preprocess")["train_x0.unfolding-2048.to64x512.log_depth"][0]
+    image = model.image_of(scan)
+    torch.testing.assert_close(to_x_0(image), expected, rtol=0, atol=1e-5)
+    assert (image.mask.mean() < 0.85 * project(scan, image.sensor, "unfolding").mask.mean()).item()
 
 
 def test_the_even_grid_of_any_height_is_exact(tiny, tmp_path):

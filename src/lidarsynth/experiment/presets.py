@@ -61,7 +61,8 @@ def r2dm_h() -> Experiment:
 
 def r2dm_kitti_raw() -> Experiment:
     """The paper's KITTI-Raw model: scan unfolding at 64x2048, subsampled to 64x512. 31,098,498 parameters."""
-    return Experiment("r2dm-kitti-raw", data=Data(sensor="hdl-64e-r2dm", projection="unfolding", width=512))
+    data = Data(sensor="hdl-64e-r2dm", projection="unfolding", width=512, columns=2048)
+    return Experiment("r2dm-kitti-raw", data=data)
 
 
 def lidargen() -> Experiment:

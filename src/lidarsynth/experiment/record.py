@@ -28,6 +28,7 @@ class Data:
     scale: float = within(0.0, 0, 0.99)  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
     mix: float = within(0.0, 0, 1)  # augmentation of completion: share of samples with a sector of another image
     fixed: bool = False  # of a model of any sensor: images of that sensor whatever made the scan, as after `into`
+    columns: int | None = within(None, 4, 65_536)  # columns to draw scans at, of which `width` are kept; None = width
 
     def __post_init__(self):
         check_ranges(self)

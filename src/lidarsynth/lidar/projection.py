@@ -61,21 +61,26 @@ def project_thinned(
     method: str = "auto",
     columns: int | None = None,
     resizing: str = "nearest-exact",
+    pixels: Pixels | None = None,
 ) -> RangeImage:
     """`project` as the published programs make their data sets: drawn at `columns`, of which the sensor's are kept.
 
     columns   None = `columns_of`, for a scan of more points than the sensor has pixels; others are images already, or
               of a sensor of so few columns
     resizing  which are kept, as in `thin`
+    pixels    of the points in the sensor's own columns, where they are known already
     Raises ValueError as `project` does.
     """
     own = WORDS.get(sensor.name, sensor).width if len(scan) > sensor.height * sensor.width else sensor.width
     wide = columns_of(method, sensor.width, own) if columns is None else columns
+    if wide == sensor.width:
+        return project(scan, sensor, method, pixels=pixels)
     return thin(project(scan, sensor, method, wide), width=sensor.width, resizing=resizing)
 
 
 def occupied(scan: Scan, sensor: Sensor, pixels: Pixels) -> np.ndarray:
-    """(H, W) bool: pixels that any point falls into, at whatever range; `pixels` are those of the points."""
+    """(H, W) bool: pixels that any point falls into, at whatever range, before which nothing is to be put; `pixels` are
+    those of the points."""
     row, column = pixels
     x, y, z = scan.xyz.T
     inside = (row >= 0) & ((x != 0) | (y != 0) | (z != 0))

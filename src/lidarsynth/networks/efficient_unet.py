@@ -13,8 +13,8 @@ from lidarsynth.networks.layers import (
     Downsample,
     ResidualBlock,
     SelfAttentionBlock,
+    TimeEmbedding,
     Upsample,
-    time_embedding,
     zero_init,
 )
 
@@ -98,7 +98,7 @@ class EfficientUNet(nn.Module):
         self.resolution, self.stem = (resolution[0], resolution[1]), (stem[0], stem[1])
         self.register_buffer("coords", default_angles(resolution))
         self.coords_encoding = coordinate_encoding(coords_encoding, reduced)
-        self.time_embedding = time_embedding(base_channels, embedding)
+        self.time_embedding = TimeEmbedding(base_channels, embedding)
         self.in_conv = Conv3x3(in_channels * patch + self.coords_encoding.channels, c0, ring)
         self.d_block1 = level(c0, c1, n1)
         self.d_block2 = level(c1, c2, n2, down=True)

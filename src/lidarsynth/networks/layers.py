@@ -79,9 +79,15 @@ class LogSNREmbedding(nn.Module):
         return torch.cat([arguments.sin(), arguments.cos()], dim=1)
 
 
-def time_embedding(channels: int, width: int) -> nn.Sequential:
-    """Embedding (B,) -> (B, width) of the log-SNR; the activation that follows is part of `AdaGroupNorm`."""
-    return nn.Sequential(LogSNREmbedding(channels), nn.Linear(channels, width), nn.SiLU(), nn.Linear(width, width))
+class TimeEmbedding(nn.Sequential):
+    """(B,) -> (B, width) of the log-SNR, of any type; the activation that follows is part of `AdaGroupNorm`."""
+
+    def __init__(self, channels: int, width: int):
+        super().__init__(LogSNREmbedding(channels), nn.Linear(channels, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, log_snr: Tensor) -> Tensor:
+        embedding, first, activation, last = self
+        return last(activation(first(embedding(log_snr).to(first.weight.dtype))))
 
 
 class AdaGroupNorm(nn.Module):

@@ -16,7 +16,7 @@ from lidarsynth.diffusion.samplers import checked_seed
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
-from lidarsynth.lidar.projection import occupied, pixel_of_points, project
+from lidarsynth.lidar.projection import Pixels, occupied, pixel_of_points, project_thinned
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, same_rays
 from lidarsynth.networks.device import check_device, usual_torch
@@ -255,8 +255,7 @@ class ScanModel(ABC):
             known = known_pixels(image, known)
             return self.fill(check_seen(image.keep(known), int(image.mask.sum())), known, how, on_step)
         pixels = pixel_of_points(scan, self.sensor, self.experiment.data.projection)
-        image = check_seen(project(scan, self.sensor, self.experiment.data.projection, pixels=pixels), len(scan))
-        # Nothing is to be put before a point, at whatever range.
+        image = check_seen(self.image_of(scan, pixels), len(scan))
         filled = self.fill(image, image.mask | occupied(scan, self.sensor, pixels), how, on_step)
         return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))
 
@@ -351,10 +350,11 @@ class ScanModel(ABC):
         """How many scans to make at once: one on a CPU, where more are no faster and differ by rounding."""
         return 1 if next(self.network.parameters()).device.type == "cpu" else batch_size
 
-    def image_of(self, scan: Scan | RangeImage) -> RangeImage:
-        """The scan in this model's image. Raises ValueError for an image of other rays."""
+    def image_of(self, scan: Scan | RangeImage, pixels: Pixels | None = None) -> RangeImage:
+        """The scan in this model's image; `pixels` of its points, if known. Raises ValueError for one of other rays."""
         if isinstance(scan, Scan):
-            return project(scan, self.sensor, self.experiment.data.projection)
+            wide = self.experiment.data.columns or self.sensor.width
+            return project_thinned(scan, self.sensor, self.experiment.data.projection, wide, pixels=pixels)
         if scan.shape != (self.sensor.height, self.sensor.width):
             raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
         if not same_rays(scan.sensor, self.sensor):

@@ -12,6 +12,8 @@ from lidarsynth.experiment.presets import lidargen
 from lidarsynth.experiment.record import Card, Experiment
 from lidarsynth.networks.refinenet import from_official, geometric_sigmas
 
+STEP_LR = 6.2e-6  # of the published program: a Langevin step is so much times (sigma / sigma_last)^2
+
 
 def belongs(checkpoint: object) -> bool:
     """Whether this is a list of four or five parts; no other system saves lists."""
@@ -47,4 +49,4 @@ def _levels(sigmas: Tensor) -> dict[str, Any]:
         raise ValueError(f"{expected}, found {len(sigmas)} from {first:g} to {last:g}")
     if not torch.allclose(sigmas, geometric_sigmas(len(sigmas), first, last), rtol=1e-4, atol=0):
         raise ValueError(f"{expected}, found {sigmas[:3].tolist()}")
-    return {"levels": len(sigmas), "sigma_max": first, "sigma_min": last}
+    return {"levels": len(sigmas), "sigma_max": first, "sigma_min": last, "rate": float(f"{STEP_LR / last**2:.6g}")}

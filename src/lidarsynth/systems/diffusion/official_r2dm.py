@@ -78,7 +78,10 @@ def experiment_of(checkpoint: dict[str, Any], coords: Tensor | None, name: str) 
         raise ValueError(f"expected model.coords (1, 2, H, W) with cfg.data.resolution {resolution}, found {found}")
     learned_from, licence = LICENCES.get(cfg["data"].get("dataset"), ("not known", "not known"))
     card = Card(licence, learned_from, (f"official R2DM checkpoint, {checkpoint.get('global_step')} steps",))
-    data = Data(sensor=_sensor(coords, name), height=coords.shape[2], width=coords.shape[3])
+    drawn, width = int(_read(cfg, "data.projection").rpartition("-")[2]), coords.shape[3]
+    data = Data(
+        sensor=_sensor(coords, name), height=coords.shape[2], width=width, columns=drawn if drawn > width else None
+    )
     return with_fields(Experiment(name, data=data, card=card), changes)
 
 
