@@ -15,6 +15,8 @@ from voxel_weights import cached
 from lidarsynth.evaluation import accumulation, evaluate
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.statistics import load_statistics
+from lidarsynth.files.formats import read
+from lidarsynth.lidar.scan import Scan
 
 PROTOCOLS = ("lidm-2024", "r2flow-2025", "r3dpa-2026")
 
@@ -73,6 +75,13 @@ def test_two_machines_gather_what_one_does(protocol: str, side, tmp_path: Path, 
     assert found.keys() == expected.keys() and {"minkowskinet.features", "spvcnn.features"} <= found.keys()
     for name, tensor in expected.items():  # counts and cells are integers; sums of floats are in another order
         torch.testing.assert_close(found[name], tensor, rtol=1e-6, atol=1e-6 if tensor.is_floating_point() else 0)
+
+
+def test_an_image_without_a_point_is_named(tmp_path: Path, cache: Path):
+    folder = scans(tmp_path / "scans", range(2), 0)
+    samples = [read(folder / "000000.bin"), Scan(np.full((3, 3), 90.0, np.float32), np.zeros(3, np.float32))]
+    with pytest.raises(ValueError, match=r"^image 1: expected points between 0.5 and 63 m, found none of"):
+        evaluate.evaluate(samples, folder, "r2flow-2025")
 
 
 def test_a_folder_that_grows_is_judged_whole_and_a_file_half_written_is_named(tmp_path: Path, cache: Path, monkeypatch):

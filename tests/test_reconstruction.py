@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist, directed_hausdorff
 
+from lidarsynth.evaluation.evaluate import evaluate
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.metrics.reconstruction import (
@@ -47,6 +48,9 @@ def test_mae_equals_the_reference(fixture_tensors, values):
     assert errors.range_mae == pytest.approx(values["lidargen_range_mae_m"], rel=1e-5)
     assert errors.reflectance_mae == pytest.approx(values["reflectance_mae_all_pixels"], rel=1e-5)
     assert errors.pixels == 3 * 16 * 64
+    judged = evaluate(*(list(tensors[f"lidargen_{name}"]) for name in ("result", "target")), "r2dm-upsampling-2024")
+    assert judged.values["range MAE"] == pytest.approx(values["lidargen_range_mae_m"], rel=1e-5)
+    assert judged.values["reflectance MAE"] == pytest.approx(values["reflectance_mae_all_pixels"], rel=1e-5)
 
 
 def test_errors_of_chosen_pixels_in_closed_form():

@@ -15,15 +15,19 @@ from torch import nn
 
 from lidarsynth.data.cache import sha256
 from lidarsynth.data.kitti360 import SPLITS
+from lidarsynth.evaluation.features import gated
 from lidarsynth.evaluation.image_sets import ImageSet
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Network
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
 from lidarsynth.experiment.record import WEIGHTS
+from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.point_sets import spread
+from lidarsynth.networks.minkowski_unet import MinkowskiUNet
 from lidarsynth.networks.pointnet import read_pointnet
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.networks.rangenet_archive import read_lidm_rangenet, read_rangenet
 from lidarsynth.networks.sparse_weights import read_sparse
+from lidarsynth.networks.spvcnn import SPVCNN
 from lidarsynth.networks.street_features import StreetFeatures
 from lidarsynth.weights.download import cache_folder, download
 from lidarsynth.weights.load import load_parts, shipped
@@ -213,6 +217,7 @@ def gather(
         else:
             real, resizing = empty.role == "real", empty.protocol.resizing
             arrays = [images.image(i, empty.sensor, projection, real, resizing) for i in batch]
+            _check_voxels(empty, images, batch, arrays)
             statistics.update(arrays, features, bev, sets)
         if on_images:
             on_images(empty.role, start + len(batch), len(numbers))
@@ -221,6 +226,17 @@ def gather(
                 save_statistics(unfinished, statistics, {"done": str(start + len(batch))})
             saved = time.monotonic()
     return statistics
+
+
+def _check_voxels(empty: Statistics, images: ImageSet, batch: Sequence[int], arrays: Sequence[RangeImage]) -> None:
+    """Raises ValueError by the name of an image without a point within the protocol's limits, of which a network of
+    voxels says nothing."""
+    if not any(isinstance(network, MinkowskiUNet | SPVCNN) for network in empty.networks.values()):
+        return
+    for i, image in zip(batch, arrays, strict=True):
+        if not gated(image, empty.protocol, empty.role).any():
+            raise ValueError(f"{images.names[i]}: expected points between {empty.protocol.near:g} and "
+                             f"{empty.protocol.far:g} m, found none of {int(image.mask.sum())}")  # fmt: skip
 
 
 def part_of(numbers: list[int], part: str | None) -> list[int]:

@@ -41,7 +41,7 @@ from lidarsynth.weights.download import cache_folder
 
 ENDING = ".safetensors"  # of a file of statistics
 NAMED = 8  # parts that lack, of a note
-GATHERED = 2  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
+GATHERED = 3  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[str | Path] | Numbered"
@@ -161,7 +161,9 @@ class _Run:
                 pairs.update_points(*points)
             else:
                 sides, resizing = (judged, truth), self.protocol.resizing
-                batch = ([of.image(i, sensor, projection, of is truth, resizing) for i in numbers] for of in sides)
+                batch = (
+                    [of.image(i, sensor, projection, of is truth, resizing, True) for i in numbers] for of in sides
+                )
                 pairs.update(*batch)
             if self.on_images:
                 self.on_images("pairs", numbers.stop, len(judged))

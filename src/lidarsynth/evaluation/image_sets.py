@@ -75,15 +75,21 @@ class ImageSet:
         return len(self.names)
 
     def image(
-        self, i: int, sensor: Sensor, projection: str, resize: bool = False, resizing: str = "nearest-exact"
+        self,
+        i: int,
+        sensor: Sensor,
+        projection: str,
+        resize: bool = False,
+        resizing: str = "nearest-exact",
+        whole: bool = False,
     ) -> RangeImage:
         """Image i in the sensor's size, its empty pixels 0; points are projected, larger images thinned where `resize`.
 
-        resizing  as in `projection.thin`
+        resizing  as in `projection.thin`; whole  as in `from_tensor`
         Raises ValueError that begins with the image's name.
         """
         try:
-            return as_image(judged(self.item(i)), sensor, projection, resize, resizing)
+            return as_image(judged(self.item(i)), sensor, projection, resize, resizing, whole)
         except ValueError as error:
             raise self._named(i, error) from None
 
@@ -277,14 +283,19 @@ def emptied(image: RangeImage) -> RangeImage:
 
 
 def as_image(
-    item: Item, sensor: Sensor, projection: str, resize: bool = False, resizing: str = "nearest-exact"
+    item: Item,
+    sensor: Sensor,
+    projection: str,
+    resize: bool = False,
+    resizing: str = "nearest-exact",
+    whole: bool = False,
 ) -> RangeImage:
     """Any stored form as a range image of the sensor's size. Raises ValueError for another size, NaN, other shapes."""
     size = (sensor.height, sensor.width)
     if isinstance(item, Scan):
         return project_thinned(item, sensor, projection, resizing=resizing)
     if isinstance(item, Tensor):
-        return from_tensor(item, sensor)
+        return from_tensor(item, sensor, whole)
     if item.shape != size and not (resize and _divides(size, item.shape)):
         raise ValueError(f"expected images of one size, {size[0]} x {size[1]}, found one of {item.shape[0]} x "
                          f"{item.shape[1]}")  # fmt: skip
@@ -296,6 +307,7 @@ def points_of(item: Item, sensor: Sensor, clouds: Clouds, real: bool) -> Cloud:
     if isinstance(item, Tensor):
         item = from_tensor(item, sensor_of(item, sensor))
     xyz = (item.xyz if isinstance(item, Scan) else item.points()[item.mask]).astype(np.float32)
+    xyz = xyz[(xyz != 0).any(axis=1)]
     if not np.isfinite(xyz).all():
         raise ValueError(f"expected finite points, found {np.sum(~np.isfinite(xyz).all(1))} with NaN or infinity")
     distance = np.linalg.norm(xyz, axis=1)

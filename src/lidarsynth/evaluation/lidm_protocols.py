@@ -112,8 +112,11 @@ R2FLOW = EvaluationProtocol(
         SPVCNN,
     ),
     Bev(),
+    samples=None,
+    samples_bev=None,
     measured=True,
     notes=(
+        "all samples; the published guide asks for 10,000",
         "the same weights as lidm-2024, another preprocessing: another FRID, and 0.5 to 63 m in FSVD and FPVD",
         "all real images for FRID, FSVD and FPVD; BEV takes 10,000 of them after Random(0).shuffle",
         _OWN_WEIGHTS,

@@ -119,7 +119,7 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     if samples.count != real.count:
         told.append(f"{samples.count:,} samples against {real.count:,} of the reference: "
                     "scores of small sets are larger, compare only with the same counts")  # fmt: skip
-    for kind in samples.moments.keys() & real.moments.keys():
+    for kind in sorted(samples.moments.keys() & real.moments.keys()):
         size = len(samples.moments[kind].mean)
         for statistics, name in ((samples, "samples"), (real, "reference")):
             if 2 <= statistics.count <= size:

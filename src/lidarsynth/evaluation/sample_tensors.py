@@ -19,13 +19,15 @@ METRE, DARK, NONE, LAYERED = 1 / 6, 0.05, 0.002, 0.3
 ENOUGH = 5  # points of a row whose elevation is told
 
 
-def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
+def from_tensor(tensor: Tensor, sensor: Sensor, whole: bool = False) -> RangeImage:
     """A published sample as a range image of the sensor.
 
     (5, H, W): depth, x, y, z in metres, reflectance, as the official R2DM program saves; (2, H, W): LiDARGen's range
-    code log2(r + 1) / 6, clipped to 63 m, and reflectance, both in [0, 1]; of NEAREST or less nothing returned. Raises
-    ValueError for another shape, NaN, infinity, or values that are not so coded: outside their limits, or a code beyond
-    the sensor's farthest range.
+    code log2(r + 1) / 6, clipped to 63 m, and reflectance, both in [0, 1]; of NEAREST or less nothing returned.
+
+    whole  the numbers of such pixels stay, as LiDARGen's mean errors are of all pixels
+    Raises ValueError for another shape, NaN, infinity, or values that are not so coded: outside their limits, or a code
+    beyond the sensor's farthest range.
     """
     size = (sensor.height, sensor.width)
     if tensor.ndim != 3 or tensor.shape[0] not in (2, 5) or tuple(tensor.shape[1:]) != size:
@@ -41,10 +43,10 @@ def from_tensor(tensor: Tensor, sensor: Sensor) -> RangeImage:
     else:
         farthest = max(1.0, float(np.log2(sensor.max_range + 1) / 6))
         distance = np.exp2(6 * within("a range code log2(r + 1) / 6", values[0], farthest).clip(0, 1)) - 1
-        distance *= distance > NEAREST
-    mask = distance > 0
+    mask = distance > (0 if len(values) == 5 else NEAREST)
+    kept = True if whole and len(values) == 2 else mask
     xyz = np.moveaxis(values[1:4], 0, -1).copy() if len(values) == 5 else None
-    return RangeImage(distance, reflectance * mask, mask, sensor, xyz=xyz)
+    return RangeImage(distance * kept, reflectance * kept, mask, sensor, xyz=xyz)
 
 
 def _check_order(code: np.ndarray, reflectance: np.ndarray) -> None:
