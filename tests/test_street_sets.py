@@ -309,10 +309,10 @@ def test_sets_and_caches_have_one_edition(tmp_path: Path, monkeypatch: pytest.Mo
     written(tmp_path / "set", "pcd", line)
     assert json.loads((tmp_path / "set" / "streets.json").read_text())["edition"] == EDITION
     crowded = Options(density=Density(pedestrians=2))
-    for options, later in ((crowded, 1), (Options(frames=3), 2)):  # whose boxes met before 2026-11-28; and houses
+    for options in (crowded, Options(frames=3)):  # whose boxes met before 2026-11-28, and houses before 2026-11-29
         written(tmp_path / "other" / str(options.frames), "pcd", LabelledStreets(0, 1, line.sensor, options))
         record = json.loads((tmp_path / "other" / str(options.frames) / "streets.json").read_text())
-        assert record["edition"] == EDITION + later
+        assert record["edition"] == EDITION + 2
     monkeypatch.setattr("lidarsynth.data.street_sets.EDITION", EDITION + 1)
     with pytest.raises(ValueError, match=r"made with \{edition \d\}, found \{edition \d\}"):
         written(tmp_path / "set", "pcd", line)

@@ -9,7 +9,7 @@ from lidarsynth.files.labels import CLASS_OF_RAW
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import actors_of
-from lidarsynth.streets.apart import boxes_on_ground, meet, stand_apart, what_stands
+from lidarsynth.streets.apart import boxes_on_ground, meet, stand_apart, walls, what_stands
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
@@ -282,6 +282,22 @@ def test_who_drives_or_rides_goes_through_no_thing_and_no_house():
         road = drive.world.ground.roads[0]
         ended += int((drive.reach[0] != (road.start, road.stop)).sum())
     assert seen["bicyclist"] > 500 and seen["car"] > 200 and kept > 0.9 and ended > 0
+
+
+def test_nobody_of_usual_streets_without_overlap_stands_in_walls_or_in_others():
+    told = {}
+    for overlap in (True, False):
+        reader = LabelledStreets(0, 48, SMALL, Options(overlap=overlap))
+        boxes = [reader[k].boxes for k in range(0, 48, 16)]
+        pairs = [apart(a, b) < -0.1 for of in boxes for k, a in enumerate(of) for b in of[:k]]
+        built = [build(np.random.default_rng((0, number))) for number in range(3)]
+        worlds = built if overlap else [stand_apart(each)[0] for each in built]
+        walled = [meet(boxes_on_ground(actors_of(w), -0.2)[:, None], walls(w)[None]).any() for w in worlds]
+        told[overlap] = (sum(pairs), sum(walled), sum(map(len, boxes)))
+    assert told[True][0] > 0 and told[True][1] > 0 and told[False][:2] == (0, 0)
+    assert told[True][2] > told[False][2] > 0.9 * told[True][2]
+    with pytest.raises(ValueError, match="expected kerbs of 0 to 3, found 9"):
+        Density(kerbs=9)
 
 
 def test_who_walks_turns_where_their_way_ends():

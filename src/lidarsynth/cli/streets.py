@@ -55,6 +55,9 @@ def streets(
     kerbs: Annotated[float, arg(help="their height: 1 = 12 cm, 0.5 = half of it.")] = 1.0,
     rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
     fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
+    overlap: Annotated[
+        bool, arg(help="as the streets always were; --no-overlap: nobody stands in others or in walls, as in drives.")
+    ] = True,
     workers: Annotated[int | None, arg(metavar="INT", help="processes, one per processor core if not given.")] = None,
     picture: Annotated[bool, arg(help="write overview.png, four frames with their boxes.")] = True,
 ) -> None:
@@ -68,7 +71,7 @@ def streets(
     density = Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs, cyclists, heavy,
                       walls, barriers, panels, garages, riders, walkers, racks)  # fmt: skip
     weather, speed = Weather(rain, fog), speed and speed / 3.6
-    options = Options(frames, rate, speed, deskewed, perfect, density, weather, inside=inside)
+    options = Options(frames, rate, speed, deskewed, perfect, density, weather, inside=inside, overlap=overlap)
     made = with_those_there(out, LabelledStreets(seed, count, get_sensor(sensor), options), format)
     written = write_streets(out, made, format, os.cpu_count() or 1 if workers is None else workers)
     deque(counted((done, len(made)) for done in written), maxlen=0)

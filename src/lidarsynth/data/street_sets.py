@@ -137,7 +137,7 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    later: dict[str, Any] = {"perfect": False, "inside": False, "kerbs": 1, "rough": 1} | dict.fromkeys(MORE, 0)
+    later: dict[str, Any] = {"perfect": False, "inside": False, "overlap": True, "kerbs": 1, "rough": 1} | dict.fromkeys(MORE, 0)
     for of in (options, options["density"], options["optics"]):
         for name in later.keys() & of.keys():
             if of[name] == later[name]:
@@ -148,11 +148,11 @@ def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
 
 def _edition(options: Options, layout: str) -> int:
     """EDITION, or one more where 2026-11-25 brought boxes that stand where seen, cyclists who roll off kerbs, or no
-    vehicles in car parks, one where label_2 lists what the camera sees alone, one where 2026-11-28 set everyone apart,
-    and one for drives, in which nobody goes through things and houses since 2026-11-29: other sets go on."""
+    vehicles in car parks, one where label_2 lists what the camera sees alone, and two where everyone is set apart since
+    2026-11-28, and stands in no wall and goes through none since 2026-11-29: other sets go on."""
     drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
     apart = options.frames > 0 or options.density != TODAY
-    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + apart + (options.frames > 0)
+    return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + 2 * apart
 
 
 def _claim(folder: Path, settings: dict[str, Any]) -> bool:

@@ -16,7 +16,7 @@ from torch.nn.functional import softplus
 
 @dataclass(frozen=True)
 class Schedule:
-    """A noise schedule as three functions; each keeps the shape, dtype and device of its argument.
+    """A noise schedule as three functions; each keeps the shape, dtype and device of its argument, and can be pickled.
 
     Example:
         >>> schedule = cosine()
@@ -76,8 +76,8 @@ def cosine_shifted(resolution: float = 256, reference: float = 64, bound: float 
     """
     shift = _shift(reference, resolution)
     return Schedule(
-        lambda t: cosine_log_snr(t, bound) + shift,
-        lambda log_snr: cosine_t(log_snr - shift, bound),
+        partial(_shifted_log_snr, bound, shift),
+        partial(_shifted_t, bound, shift),
         variance_preserving,
     )
 
@@ -87,21 +87,13 @@ def cosine_interpolated(resolution: float = 256, low: float = 32, high: float = 
 
     resolution, low, high: image sides in pixels. Its inverse has no closed form and is found by bisection.
     """
-    shift_low, shift_high = _shift(low, resolution), _shift(high, resolution)
-
-    def log_snr(t: Tensor) -> Tensor:
-        return cosine_log_snr(t, bound) + t * shift_low + (1 - t) * shift_high
-
+    log_snr = partial(_interpolated_log_snr, bound, _shift(low, resolution), _shift(high, resolution))
     return Schedule(log_snr, partial(bisect, log_snr), variance_preserving)
 
 
 def linear() -> Schedule:
     """The continuous form of DDPM's linear betas, log_snr in [-10.0, 9.2] (Ho et al. 2020; Kingma et al. 2021)."""
-    return Schedule(
-        lambda t: -torch.log(torch.expm1(1e-4 + 10 * t**2)),
-        lambda log_snr: ((softplus(-log_snr) - 1e-4).clamp(min=0) / 10).sqrt(),
-        variance_preserving,
-    )
+    return Schedule(_linear_log_snr, _linear_t, variance_preserving)
 
 
 def flow(bound: float = 30.0, noisiest: float | None = None) -> Schedule:
@@ -112,11 +104,7 @@ def flow(bound: float = 30.0, noisiest: float | None = None) -> Schedule:
     """
     first, last = (1 / (1 + math.exp(end / 2)) for end in (bound, bound if noisiest is None else noisiest))
     width = 1 - (first + last)
-    return Schedule(
-        lambda t: 2 * torch.log((last + (1 - t) * width) / (first + t * width)),
-        lambda log_snr: ((-log_snr / 2).sigmoid() - first) / width,
-        straight,
-    )
+    return Schedule(partial(_flow_log_snr, first, last, width), partial(_flow_t, first, width), straight)
 
 
 def ve(sigma_min: float = 0.01, sigma_max: float = 50.0) -> Schedule:
@@ -124,11 +112,7 @@ def ve(sigma_min: float = 0.01, sigma_max: float = 50.0) -> Schedule:
     if not 0 < sigma_min < 1 <= sigma_max:  # the noise has to cover data in [-1, 1]
         raise ValueError(f"sigma_min and sigma_max must satisfy 0 < min < 1 <= max, got {sigma_min} and {sigma_max}")
     start, ratio = math.log(sigma_min), math.log(sigma_max / sigma_min)
-    return Schedule(
-        lambda t: -2 * (start + t * ratio),
-        lambda log_snr: (-log_snr / 2 - start) / ratio,
-        variance_exploding,
-    )
+    return Schedule(partial(_ve_log_snr, start, ratio), partial(_ve_t, start, ratio), variance_exploding)
 
 
 def renoise(schedule: Schedule, x_s: Tensor, s: Tensor, t: Tensor, eps: Tensor) -> Tensor:
@@ -158,6 +142,42 @@ def cosine_t(log_snr: Tensor, bound: float) -> Tensor:
     """The inverse of cosine_log_snr."""
     start = math.atan(math.exp(-bound / 2))
     return (torch.atan(torch.exp(-log_snr / 2)) - start) / (math.pi / 2 - 2 * start)
+
+
+def _shifted_log_snr(bound: float, shift: float, t: Tensor) -> Tensor:
+    return cosine_log_snr(t, bound) + shift
+
+
+def _shifted_t(bound: float, shift: float, log_snr: Tensor) -> Tensor:
+    return cosine_t(log_snr - shift, bound)
+
+
+def _interpolated_log_snr(bound: float, low: float, high: float, t: Tensor) -> Tensor:
+    return cosine_log_snr(t, bound) + t * low + (1 - t) * high
+
+
+def _linear_log_snr(t: Tensor) -> Tensor:
+    return -torch.log(torch.expm1(1e-4 + 10 * t**2))
+
+
+def _linear_t(log_snr: Tensor) -> Tensor:
+    return ((softplus(-log_snr) - 1e-4).clamp(min=0) / 10).sqrt()
+
+
+def _flow_log_snr(first: float, last: float, width: float, t: Tensor) -> Tensor:
+    return 2 * torch.log((last + (1 - t) * width) / (first + t * width))
+
+
+def _flow_t(first: float, width: float, log_snr: Tensor) -> Tensor:
+    return ((-log_snr / 2).sigmoid() - first) / width
+
+
+def _ve_log_snr(start: float, ratio: float, t: Tensor) -> Tensor:
+    return -2 * (start + t * ratio)
+
+
+def _ve_t(start: float, ratio: float, log_snr: Tensor) -> Tensor:
+    return (-log_snr / 2 - start) / ratio
 
 
 def bisect(falling: Callable[[Tensor], Tensor], value: Tensor, iterations: int = 40) -> Tensor:

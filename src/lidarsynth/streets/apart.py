@@ -83,13 +83,14 @@ def stand_apart(
     kept = footprints(world.poses, world.poses[:, 3], np.zeros(2), np.array(CARRIER)) if ways is None else ways
     going = np.equal(actors.pace, TRAFFIC) if makes is None else makes
     fixed, taken = what_stands(world), np.zeros((0, 5))
-    posts = int(np.isin(world.things["kind"], POSTS).sum())  # vehicles may stand at fences and in hedges
+    posts = fixed[: int(np.isin(world.things["kind"], POSTS).sum())]
+    solid = np.concatenate([posts, walls(world)])  # vehicles may stand at fences and in hedges
     shift, left = np.zeros((len(actors), 2)), there.copy()
     for one in _order(actors):
         if not there[one]:
             continue
         parked, goes = actors.kind[one] in VEHICLES, bool(going[one])
-        others = np.concatenate([taken, kept[: 0 if goes else None], fixed[: 0 if goes else posts if parked else None]])
+        others = taken if goes else np.concatenate([taken, kept, solid if parked else fixed])
         move: np.ndarray | None = np.zeros(2)
         if meet(boxes[one], near(boxes[one], others, 0.0)).any():
             move = None if goes else _moved(boxes[one], others, world.ground, parked)

@@ -60,6 +60,8 @@ class Area:
 
 
 # fmt: off
+HIGHEST = 3  # times 12 cm, of kerbs
+
 AREAS: dict[str, Area] = {
     "city": Area(
         weight=0.21, half=(3.0, 6.5), walk=(2.0, 5.5), parking=(0.7, 0.6), parked=(0.3, 0.85), setback=(0.0, 3.0),
@@ -110,7 +112,7 @@ class Density:
     garages; on the main road riders, of bicycles and motorcycles; people on sidewalks, racks of bicycles, and these
     riders, of more shapes than every street has.
 
-    Raises ValueError for a factor outside 0 to 100.
+    Raises ValueError for a factor outside 0 to 100, of kerbs outside 0 to HIGHEST.
     """
 
     traffic: float = 1.0  # moving vehicles and cyclists
@@ -133,8 +135,9 @@ class Density:
 
     def __post_init__(self):
         for name, factor in vars(self).items():
-            if not 0 <= factor <= 100:
-                raise ValueError(f"expected {name} of 0 to 100, found {factor}")
+            most = HIGHEST if name == "kerbs" else 100
+            if not 0 <= factor <= most:
+                raise ValueError(f"expected {name} of 0 to {most}, found {factor}")
 
     def of(self, area: Area) -> Area:
         """The kind of street with these factors."""

@@ -44,6 +44,8 @@ class Options:
               by both ends of the turn, directly behind, one part is brought to the other
     perfect   as a simulator casts: every beam reports exactly what it meets first, with a reflectance of 0
     inside    places in buildings, not in streets: rooms, halls, garages, the sensor `mount` above the floor
+    overlap   scans of places with the usual density stay what they always were, where some stand in others and in
+              walls; False = nobody does, as with any other density and in drives
     """
 
     frames: int = 0
@@ -55,6 +57,7 @@ class Options:
     weather: Weather = CLEAR
     optics: Optics = field(default=OPTICS)
     inside: bool = False
+    overlap: bool = True
 
     def __post_init__(self):
         object.__setattr__(self, "frames", whole("frames", self.frames, 0))
@@ -164,7 +167,7 @@ class LabelledStreets:
         if self.options.inside:
             return buildings(self.seed, self.sensor)
         density = self.options.density
-        built = None if density == TODAY else partial(_apart, self.seed, self.sensor, density)
+        built = None if density == TODAY and self.options.overlap else partial(_apart, self.seed, self.sensor, density)
         return Worlds(self.seed, self.sensor, built=built)
 
     def _still(self, index: int) -> Frame:
