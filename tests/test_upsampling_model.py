@@ -19,7 +19,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.iln import ILN, LIIF, angle_queries
-from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
+from lidarsynth.networks.lidar_sr import Dropout, LidarSR, mc_dropout, remove_uncertain
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated
 from lidarsynth.systems.table import SYSTEMS, assemble, build_network
@@ -419,6 +419,41 @@ def test_arguments_of_official_files_are_heard(tmp_path):
         torch.save(checkpoint, tmp_path / "other.pth")
         with pytest.raises(ValueError, match=said):
             lidarsynth.load(tmp_path / "other.pth")
+
+
+def test_arguments_of_official_lidar_sr_are_heard(fixture_tensors, tmp_path):
+    """The rate decides how far passes under dropout differ, and so which pixels stay."""
+    stored = fixture_tensors("lsr_4h1w_small")
+    weights = {k.removeprefix("state_dict."): v for k, v in stored.items() if k.startswith("state_dict.")}
+
+    def loaded(args: object) -> UpsamplingModel:
+        checkpoint = official("lsr", weights)
+        checkpoint["model"]["args"] = args
+        torch.save(checkpoint, tmp_path / "lsr.pth")
+        return lidarsynth.load(tmp_path / "lsr.pth")
+
+    for args, rate in (({}, 0.25), (None, 0.25), ({"dropout_rate": 0.1}, 0.1), ({"dropout_rate": 0}, 0.0)):
+        model = loaded(args)
+        rates = {module.rate for module in model.network.modules() if isinstance(module, Dropout)}
+        assert rates == {rate} and (model.network.dropout, model.experiment.model.dropout) == (rate, rate)
+    model = loaded({"scale_h": 4, "scale_w": 1, "width": 6, "dropout_rate": 0.1})
+    save(tmp_path / "own", model.experiment, model.network)
+    again = lidarsynth.load(tmp_path / "own")
+    ours, theirs = (mc_dropout(m.network, stored["input"], torch.Generator().manual_seed(1), 8) for m in (model, again))
+    assert torch.equal(ours[1], theirs[1]) and "dropout 0.1" in describe(str(tmp_path / "lsr.pth"))
+    assert loaded({"scale_w": 2}).experiment.upsampling.factor == (4, 2), "tensors say nothing of columns"
+    for args, said in (
+        ({"scale_h": 8}, "expected tensors of scale_h = 8, as model.args says, found those of 4"),
+        ({"width": 64}, "expected tensors of width = 64, as model.args says, found those of 6"),
+        ({"scale_w": 3}, r"scale must be two powers of 2, .* got \(4, 3\)"),
+        ({"dropout_rate": 1.5}, "expected dropout_rate of model.args from 0 to below 1, found 1.5"),
+        ({"dropout_rate": "much"}, "expected a number as dropout_rate of model.args, found 'much'"),
+        ({"scale_w": math.inf}, "expected a number as scale_w of model.args, found inf"),
+        ([0.1], r"expected model.args by name, found \[0.1\]"),
+    ):
+        with pytest.raises(ValueError, match=said) as caught:
+            loaded(args)
+        assert "\n" not in str(caught.value)
 
 
 def test_other_files_are_named_as_what_they_are(tmp_path):
