@@ -155,6 +155,10 @@ def test_rates_are_those_of_the_papers():
     keras = preset("lidar-sr-keras").training
     for step in (0, 1, 1000, 99_999):
         assert learning_rate(keras, step) == pytest.approx(1e-4 / (1 + 1e-5 * step))
+    for steps in (1000, 400_000):  # a decay per iteration, however many there are
+        other = with_fields(preset("lidar-sr-keras"), {"training.steps": steps}).training
+        assert all(learning_rate(other, step) == learning_rate(keras, step) for step in range(0, 1000, 37))
+        assert learning_rate(other, steps - 1) == pytest.approx(1e-4 / (1 + 1e-5 * (steps - 1)))
     iln = Training(steps=1000, learning_rate=1e-4, warmup=0, decay="halving")  # a step for each epoch of the paper
     expected = [1e-4 * 0.5 ** sum(epoch >= m for m in (200, 400, 600, 800)) for epoch in range(1000)]
     assert [learning_rate(iln, epoch) for epoch in range(1000)] == pytest.approx(expected)
