@@ -319,6 +319,7 @@ def test_info_tells_the_published_counts():
     for word, count in counts.items():
         text = describe(word)
         assert f" {count}\n" in text and "16 to 64 rows (beams:4:0)" in text and "diffusion" not in text
+    assert "16 to 64 rows (beams:4:3)" in describe("lidar-sr-keras"), "of each four the lowest, as its program"
     assert "monte" not in describe("iln") and "mean of 50 passes under dropout" in describe("lidar-sr")
     for word, how in (("nearest", "nearest known row"), ("bilinear", "linear between"), ("bicubic", "a = -0.75")):
         text = describe(word)

@@ -124,6 +124,16 @@ def test_a_sample_depends_on_seed_step_and_position_only(kind, draw):
         assert not torch.equal(draw(other[0], Walls(), [0], other[1], [0]).low, whole.low[:1])
 
 
+def test_keras_program_knows_the_lowest_beam_and_every_fourth_from_there():
+    """Row 0 of its images is the lowest beam, and rows 0, 4, 8, ... are its low image: of 64 beams 63, 59, ..., 3."""
+    small = {"data.height": 16, "data.width": 64, "model.base_channels": 4}
+    experiment = with_fields(preset("lidar-sr-keras"), small)
+    low, high = draw_pairs(experiment, Walls(), [3], 0, [0])  # noise is drawn before rows are taken
+    torch.testing.assert_close(low, high[:, :, ::4], rtol=0, atol=0)
+    beams = SENSOR.elevations[experiment.upsampling.first :: experiment.upsampling.factor[0]]
+    assert beams == SENSOR.elevations[::-1][::4][::-1] and beams[-1] == min(SENSOR.elevations)
+
+
 def test_columns_are_thinned_too():
     experiment = tiny("lidar-sr", **{"upsampling.factor": (4, 2)})
     low, high = draw_pairs(experiment, Walls(), [3], 0, [0])

@@ -126,12 +126,10 @@ def read_keras(path: Path) -> tuple[Experiment, nn.Module]:
     except (OSError, KeyError, RuntimeError) as error:
         raise ValueError(f"expected LiDAR-SR's Keras weights, found a damaged file ({error!s:.80})") from None
     start = lidar_sr_keras()
-    group = start.upsampling or Upsampling()
     data = replace(start.data, sensor="os1-64", projection="spherical")
     history = ("official Keras weights of LiDAR-SR",)
     experiment = replace(start, name=path.stem, data=data, card=replace(CARD, history=history))
-    model = replace(start.model, base_channels=network.width)
-    return replace(experiment, model=model, upsampling=replace(group, first=group.factor[0] - 1)), network
+    return replace(experiment, model=replace(start.model, base_channels=network.width)), network
 
 
 def _in_order(group: Any, h5py: Any) -> Iterator[Tensor]:
