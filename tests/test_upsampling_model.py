@@ -22,7 +22,7 @@ from lidarsynth.networks.iln import ILN, LIIF, angle_queries
 from lidarsynth.networks.lidar_sr import Dropout, LidarSR, mc_dropout, remove_uncertain
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated
-from lidarsynth.systems.table import SYSTEMS, assemble, build_network
+from lidarsynth.systems.table import SYSTEMS, assemble, build_network, transfer
 from lidarsynth.systems.upsampling.model import UpsamplingModel, places, queries_at, scaled
 from lidarsynth.verbs.completion import complete_scan, upsample_scan
 from lidarsynth.verbs.description import describe
@@ -413,13 +413,38 @@ def test_arguments_of_official_files_are_heard(tmp_path):
     for name, network, args, said in (
         ("iln", ILN(1), {"d": 2}, "tensors of d = 2 layers, as model.args says, found 1"),
         ("iln", ILN(1), {"depth": 1}, r"expected model.args of d, h, found \{'depth': 1\}"),
-        ("liif_lidar", LIIF(), {"local_ensemble": False}, "expected a LIIF of .* found .*'local_ensemble': False"),
+        (
+            "liif_lidar",
+            LIIF(),
+            {"cell_decode": True},
+            "expected a LIIF without cell_decode, .*, found .*True",
+        ),
     ):
         checkpoint = official(name, network.state_dict())
         checkpoint["model"]["args"] = args
         torch.save(checkpoint, tmp_path / "other.pth")
         with pytest.raises(ValueError, match=said):
             lidarsynth.load(tmp_path / "other.pth")
+
+
+def test_arguments_of_official_liif_are_heard_and_kept(tmp_path):
+    torch.manual_seed(0)
+    theirs = LIIF(unfold=True, ensemble=False).eval()
+    checkpoint = official("liif_lidar", theirs.state_dict())
+    checkpoint["model"]["args"] = {"feat_unfold": True, "local_ensemble": False, "cell_decode": False}
+    torch.save(checkpoint, tmp_path / "liif.pth")
+    model, asked = lidarsynth.load(tmp_path / "liif.pth"), (torch.rand(1, 1, 4, 8), torch.rand(1, 512, 2) * 2 - 1)
+    assert torch.equal(model.network(*asked), theirs(*asked))
+    save(tmp_path / "own", model.experiment, model.network)
+    again = lidarsynth.load(tmp_path / "own")
+    assert torch.equal(again.network(*asked), theirs(*asked))
+    assert "64 channels, of 3x3 pixels, of one neighbour" in describe(str(tmp_path / "own"))
+    known = np.zeros((64, 64), bool)
+    known[::4] = True
+    assert again.complete(sphere(again.sensor), known).mask.any()
+    plain = with_fields(again.experiment, {"upsampling.ensemble": True})
+    with pytest.raises(ValueError, match=r"expected weights of liif, .* True \(network, .*, ensemble\), found liif"):
+        transfer(build_network(plain), plain, again.network, again.experiment, "own")
 
 
 def test_arguments_of_official_lidar_sr_are_heard(fixture_tensors, tmp_path):

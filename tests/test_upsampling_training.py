@@ -253,5 +253,5 @@ def test_a_run_in_a_folder_learns_from_a_cache_and_starts_another(tmp_path):
         with pytest.raises(ValueError, match=r"expected .*\(16, 1, 3, 3\)|expected .*\(1, 16, 3, 3\)"):
             transfer(build_network(wide), wide, network, kept, word)
     ours, theirs = tiny("lidar-sr"), tiny("iln")
-    with pytest.raises(ValueError, match=r"expected weights of lidar-sr, \(4, 1\), False .*, found iln"):
+    with pytest.raises(ValueError, match=r"expected weights of lidar-sr, \(4, 1\), False, .*, found iln"):
         transfer(build_network(ours), ours, build_network(theirs), theirs, "iln")

@@ -119,6 +119,8 @@ class Upsampling:
         0.03, -1
     )  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
     depth: int = within(1, 0, 64)  # layers of ILN's transformer
+    unfold: bool = False  # LIIF is told the features of 3x3 pixels
+    ensemble: bool = True  # LIIF asks four neighbours, not one
     queries: int = within(16_384, 1)  # pixels of a scan that a step of ILN or LIIF learns from
 
     def __post_init__(self):

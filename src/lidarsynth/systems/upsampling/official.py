@@ -58,6 +58,8 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
         if isinstance(network, ILN):
             group = replace(group, depth=len(network.attention.transformer.layers))
             start = replace(start, model=replace(start.model, attn_num_heads=network.heads))
+        else:
+            group = replace(group, unfold=network.unfold, ensemble=network.ensemble)
         width = start.model.base_channels
     if sensor is not None:
         start, group = _with_sensor(start, group, sensor, name)
