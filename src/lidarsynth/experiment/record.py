@@ -137,6 +137,7 @@ class Adversarial:
     discriminator_channels: int | None = within(None, 1, 8192)  # at its finest map; None = model.base_channels
     temperature: float = within(1.0, 1e-6)  # of the Gumbel-sigmoid that drops rays
     iros21: bool = False  # layers of the first release of vanilla GAN and DUSty v1: tanh, mirrored blur
+    image_mask: bool = False  # dusty-v1 drops by a second mask, of one draw for all of an image: DUSty-II
     empty_below: float = within(0.0, 0, 1)  # code in [0, 1] up to which a pixel is empty
     r1_weight: float = within(1.0, 0)
     r1_every: int = within(16, 1)  # steps
