@@ -100,6 +100,30 @@ def test_names_shapes_and_counts_are_the_official_ones(reference):
     check_structure(reference, "dusty_v2", nets, {"G": 4_367_594, "D": 38_445_569})
 
 
+@pytest.mark.parametrize(("size", "count"), [((64, 512), 4), ((32, 128), 3), ((128, 256), 5), ((256, 64), 4)])
+def test_the_discriminator_halves_an_image_until_it_is_four_pixels_high(size, count):
+    net, maps = Discriminator(size, 2, 8), []  # as wide at the third halving as at the fourth: 2, 4, 8, 8, 8, 8
+    net.epilogue[0].register_forward_hook(lambda module, inputs, output: maps.append(output.shape))
+    assert net(torch.randn(4, 1, *size)).shape == (4, 1)
+    assert maps == [(4, 9, size[0] >> count, size[1] >> count)] and min(maps[0][2:]) == 4
+    blocks = {key.split(".")[1] for key in net.state_dict() if ".skip.0." in key}
+    assert blocks == {str(3 + i) for i in range(count)}, "names go on as in the official file"
+    shapes = {key: tuple(value.shape) for key, value in net.state_dict().items() if key.startswith("epilogue")}
+    pixels = (size[0] >> count) * (size[1] >> count)
+    assert shapes["epilogue.1.1.module.weight"] == (8, 9, 3, 3)
+    assert shapes["epilogue.4.module.weight"] == (8, 8 * pixels)
+
+
+def test_the_last_layers_of_the_discriminator_are_as_wide_as_after_four_halvings():
+    for size, before in (((32, 128), 8), ((64, 128), 16), ((128, 128), 32)):
+        net = Discriminator(size, 1, 64)
+        assert net.get_parameter("epilogue.1.1.module.weight").shape == (16, before + 1, 3, 3)
+        assert net(torch.randn(2, 1, *size)).isfinite().all()
+    odd = Discriminator((48, 176), 1, 8)  # sizes that are no power of 2: at least 4, less than 8 pixels high
+    assert len([key for key in odd.state_dict() if ".skip.0." in key]) == 3
+    assert odd(torch.randn(2, 1, 48, 176)).shape == (2, 1)
+
+
 def regular_angles(height: int, width: int) -> torch.Tensor:
     elevation = torch.linspace(0.05, -0.4, height)
     azimuth = math.pi * (1 - 2 * (torch.arange(width) + 0.5) / width)

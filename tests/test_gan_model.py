@@ -305,7 +305,10 @@ def test_the_released_angles_have_a_word(fixture_tensors, reference: Path, tmp_p
         assert build_sensor(read_official(tmp_path / f"{name}.pth")[0]).name == sensor
 
 
-@pytest.mark.parametrize(("name", "word"), [("gan_iros21_vanilla", "vanilla-gan"), ("gan_iros21_dusty1", "dusty-v1")])
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [("gan_iros21_vanilla", "vanilla-gan"), ("gan_iros21_dusty1", "dusty-v1"), ("gan_iros21_dusty2", "dusty-v1")],
+)
 @torch.no_grad()
 def test_the_first_release_is_read_too(fixture_tensors, tmp_path: Path, name: str, word: str):
     expected = fixture_tensors(name)
@@ -321,6 +324,28 @@ def test_the_first_release_is_read_too(fixture_tensors, tmp_path: Path, name: st
     assert image.range.max() < (62 if word == "vanilla-gan" else 120), "codes up to 0.008 are no returns"
     truth = image.keep(corrupt(image, "points:0.5", 0))
     assert model.complete(truth, steps=2).mask.sum() >= truth.mask.sum()
+
+
+@torch.no_grad()
+def test_dusty_ii_is_read_generated_and_kept(fixture_tensors, tmp_path: Path):
+    expected = fixture_tensors("gan_iros21_dusty2")
+    torch.save(released(expected), tmp_path / "dusty2.pth")
+    model = lidarsynth.load(tmp_path / "dusty2.pth")
+    assert isinstance(model, GanModel) and "official DUSty-II checkpoint" in model.experiment.card.history[0]
+    assert "dusty-v1 with a mask of images (DUSty-II)" in describe(str(tmp_path / "dusty2.pth"))
+    out = model.network(expected["z"], torch.full((1, 1, 1, 1), 0.5))
+    assert_close(out.raydrop_logit, expected["eval.confidence"], **TOLERANCE)
+    assert torch.equal(out.raydrop_mask, (out.raydrop_logit > 0).float())
+    uniform = torch.rand(1, 1, 64, 128, generator=torch.Generator().manual_seed(0))
+    z = torch.randn(16, generator=torch.Generator().manual_seed(4))[None]
+    logit = model.network(z, uniform).raydrop_logit[0].numpy()
+    kept = (logit[0] + (torch.log(uniform) - torch.log1p(-uniform))[0, 0].numpy() > 0) & (logit[1] > 0)
+    (image,) = model.generate(1, seed=4)
+    assert 0.05 < kept.mean() < 0.95 and not image.mask[~kept].any() and image.mask[kept].all()
+    save(tmp_path / "own", model.experiment, model.network)
+    np.testing.assert_array_equal(lidarsynth.load(tmp_path / "own").generate(1, seed=4)[0].range, image.range)
+    with pytest.raises(ValueError, match=r"adversarial.image_mask: expected false for vanilla-gan, .*, found true"):
+        build_network(tiny("vanilla-gan", **{"adversarial.image_mask": True}))
 
 
 @pytest.mark.parametrize(("official", "word"), [("vanilla", "vanilla-gan"), ("dusty_v2", "dusty-v2")])
@@ -385,6 +410,7 @@ def test_other_files_are_named(fixture_tensors, tmp_path: Path):
     height, width = tensors["eval.image"].shape[2:]
     good = released(tensors, angles(height, width))
     first, second = "synthesis_network.0.1.module.weight", "synthesis_network.1.1.module.weight"
+    third = "backbone.4.heads.confidence.1.module.bias"
     cases = {
         "no angle": ({**good, "angle": None}, r"expected angle \(1, 2, H, W\) beside G, found NoneType"),
         "size": ({**good, "angle": angles(height, 2 * width)}, r"of the size of angle \(\d+, \d+\), found"),
@@ -396,7 +422,10 @@ def test_other_files_are_named(fixture_tensors, tmp_path: Path):
         ),
         "headless": (changed(good, first, None), f"expected a generator with {first} of 4 dimensions, found"),
         "no tensors": ({**good, "G_ema": [1]}, "expected G_ema with tensors by name, found list"),
-        "dusty-ii": (released(fixture_tensors("gan_iros21_dusty2")), r"\(DUSty-I\), found 2 \(DUSty-II\)"),
+        "three masks": (
+            changed(released(fixture_tensors("gan_iros21_dusty2")), third, torch.zeros(3)),
+            r"1 ray-drop logit per pixel \(DUSty-I\) or 2 \(DUSty-II\), found \(3,\)",
+        ),
         "foreign": ({**good, "cfg": Foreign()}, "found a damaged or unsafe file .*Foreign"),
     }
     for name, (checkpoint, message) in cases.items():

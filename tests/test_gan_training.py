@@ -189,6 +189,21 @@ def test_the_groups_of_the_minibatch_deviation_are_the_same_in_two_processes():
     assert_close(torch.stack(halves, dim=1).flatten(0, 1), whole)
 
 
+def test_dusty_ii_draws_its_second_mask_once_for_an_image():
+    experiment = tiny("dusty-v1", **{"adversarial.image_mask": True, "training.steps": 2})
+    latents = draw(experiment, Flat(), [0, 1, 2], 0, [0, 1, 2]).latents  # type: ignore[arg-type]
+    assert latents.uniform.shape == (3, 2, 32, 64)
+    image = latents.uniform[:, 1].flatten(1)
+    assert (image == image[:, :1]).all() and len(image[:, 0].unique()) == 3
+    other = draw(tiny("dusty-v1"), Flat(), [0], 0, [0]).latents  # type: ignore[arg-type]
+    assert torch.equal(latents.uniform[:1, :1], other.uniform), "pixels have the noise of DUSty-I"
+    state = started(experiment)
+    head = "generator.generator.synthesis_network.4.heads.raydrop_logit.1.module.bias"
+    before = state.network.get_parameter(head).detach().clone()
+    list(train(experiment, state, Flat(), Options(workers=0)))  # type: ignore[arg-type]
+    assert (state.network.get_parameter(head) != before).all(), "both masks have gradients"
+
+
 @pytest.mark.parametrize("word", WORDS)
 def test_training_brings_the_samples_to_the_data(word):
     steps = 12 if word == "dusty-v2" else 16

@@ -8,7 +8,7 @@ from oracle import assert_close, largest
 from procedural_weights import upsampling_weights
 from torch import Tensor
 
-from lidarsynth.networks.iln import ILN, LIIF, angle_queries, from_official, neighbours, pixel_centres
+from lidarsynth.networks.iln import ILN, LIIF, SHIFTS, angle_queries, from_official, neighbours, pixel_centres
 
 DEPTHS = {"iln_0d_full": 0, "iln_1d_full": 1}
 FIXTURES = [*DEPTHS, "iln_liif_full"]
@@ -126,6 +126,65 @@ def test_angles_of_the_image_itself_are_its_pixel_centres():
     elevation, azimuth = torch.linspace(-0.3, 0.3, 16), torch.linspace(-torch.pi, torch.pi, 65)[:-1]
     found = angle_queries(elevation, azimuth, (16, 64), -0.3, 0.3)
     torch.testing.assert_close(found.T.view(2, 16, 64), pixel_centres(16, 64), atol=1e-6, rtol=0)
+
+
+def answered(network: LIIF, features: Tensor, query: Tensor) -> Tensor:
+    """LIIF's range at a query (2,) from features (C,H,W), pixel by pixel, as the facts have it (upsampling.md 2.5)."""
+    size, said, areas = features.shape[1:], [], []
+    for sign in SHIFTS if network.ensemble else [None]:
+        rows, place = [], []
+        for axis in (0, 1):
+            moved = float(query[axis]) + (sign[axis] / size[axis] + 1e-6 if sign else 0)
+            index = int((min(max(moved, -1 + 1e-6), 1 - 1e-6) + 1) / 2 * size[axis])
+            rows.append(index)
+            place.append((float(query[axis]) - (-1 + (2 * index + 1) / size[axis])) * size[axis])
+        if network.unfold:
+            padded = torch.zeros(len(features), size[0] + 2, size[1] + 2)
+            padded[:, 1:-1, 1:-1] = features
+            near = torch.stack([p[rows[0] + i, rows[1] + j] for p in padded for i in range(3) for j in range(3)])
+        else:
+            near = features[:, rows[0], rows[1]]
+        said.append(network.imnet(torch.cat([near, torch.tensor(place)])))
+        areas.append(abs(place[0] * place[1]) + 1e-9)
+    return sum(value * area for value, area in zip(said, reversed(areas), strict=True)) / sum(areas)
+
+
+@pytest.mark.parametrize("unfold", [False, True])
+@pytest.mark.parametrize("ensemble", [False, True])
+@torch.no_grad()
+def test_liif_of_other_arguments_is_what_the_facts_say(unfold, ensemble):
+    torch.manual_seed(0)
+    network, low = LIIF(4, 8, 1, unfold, ensemble).eval(), torch.rand(1, 1, 5, 7) * 2 - 1
+    for parameter in network.parameters():
+        parameter.mul_(3)  # else all answers are nearly the last bias
+    queries = torch.cat([torch.rand(60, 2) * 2 - 1, torch.tensor([[-1.0, -1.0], [1.0, 1.0], [-1.0, 0.9]])])
+    features = network.encoder(low)[0]
+    expected = torch.cat([answered(network, features, query) for query in queries])
+    torch.testing.assert_close(network(low, queries[None])[0], expected, atol=1e-5, rtol=1e-5)
+    assert expected.std() > 0.01
+    assert network.encode(low).shape == (1, 36 if unfold else 4, 5, 7)
+    apart = LIIF(4, 8, 1, unfold, not ensemble)
+    apart.load_state_dict(network.state_dict())
+    assert (apart(low, queries[None])[0] - expected).abs().max() > 1e-3
+
+
+def test_unfolded_liif_is_told_576_features_and_2_places():
+    with torch.device("meta"):
+        network = LIIF(unfold=True)
+    assert network.get_parameter("imnet.layers.0.weight").shape == (256, 576 + 2)
+
+
+@torch.no_grad()
+def test_official_liif_of_other_arguments_loads():
+    torch.manual_seed(0)
+    for args in ({"feat_unfold": True}, {"local_ensemble": False}, {"feat_unfold": True, "local_ensemble": False}):
+        theirs = LIIF(unfold="feat_unfold" in args, ensemble="local_ensemble" not in args).eval()
+        checkpoint = {"model": {"name": "liif_lidar", "args": args, "state_dict": theirs.state_dict()}}
+        asked = torch.rand(1, 1, 4, 8), torch.rand(1, 50, 2) * 2 - 1
+        assert torch.equal(from_official(checkpoint, "liif_lidar")(*asked), theirs(*asked))
+    checkpoint["model"]["args"] = {"local_ensemble": False}
+    with pytest.raises(ValueError, match=r"imnet.layers.0.weight \(256, 66\), found \(256, 578\)"):
+        from_official(checkpoint, "liif_lidar")
 
 
 @torch.no_grad()

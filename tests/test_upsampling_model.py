@@ -19,10 +19,10 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.iln import ILN, LIIF, angle_queries
-from lidarsynth.networks.lidar_sr import LidarSR, mc_dropout, remove_uncertain
+from lidarsynth.networks.lidar_sr import Dropout, LidarSR, mc_dropout, remove_uncertain
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import InterpolationModel, interpolated
-from lidarsynth.systems.table import SYSTEMS, assemble, build_network
+from lidarsynth.systems.table import SYSTEMS, assemble, build_network, transfer
 from lidarsynth.systems.upsampling.model import UpsamplingModel, places, queries_at, scaled
 from lidarsynth.verbs.completion import complete_scan, upsample_scan
 from lidarsynth.verbs.description import describe
@@ -319,6 +319,7 @@ def test_info_tells_the_published_counts():
     for word, count in counts.items():
         text = describe(word)
         assert f" {count}\n" in text and "16 to 64 rows (beams:4:0)" in text and "diffusion" not in text
+    assert "16 to 64 rows (beams:4:3)" in describe("lidar-sr-keras"), "of each four the lowest, as its program"
     assert "monte" not in describe("iln") and "mean of 50 passes under dropout" in describe("lidar-sr")
     for word, how in (("nearest", "nearest known row"), ("bilinear", "linear between"), ("bicubic", "a = -0.75")):
         text = describe(word)
@@ -412,13 +413,73 @@ def test_arguments_of_official_files_are_heard(tmp_path):
     for name, network, args, said in (
         ("iln", ILN(1), {"d": 2}, "tensors of d = 2 layers, as model.args says, found 1"),
         ("iln", ILN(1), {"depth": 1}, r"expected model.args of d, h, found \{'depth': 1\}"),
-        ("liif_lidar", LIIF(), {"local_ensemble": False}, "expected a LIIF of .* found .*'local_ensemble': False"),
+        (
+            "liif_lidar",
+            LIIF(),
+            {"cell_decode": True},
+            "expected a LIIF without cell_decode, .*, found .*True",
+        ),
     ):
         checkpoint = official(name, network.state_dict())
         checkpoint["model"]["args"] = args
         torch.save(checkpoint, tmp_path / "other.pth")
         with pytest.raises(ValueError, match=said):
             lidarsynth.load(tmp_path / "other.pth")
+
+
+def test_arguments_of_official_liif_are_heard_and_kept(tmp_path):
+    torch.manual_seed(0)
+    theirs = LIIF(unfold=True, ensemble=False).eval()
+    checkpoint = official("liif_lidar", theirs.state_dict())
+    checkpoint["model"]["args"] = {"feat_unfold": True, "local_ensemble": False, "cell_decode": False}
+    torch.save(checkpoint, tmp_path / "liif.pth")
+    model, asked = lidarsynth.load(tmp_path / "liif.pth"), (torch.rand(1, 1, 4, 8), torch.rand(1, 512, 2) * 2 - 1)
+    assert torch.equal(model.network(*asked), theirs(*asked))
+    save(tmp_path / "own", model.experiment, model.network)
+    again = lidarsynth.load(tmp_path / "own")
+    assert torch.equal(again.network(*asked), theirs(*asked))
+    assert "64 channels, of 3x3 pixels, of one neighbour" in describe(str(tmp_path / "own"))
+    known = np.zeros((64, 64), bool)
+    known[::4] = True
+    assert again.complete(sphere(again.sensor), known).mask.any()
+    plain = with_fields(again.experiment, {"upsampling.ensemble": True})
+    with pytest.raises(ValueError, match=r"expected weights of liif, .* True \(network, .*, ensemble\), found liif"):
+        transfer(build_network(plain), plain, again.network, again.experiment, "own")
+
+
+def test_arguments_of_official_lidar_sr_are_heard(fixture_tensors, tmp_path):
+    """The rate decides how far passes under dropout differ, and so which pixels stay."""
+    stored = fixture_tensors("lsr_4h1w_small")
+    weights = {k.removeprefix("state_dict."): v for k, v in stored.items() if k.startswith("state_dict.")}
+
+    def loaded(args: object) -> UpsamplingModel:
+        checkpoint = official("lsr", weights)
+        checkpoint["model"]["args"] = args
+        torch.save(checkpoint, tmp_path / "lsr.pth")
+        return lidarsynth.load(tmp_path / "lsr.pth")
+
+    for args, rate in (({}, 0.25), (None, 0.25), ({"dropout_rate": 0.1}, 0.1), ({"dropout_rate": 0}, 0.0)):
+        model = loaded(args)
+        rates = {module.rate for module in model.network.modules() if isinstance(module, Dropout)}
+        assert rates == {rate} and (model.network.dropout, model.experiment.model.dropout) == (rate, rate)
+    model = loaded({"scale_h": 4, "scale_w": 1, "width": 6, "dropout_rate": 0.1})
+    save(tmp_path / "own", model.experiment, model.network)
+    again = lidarsynth.load(tmp_path / "own")
+    ours, theirs = (mc_dropout(m.network, stored["input"], torch.Generator().manual_seed(1), 8) for m in (model, again))
+    assert torch.equal(ours[1], theirs[1]) and "dropout 0.1" in describe(str(tmp_path / "lsr.pth"))
+    assert loaded({"scale_w": 2}).experiment.upsampling.factor == (4, 2), "tensors say nothing of columns"
+    for args, said in (
+        ({"scale_h": 8}, "expected tensors of scale_h = 8, as model.args says, found those of 4"),
+        ({"width": 64}, "expected tensors of width = 64, as model.args says, found those of 6"),
+        ({"scale_w": 3}, r"scale must be two powers of 2, .* got \(4, 3\)"),
+        ({"dropout_rate": 1.5}, "expected dropout_rate of model.args from 0 to below 1, found 1.5"),
+        ({"dropout_rate": "much"}, "expected a number as dropout_rate of model.args, found 'much'"),
+        ({"scale_w": math.inf}, "expected a number as scale_w of model.args, found inf"),
+        ([0.1], r"expected model.args by name, found \[0.1\]"),
+    ):
+        with pytest.raises(ValueError, match=said) as caught:
+            loaded(args)
+        assert "\n" not in str(caught.value)
 
 
 def test_other_files_are_named_as_what_they_are(tmp_path):

@@ -124,6 +124,16 @@ def test_a_sample_depends_on_seed_step_and_position_only(kind, draw):
         assert not torch.equal(draw(other[0], Walls(), [0], other[1], [0]).low, whole.low[:1])
 
 
+def test_keras_program_knows_the_lowest_beam_and_every_fourth_from_there():
+    """Row 0 of its images is the lowest beam, and rows 0, 4, 8, ... are its low image: of 64 beams 63, 59, ..., 3."""
+    small = {"data.height": 16, "data.width": 64, "model.base_channels": 4}
+    experiment = with_fields(preset("lidar-sr-keras"), small)
+    low, high = draw_pairs(experiment, Walls(), [3], 0, [0])  # noise is drawn before rows are taken
+    torch.testing.assert_close(low, high[:, :, ::4], rtol=0, atol=0)
+    beams = SENSOR.elevations[experiment.upsampling.first :: experiment.upsampling.factor[0]]
+    assert beams == SENSOR.elevations[::-1][::4][::-1] and beams[-1] == min(SENSOR.elevations)
+
+
 def test_columns_are_thinned_too():
     experiment = tiny("lidar-sr", **{"upsampling.factor": (4, 2)})
     low, high = draw_pairs(experiment, Walls(), [3], 0, [0])
@@ -155,6 +165,10 @@ def test_rates_are_those_of_the_papers():
     keras = preset("lidar-sr-keras").training
     for step in (0, 1, 1000, 99_999):
         assert learning_rate(keras, step) == pytest.approx(1e-4 / (1 + 1e-5 * step))
+    for steps in (1000, 400_000):  # a decay per iteration, however many there are
+        other = with_fields(preset("lidar-sr-keras"), {"training.steps": steps}).training
+        assert all(learning_rate(other, step) == learning_rate(keras, step) for step in range(0, 1000, 37))
+        assert learning_rate(other, steps - 1) == pytest.approx(1e-4 / (1 + 1e-5 * (steps - 1)))
     iln = Training(steps=1000, learning_rate=1e-4, warmup=0, decay="halving")  # a step for each epoch of the paper
     expected = [1e-4 * 0.5 ** sum(epoch >= m for m in (200, 400, 600, 800)) for epoch in range(1000)]
     assert [learning_rate(iln, epoch) for epoch in range(1000)] == pytest.approx(expected)
@@ -239,5 +253,5 @@ def test_a_run_in_a_folder_learns_from_a_cache_and_starts_another(tmp_path):
         with pytest.raises(ValueError, match=r"expected .*\(16, 1, 3, 3\)|expected .*\(1, 16, 3, 3\)"):
             transfer(build_network(wide), wide, network, kept, word)
     ours, theirs = tiny("lidar-sr"), tiny("iln")
-    with pytest.raises(ValueError, match=r"expected weights of lidar-sr, \(4, 1\), False .*, found iln"):
+    with pytest.raises(ValueError, match=r"expected weights of lidar-sr, \(4, 1\), False, .*, found iln"):
         transfer(build_network(ours), ours, build_network(theirs), theirs, "iln")

@@ -137,7 +137,13 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    later: dict[str, Any] = {"perfect": False, "inside": False, "overlap": True, "kerbs": 1, "rough": 1} | dict.fromkeys(MORE, 0)
+    later: dict[str, Any] = {
+        "perfect": False,
+        "inside": False,
+        "overlap": True,
+        "kerbs": 1,
+        "rough": 1,
+    } | dict.fromkeys(MORE, 0)
     for of in (options, options["density"], options["optics"]):
         for name in later.keys() & of.keys():
             if of[name] == later[name]:

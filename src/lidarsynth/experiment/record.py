@@ -119,6 +119,8 @@ class Upsampling:
         0.03, -1
     )  # LiDAR-SR drops pixels with a standard deviation above this share of their mean
     depth: int = within(1, 0, 64)  # layers of ILN's transformer
+    unfold: bool = False  # LIIF is told the features of 3x3 pixels
+    ensemble: bool = True  # LIIF asks four neighbours, not one
     queries: int = within(16_384, 1)  # pixels of a scan that a step of ILN or LIIF learns from
 
     def __post_init__(self):
@@ -135,6 +137,7 @@ class Adversarial:
     discriminator_channels: int | None = within(None, 1, 8192)  # at its finest map; None = model.base_channels
     temperature: float = within(1.0, 1e-6)  # of the Gumbel-sigmoid that drops rays
     iros21: bool = False  # layers of the first release of vanilla GAN and DUSty v1: tanh, mirrored blur
+    image_mask: bool = False  # dusty-v1 drops by a second mask, of one draw for all of an image: DUSty-II
     empty_below: float = within(0.0, 0, 1)  # code in [0, 1] up to which a pixel is empty
     r1_weight: float = within(1.0, 0)
     r1_every: int = within(16, 1)  # steps

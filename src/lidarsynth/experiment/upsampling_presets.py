@@ -27,10 +27,11 @@ def lidar_sr() -> Experiment:
 
 def lidar_sr_keras() -> Experiment:
     """LiDAR-SR's own Keras program: noise on ranges, no return and what is nearer than 2 m as 0, a rate that falls with
-    1 / (1 + 1e-5 step)."""
+    1 / (1 + 1e-5 step). Its images begin with the lowest beam, and of these rows 0, 4, 8, ... are known: the last of
+    each four from the top."""
     start = lidar_sr()
     training = replace(start.training, steps=100_000, batch_size=32, decay="inverse")
-    upsampling = Upsampling(noise=0.03, keras=True, min_range=2.0)
+    upsampling = Upsampling(first=3, noise=0.03, keras=True, min_range=2.0)
     return replace(start, name="lidar-sr-keras", training=training, upsampling=upsampling)
 
 

@@ -159,24 +159,37 @@ class LIIF(nn.Module):
     """LIIF (Chen et al. 2021) as ILN's repository compares with it, `liif_lidar`; the interface of ILN.
 
     A perceptron says a range from each of the four neighbours, and these are weighted by the opposite areas. The result
-    is not bounded. 3x3 unfolding of features and cell decoding, both off in the published configuration, are left out.
+    is not bounded. Cell decoding, off in the published configuration, is left out.
     """
 
-    def __init__(self, channels: int = 64, hidden: int = 256, blocks: int = 16):
+    def __init__(
+        self,
+        channels: int = 64,
+        hidden: int = 256,
+        blocks: int = 16,
+        unfold: bool = False,  # whether the perceptron is told the features of 3x3 pixels, zeros beyond the borders
+        ensemble: bool = True,  # of the four neighbours; without, the pixel that a query is in says the range alone
+    ):
         super().__init__()
+        self.unfold, self.ensemble = unfold, ensemble
         self.encoder = Encoder(channels, blocks)
-        self.imnet = Perceptron((channels + 2, hidden, hidden, hidden, hidden, 1))
+        told = channels * (9 if unfold else 1) + 2
+        self.imnet = Perceptron((told, hidden, hidden, hidden, hidden, 1))
 
     def forward(self, low: Tensor, queries: Tensor) -> Tensor:
         return self.decode(low, self.encode(low), queries)
 
     def encode(self, low: Tensor) -> Tensor:
-        """Features (B,C,H,W) of ranges (B,1,H,W), float32 under autocast too: places among them need it."""
-        return self.encoder(low).float()
+        """Features (B,C,H,W) of ranges (B,1,H,W), float32 under autocast too: places among them need it.
+
+        Unfolded they are (B,9C,H,W): of each channel the nine pixels, row by row.
+        """
+        features = self.encoder(low).float()
+        return F.unfold(features, 3, padding=1).unflatten(-1, features.shape[2:]) if self.unfold else features
 
     def decode(self, low: Tensor, features: Tensor, queries: Tensor) -> Tensor:
         """Ranges (B,Q) at queries (B,Q,2), from ranges (B,1,H,W) and their features."""
-        near, places, _ = neighbours(features, low, queries)
+        near, places, _ = neighbours(features, low, queries, self.ensemble)
         said = self.imnet(torch.cat([near, places], dim=-1)).squeeze(-1)
         areas = (places[..., 0] * places[..., 1]).abs() + 1e-9
         return (said * areas.flip(-1) / areas.sum(-1, keepdim=True)).sum(-1)
@@ -196,10 +209,11 @@ class Perceptron(nn.Module):
         return self.layers(x)
 
 
-def neighbours(features: Tensor, low: Tensor, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def neighbours(features: Tensor, low: Tensor, queries: Tensor, ensemble: bool = True) -> tuple[Tensor, Tensor, Tensor]:
     """Features (B,Q,4,C), relative places (B,Q,4,2) in half pixels and ranges (B,Q,4) of the pixels around queries.
 
-    features (B,C,H,W), low (B,1,H,W), queries (B,Q,2); the neighbours are in the order of SHIFTS.
+    features (B,C,H,W), low (B,1,H,W), queries (B,Q,2); the neighbours are in the order of SHIFTS. Without `ensemble`
+    there is one for each query, not four: the pixel that it is in.
     On a pixel's centre only the 1e-6 decides which they are: this keeps the published order of float32 operations.
     Raises ValueError if the shapes do not fit.
     """
@@ -210,9 +224,9 @@ def neighbours(features: Tensor, low: Tensor, queries: Tensor) -> tuple[Tensor, 
     centres = pixel_centres(height, width, low.device).expand(batch, -1, -1, -1)
     image = torch.cat([features, centres.to(features.dtype), low.to(features.dtype)], dim=1)
     found = []
-    for vertical, horizontal in SHIFTS:
-        shift = queries.new_tensor([vertical / height + 1e-6, horizontal / width + 1e-6])
-        grid = (queries + shift).clamp(-1 + 1e-6, 1 - 1e-6).flip(-1)[:, None]
+    shifts = [(v / height + 1e-6, h / width + 1e-6) for v, h in SHIFTS] if ensemble else [(0.0, 0.0)]
+    for shift in shifts:
+        grid = (queries + queries.new_tensor(shift)).clamp(-1 + 1e-6, 1 - 1e-6).flip(-1)[:, None]
         found.append(F.grid_sample(image, grid.to(image.dtype), mode="nearest", align_corners=False)[:, :, 0])
     near, centre, ranges = torch.stack(found, dim=2).permute(0, 3, 2, 1).split([features.shape[1], 2, 1], dim=-1)
     return near, (queries[:, :, None] - centre) * queries.new_tensor([height, width]), ranges.squeeze(-1)
@@ -248,17 +262,17 @@ def from_official(checkpoint: object, model: str = "iln") -> ILN | LIIF:
     """The network, in evaluation mode, of a checkpoint of ILN's repository; model "iln" or "liif_lidar".
 
     Its arguments are those of the checkpoint, `d` layers of `h` heads; where it tells none, as published. The number of
-    layers is also read from the tensors. Raises ValueError if something does not fit, and for a LIIF with arguments
-    other than the published ones.
+    layers is also read from the tensors. Raises ValueError if something does not fit, or a LIIF decodes cells.
     """
     if model not in ("iln", "liif_lidar"):
         raise ValueError(f'model must be "iln" or "liif_lidar", got {model!r}')
     weights = iln_tensors(checkpoint, model)
     assert isinstance(checkpoint, dict)
     if model == "liif_lidar":
-        if (found := iln_arguments(checkpoint, LIIF_ARGUMENTS)) != LIIF_ARGUMENTS:
-            raise ValueError(f"expected a LIIF of {LIIF_ARGUMENTS}, found {found}")
-        network: ILN | LIIF = LIIF()
+        found = iln_arguments(checkpoint, LIIF_ARGUMENTS)
+        if found["cell_decode"]:
+            raise ValueError(f"expected a LIIF without cell_decode, as published, found {found}")
+        network: ILN | LIIF = LIIF(unfold=bool(found["feat_unfold"]), ensemble=bool(found["local_ensemble"]))
     else:
         depth = sum(key.startswith("attention.transformer") and key.endswith(".to_qkv.weight") for key in weights)
         found = iln_arguments(checkpoint, {"d": depth, "h": 8})

@@ -13,6 +13,8 @@ from torch.nn import functional as F
 
 from lidarsynth.networks.tensors import iln_tensors, load_weights
 
+DROPOUT = 0.25  # as published, in both programs
+
 
 class TransposedConv(nn.ConvTranspose2d):
     """3x3 transposed convolution: (B,in,H,W) -> (B,out,sh*H,sw*W) for strides of 1 or 2.
@@ -141,7 +143,7 @@ class LidarSR(nn.Module):
         self,
         scale: tuple[int, int] = (4, 1),  # of rows and columns, powers of 2; the second at most the first
         width: int = 64,
-        dropout: float = 0.25,
+        dropout: float = DROPOUT,
         keras: bool = False,  # arithmetic of the original: end crop, eps 1e-3, dropout of single values
     ):
         super().__init__()
@@ -231,21 +233,44 @@ def remove_uncertain(mean: Tensor, std: Tensor, threshold: float = 0.03) -> Tens
     return torch.where(std > threshold * mean, 0, mean)
 
 
+def official_arguments(checkpoint: object) -> dict[str, float]:
+    """What `model.args` of a checkpoint of ILN's repository says of scale_h, scale_w, width and dropout_rate.
+
+    Other arguments, and none at all, say nothing. Raises ValueError for what is no number, or no rate.
+    """
+    model = checkpoint.get("model") if isinstance(checkpoint, dict) else None
+    args = (model.get("args") if isinstance(model, dict) else None) or {}
+    if not isinstance(args, dict):
+        raise ValueError(f"expected model.args by name, found {args!r:.80}")
+    found = {key: args[key] for key in ("scale_h", "scale_w", "width", "dropout_rate") if key in args}
+    for key, value in found.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ValueError(f"expected a number as {key} of model.args, found {value!r:.80}")
+    if not 0 <= found.get("dropout_rate", 0) < 1:
+        raise ValueError(f"expected dropout_rate of model.args from 0 to below 1, found {found['dropout_rate']}")
+    return found
+
+
 def from_official(checkpoint: object, scale: tuple[int, int] = (4, 1)) -> LidarSR:
     """The network, in evaluation mode, of a checkpoint of ILN's repository (`lsr_4h_1w_*.pth`: scale (4, 1)).
 
-    The width is read from the tensors; the factor of columns cannot be. Raises ValueError if something does not fit.
+    The width is read from the tensors; the factor of columns cannot be. Dropout is that of the checkpoint's arguments
+    or, where it tells none, as published. Raises ValueError if something does not fit, arguments and tensors included.
     """
-    weights = iln_tensors(checkpoint, "lsr")
+    weights, told = iln_tensors(checkpoint, "lsr"), official_arguments(checkpoint)
     last = weights.get("outc.conv.1.weight")
     if last is None or last.ndim != 4:
         raise ValueError(f"expected LiDAR-SR's outc.conv.1.weight, found {list(weights)[:4]}")
-    network = LidarSR(scale, width=last.shape[1])
+    found = {"scale_h": scale[0], "scale_w": scale[1], "width": last.shape[1]}
+    for key, value in found.items():
+        if told.get(key, value) != value:
+            raise ValueError(f"expected tensors of {key} = {told[key]}, as model.args says, found those of {value}")
+    network = LidarSR(scale, last.shape[1], told.get("dropout_rate", DROPOUT))
     load_weights(network, weights)
     return network.eval()
 
 
-def from_keras(weights: Sequence[Tensor], scale: int = 4, dropout: float = 0.25) -> LidarSR:
+def from_keras(weights: Sequence[Tensor], scale: int = 4, dropout: float = DROPOUT) -> LidarSR:
     """The network, in evaluation mode, of the original program's weights in the order of Keras' `get_weights()`.
 
     That is by layer as created: kernel [kh,kw,in,out] (transposed: [kh,kw,out,in]), bias; or gamma, beta, moving mean

@@ -92,15 +92,17 @@ def learning_rate(training: Training, step: int) -> float:
         raise ValueError(f"training.decay: expected one of {', '.join(DECAYS)}, found {training.decay!r}")
     if step < training.warmup:
         return training.learning_rate * step / max(1, training.warmup)
-    progress = (step - training.warmup) / max(1, training.steps - training.warmup)
-    return training.learning_rate * DECAYS[training.decay](min(1.0, progress))
+    done = step - training.warmup
+    progress = done / max(1, training.steps - training.warmup)
+    return training.learning_rate * DECAYS[training.decay](min(1.0, progress), done)
 
 
-DECAYS: dict[str, Callable[[float], float]] = {  # factor of the rate after a share of the steps behind the warm-up
-    "cosine": lambda progress: 0.5 * (1 + math.cos(math.pi * progress)),  # R2DM's schedule
-    "constant": lambda progress: 1.0,
-    "inverse": lambda progress: 1 / (1 + progress),  # Keras' decay of 1e-5 per step, over 100,000 steps (LiDAR-SR)
-    "halving": lambda progress: 0.5 ** min(4, int(5 * progress)),  # after each fifth of the steps (ILN)
+# Factor of the rate behind the warm-up: after a share of the steps there, and after that many steps.
+DECAYS: dict[str, Callable[[float, int], float]] = {
+    "cosine": lambda progress, done: 0.5 * (1 + math.cos(math.pi * progress)),  # R2DM's schedule
+    "constant": lambda progress, done: 1.0,
+    "inverse": lambda progress, done: 1 / (1 + done / 100_000),  # Keras' decay of 1e-5, of any length (LiDAR-SR)
+    "halving": lambda progress, done: 0.5 ** min(4, int(5 * progress)),  # after each fifth of the steps (ILN)
 }
 
 

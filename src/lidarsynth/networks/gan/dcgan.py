@@ -4,7 +4,7 @@ Both as re-trained by the DUSty v2 authors at 64x512 (WACV 2023), which is what 
 those of the official checkpoints. Range only: images are inverse depth.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
@@ -18,13 +18,13 @@ _LEVELS = 4  # the image is 2^4 times as large as the coarsest map
 
 
 class _Heads(nn.Module):
-    """One transposed convolution per output map: (B,C,H,W) -> {name: (B,1,2H,2W)}."""
+    """One transposed convolution per output map: (B,C,H,W) -> {name: (B,maps,2H,2W)}, `maps` by name."""
 
-    def __init__(self, channels: int, names: Sequence[str], bounded: bool):
+    def __init__(self, channels: int, maps: Mapping[str, int], bounded: bool):
         super().__init__()
         self.bounded = bounded
         self.heads = nn.ModuleDict(
-            {name: nn.Sequential(Pad(1, "reflect"), _double(channels, 1, True)) for name in names}
+            {name: nn.Sequential(Pad(1, "reflect"), _double(channels, count, True)) for name, count in maps.items()}
         )
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
@@ -50,7 +50,7 @@ class Generator(nn.Module):
     """Latents (B,Z) ~ N(0,I) -> inverse depth images (B,1,H,W); Vanilla GAN, or DUSty v1 with `raydrop`.
 
     In training mode a forward pass updates `w_avg`, the running mean of latents that truncation leans on.
-    Raises ValueError for a resolution that is not a multiple of 16.
+    Raises ValueError for a resolution that is not a multiple of 16, and for `image_mask` alone.
     """
 
     w_avg: Tensor
@@ -64,21 +64,27 @@ class Generator(nn.Module):
         raydrop: bool = False,
         bounded: bool = False,  # tanh on the image: the IROS 2021 release
         temperature: float = 1.0,  # of the ray-drop
+        image_mask: bool = False,  # a second mask, of whole images: DUSty-II of the IROS 2021 release
     ):
         super().__init__()
+        if image_mask and not raydrop:
+            raise ValueError("image_mask must be off without raydrop, got True")
         kernel = _coarsest(resolution)
         widths = [min(base_channels << i, max_channels) for i in reversed(range(_LEVELS))]
         first = EqualLR(nn.ConvTranspose2d(latent_channels, widths[0], kernel, bias=False))
         blocks = [nn.Sequential(nn.Identity(), first, FusedLeakyReLU(widths[0]))]
         for before, after in pairwise(widths):
             blocks.append(nn.Sequential(Pad(1, "reflect"), _double(before, after, False), FusedLeakyReLU(after)))
-        heads = ("image", "raydrop_logit") if raydrop else ("image",)
+        heads = {"image": 1, **({"raydrop_logit": 2 if image_mask else 1} if raydrop else {})}
         self.synthesis_network = nn.Sequential(*blocks, _Heads(widths[-1], heads, bounded))
         self.measurement_model = RayDrop(temperature=temperature) if raydrop else None
         self.register_buffer("w_avg", torch.zeros(1, latent_channels))
 
     def forward(self, z: Tensor, uniform: Tensor | None = None, psi: float = 1.0) -> GeneratedImages:
-        """`uniform` in [0,1), broadcast to (B,1,H,W), decides which rays drop; `psi` < 1 truncates (eval mode only)."""
+        """`uniform` in [0,1), broadcast to (B,1,H,W), decides which rays drop; `psi` < 1 truncates (eval mode only).
+
+        In training with `image_mask` it is (B,2,H,W): of each pixel, and, all over the second map, of each image.
+        """
         return self.synthesize(styles(z, self.w_avg, psi, self.training), uniform)
 
     def synthesize(self, w: Tensor, uniform: Tensor | None = None) -> GeneratedImages:

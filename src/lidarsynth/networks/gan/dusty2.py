@@ -26,7 +26,8 @@ from lidarsynth.networks.gan.layers import (
 from lidarsynth.networks.gan.modulated import SynthesisBlock
 from lidarsynth.networks.gan.raydrop import GeneratedImages, RayDrop, measured
 
-_LEVELS = 4  # the image is 2^4 times as large as the coarsest map
+_LEVELS = 4  # the image is 2^4 times as large as the generator's coarsest map
+_COARSEST = 4  # pixels along the shorter side of the discriminator's coarsest map
 _OUTPUT_SCALE = 0.25
 _ACTIVATIONS = {"image": torch.tanh, "raydrop_logit": lambda x: x}
 
@@ -154,21 +155,31 @@ class ResidualBlock(nn.Module):
         return (h + self.skip(self.resample(x))) / math.sqrt(2)
 
 
+def _halvings(resolution: tuple[int, int]) -> int:
+    """How many blocks the discriminator has: log2(min(H,W)/4), rounded down, 4 for 64 rows."""
+    return (min(resolution) // _COARSEST).bit_length() - 1
+
+
 class Discriminator(nn.Module):
-    """Images (B,1,H,W) -> logits (B,1), large = real. B must be below 4 or a multiple of 4 (statistics of groups)."""
+    """Images (B,1,H,W) -> logits (B,1), large = real. B must be below 4 or a multiple of 4 (statistics of groups).
+
+    It halves an image until its shorter side is 4 pixels (up to 7, of sizes that are no power of 2); then come layers
+    as wide as after 4 halvings, however many there were, as the published program has it written down.
+    """
 
     def __init__(self, resolution: tuple[int, int] = (64, 512), base_channels: int = 32, max_channels: int = 512):
         super().__init__()
         _check_multiple(resolution)
-        widths = [min(base_channels << i, max_channels) for i in range(_LEVELS + 1)]
+        count = _halvings(resolution)
+        widths = [min(base_channels << i, max_channels) for i in range(count + 1)]
         first = nn.Sequential(EqualLR(nn.Conv2d(2, widths[0], 1, bias=False)))
         blocks = [ResidualBlock(before, after) for before, after in pairwise(widths)]
         self.layers = nn.Sequential(BlurVH(), first, FusedLeakyReLU(widths[0]), *blocks)
-        top = widths[-1]
-        pixels = (resolution[0] >> _LEVELS) * (resolution[1] >> _LEVELS)
+        top = min(base_channels << _LEVELS, max_channels)
+        pixels = math.prod(math.ceil(size / 2**count) for size in resolution)
         self.epilogue = nn.Sequential(
             MinibatchStdDev(),
-            _conv3x3(top + 1, top),
+            _conv3x3(widths[-1] + 1, top),
             FusedLeakyReLU(top),
             nn.Flatten(),
             EqualLR(nn.Linear(top * pixels, top, bias=False)),

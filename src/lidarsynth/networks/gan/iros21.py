@@ -1,6 +1,7 @@
-"""The first release of the vanilla GAN and DUSty-I (IROS 2021): its parameter names and noise, in terms of ours.
+"""The first release of the vanilla GAN, DUSty-I and DUSty-II (IROS 2021): its names and noise, in terms of ours.
 
-Build `gan.Generator(..., bounded=True)` and `gan.Discriminator(..., vertical="reflect")`.
+Build `gan.Generator(..., bounded=True)`, of DUSty-II with `image_mask`; and
+`gan.Discriminator(..., vertical="reflect")`.
 """
 
 import re
@@ -15,7 +16,7 @@ _HEADS = {"depth": "image", "confidence": "raydrop_logit"}
 def generator_weights(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """State dict of the release's G or G_ema -> that of `gan.Generator`; the release has no mean style, it is 0.
 
-    Raises ValueError for DUSty-II, which drops whole images too, and for keys that are not of the release.
+    Raises ValueError for keys that are not of the release.
     """
     weights: dict[str, Tensor] = {}
     for key, value in state.items():
@@ -23,15 +24,25 @@ def generator_weights(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             weights["measurement_model.raydrop_const"] = value
         else:
             weights[f"synthesis_network.{_layer(key.removeprefix('backbone.'))}"] = value
-    bias = weights.get("synthesis_network.4.heads.raydrop_logit.1.module.bias")
-    if bias is not None and len(bias) != 1:
-        raise ValueError(f"expected one ray-drop logit per pixel (DUSty-I), found {len(bias)} (DUSty-II)")
     first = weights.get("synthesis_network.0.1.module.weight")
     if first is None:
         raise ValueError(
             f"expected the weights of the IROS 2021 generator, found {len(state)} keys without its first layer"
         )
     return {**weights, "w_avg": first.new_zeros(1, len(first))}
+
+
+def masks(state: Mapping[str, Tensor]) -> int:
+    """How many masks a generator of `generator_weights` has: none, of pixels (DUSty-I), of images too (DUSty-II).
+
+    Raises ValueError for more.
+    """
+    bias = state.get("synthesis_network.4.heads.raydrop_logit.1.module.bias")
+    if bias is None:
+        return 0
+    if tuple(bias.shape) not in ((1,), (2,)):
+        raise ValueError(f"expected 1 ray-drop logit per pixel (DUSty-I) or 2 (DUSty-II), found {tuple(bias.shape)}")
+    return len(bias)
 
 
 def _layer(key: str) -> str:

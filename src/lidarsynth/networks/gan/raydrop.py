@@ -13,8 +13,8 @@ class GeneratedImages:
     image: Tensor  # with ray-drop, where the network has it
     image_orig: Tensor  # before ray-drop
     w: Tensor  # styles (B,D), after truncation
-    raydrop_logit: Tensor | None = None  # sigmoid of it = probability that the pixel is kept
-    raydrop_mask: Tensor | None = None  # 1 = kept, 0 = dropped; its gradient is that of the relaxed sample
+    raydrop_logit: Tensor | None = None  # sigmoid of it = probability that the pixel is kept; (B,2,H,W) of DUSty-II
+    raydrop_mask: Tensor | None = None  # 1 = kept, 0 = dropped, by both maps of DUSty-II; the relaxed sample's gradient
 
 
 def relaxed_bernoulli(logit: Tensor, uniform: Tensor, temperature: float = 1.0) -> Tensor:
@@ -32,7 +32,12 @@ def relaxed_bernoulli(logit: Tensor, uniform: Tensor, temperature: float = 1.0) 
 
 
 class RayDrop(nn.Module):
-    """Sets dropped pixels to `raydrop_const`: image and logit (B,1,H,W), uniform noise -> (image, mask)."""
+    """Sets dropped pixels to `raydrop_const`: image and logit (B,1,H,W), uniform noise -> (image, mask).
+
+    DUSty-II has two logits (B,2,H,W) and as many masks, and keeps what both keep. Of the second mask, the image's, the
+    noise of training is one value for each image, `uniform[:, 1]`, and there is none in evaluation mode, where it keeps
+    what is likelier kept than not. Raises ValueError if training lacks it.
+    """
 
     raydrop_const: Tensor
 
@@ -42,8 +47,22 @@ class RayDrop(nn.Module):
         self.register_buffer("raydrop_const", torch.tensor(const))
 
     def forward(self, image: Tensor, logit: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        mask = relaxed_bernoulli(logit, uniform, self.temperature).to(image.dtype)
-        return torch.lerp(image, self.raydrop_const.to(image.dtype), 1 - mask), mask
+        if logit.shape[1] == 2:
+            pixels = relaxed_bernoulli(logit[:, :1], uniform[:, :1], self.temperature)
+            mask = torch.cat([pixels, self._image(logit[:, 1:], uniform)], dim=1).to(image.dtype)
+            kept = mask[:, :1] * mask[:, 1:]
+        else:
+            kept = mask = relaxed_bernoulli(logit, uniform, self.temperature).to(image.dtype)
+        return torch.lerp(image, self.raydrop_const.to(image.dtype), 1 - kept), mask
+
+    def _image(self, logit: Tensor, uniform: Tensor) -> Tensor:
+        """The second mask (B,1,H,W) of DUSty-II."""
+        if not self.training:
+            return (logit > 0).to(logit.dtype)
+        if uniform.shape[1] != 2:
+            raise ValueError(f"uniform must have noise of pixels and of images, (B, 2, H, W), to train DUSty-II, got "
+                             f"{tuple(uniform.shape)}")  # fmt: skip
+        return relaxed_bernoulli(logit, uniform[:, 1:], self.temperature)
 
 
 def measured(model: RayDrop | None, maps: dict[str, Tensor], uniform: Tensor | None, w: Tensor) -> GeneratedImages:

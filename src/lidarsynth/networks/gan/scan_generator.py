@@ -37,7 +37,7 @@ class ScanGenerator(nn.Module):
     def forward(
         self,
         z: Tensor,  # (B,Z)
-        uniform: Tensor,  # noise in [0,1) of the ray-drop, broadcasts to (B,1,H,W); not looked at without ray-drop
+        uniform: Tensor,  # noise in [0,1) of the ray-drop, broadcasts to (B,1,H,W), or, to train DUSty-II, (B,2,H,W)
         psi: float = 1.0,  # truncation, in evaluation mode
         shift: Tensor | None = None,  # (B,) in [0,1) turns: DUSty v2's augmentation of coordinates, in training
     ) -> GeneratedImages:

@@ -21,7 +21,7 @@ class Latents(NamedTuple):
     """What b images are generated from."""
 
     z: Tensor  # (b, Z) unit Gaussian
-    uniform: Tensor  # (b, 1, H, W) in [0, 1), of the ray-drop
+    uniform: Tensor  # (b, 1, H, W) in [0, 1), of the ray-drop; of DUSty-II (b, 2, H, W), the second all alike
     shift: Tensor  # (b,) in [0, 1), share of a turn by which DUSty v2's angles are rotated
 
 
@@ -76,6 +76,8 @@ def _latents(experiment: Experiment, shape: torch.Size, rng: torch.Generator) ->
     """Of one sample, whose image is (1, H, W)."""
     z = torch.randn(group_of(experiment).latent_channels, generator=rng)
     uniform = torch.rand(shape if experiment.model.network != "vanilla-gan" else (1, 1, 1), generator=rng)
+    if group_of(experiment).image_mask:
+        uniform = torch.cat([uniform, torch.rand(1, 1, 1, generator=rng).expand(shape)])
     return Latents(z, uniform, torch.rand((), generator=rng))
 
 

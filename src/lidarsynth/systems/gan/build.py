@@ -14,17 +14,19 @@ from lidarsynth.networks.gan.scan_generator import ScanGenerator
 
 
 def generator(experiment: Experiment, sensor: Sensor) -> ScanGenerator:
-    """The generator of a GAN of inverse depth. Raises ValueError for another codec."""
+    """The generator of a GAN of inverse depth. Raises ValueError for another codec, or an image mask of no dusty-v1."""
     model, group, codec = experiment.model, experiment.adversarial or Adversarial(), experiment.data.codec
     if codec not in ("inverse", "inverse-minmax"):
         raise ValueError(f"data.codec: expected inverse or inverse-minmax for {model.network}, found {codec!r}")
+    if group.image_mask and model.network != "dusty-v1":
+        raise ValueError(f"adversarial.image_mask: expected false for {model.network}, which has none, found true")
     size, widths = (sensor.height, sensor.width), (model.base_channels, group.max_channels)
     if model.network == "dusty-v2":
         latents = (group.latent_channels, group.style_channels)
         angles = torch.from_numpy(sensor.ray_angles())[None]
         return ScanGenerator(dusty2.Generator(size, *latents, *widths, group.temperature), angles)
-    drops = model.network == "dusty-v1"
-    return ScanGenerator(gan.Generator(size, group.latent_channels, *widths, drops, group.iros21, group.temperature))
+    how = (model.network == "dusty-v1", group.iros21, group.temperature, group.image_mask)
+    return ScanGenerator(gan.Generator(size, group.latent_channels, *widths, *how))
 
 
 def build_discriminator(experiment: Experiment) -> nn.Module:

@@ -18,7 +18,8 @@ PAPERS = {
 def _network(experiment: Experiment) -> str:
     group, model = experiment.adversarial or Adversarial(), experiment.model
     made = f"latents of {group.latent_channels}, base {model.base_channels}, at most {group.max_channels} channels"
-    return f"generator of {model.network}, {made}; range only"
+    second = " with a mask of images (DUSty-II)" if group.image_mask else ""
+    return f"generator of {model.network}{second}, {made}; range only"
 
 
 def _discriminator(experiment: Experiment) -> dict[str, str]:

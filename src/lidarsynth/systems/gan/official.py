@@ -1,4 +1,5 @@
-"""Official checkpoints of Vanilla GAN, DUSty v1 and DUSty v2: those of the WACV 2023 release, and of the IROS 2021 one.
+"""Official checkpoints of Vanilla GAN, DUSty v1 and DUSty v2: those of the WACV 2023 release, and of the IROS 2021 one,
+which has DUSty-II too.
 
 A WACV file is dict(cfg, step, angle, G, D, G_ema, A, ...), whose `cfg` is a pickled OmegaConf object. It is read with
 weights_only=True all the same: STAND_INS are empty classes that take the place of OmegaConf's, so that no code of that
@@ -19,7 +20,7 @@ from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Adversarial, Card, Data, Experiment
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.sensor import get_sensor
-from lidarsynth.networks.gan.iros21 import generator_weights
+from lidarsynth.networks.gan.iros21 import generator_weights, masks
 from lidarsynth.networks.tensors import Undrawn, load_weights
 from lidarsynth.systems.gan.build import generator
 
@@ -71,7 +72,8 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
     else:
         experiment = _wacv23(state, checkpoint.get("angle"), name)
     title, data = ("IROS 2021", "KITTI Odometry") if first_release else ("WACV 2023", "KITTI raw")
-    history = f"official {experiment.model.network} checkpoint ({title}), step {checkpoint.get('step', 'not told')}"
+    word = "DUSty-II" if (experiment.adversarial or Adversarial()).image_mask else experiment.model.network
+    history = f"official {word} checkpoint ({title}), step {checkpoint.get('step', 'not told')}"
     experiment = replace(experiment, name=name, card=Card(LICENCE, data, (history,)))
     with Undrawn():
         network = generator(experiment, build_sensor(experiment)).eval()
@@ -108,7 +110,8 @@ def _iros21(state: Mapping[str, Tensor]) -> Experiment:
     word = _word(state)
     experiment = preset(word)
     # Without ray-drop an inverse depth that is nearly 0 stands for no return, as in the release's evaluation.
-    group = replace(group, iros21=True, empty_below=0.008 if word == "vanilla-gan" else 0.0)
+    empty = 0.008 if word == "vanilla-gan" else 0.0
+    group = replace(group, iros21=True, empty_below=empty, image_mask=masks(state) == 2)
     data = Data("hdl-64e-iros21", "unfolding", height, width, "inverse-minmax", reflectance=False)
     return replace(experiment, data=data, model=replace(experiment.model, base_channels=base), adversarial=group)
 

@@ -23,5 +23,6 @@ def iln(experiment: Experiment, sensor: Sensor) -> ILN:
 
 def liif(experiment: Experiment, sensor: Sensor) -> LIIF:
     """LIIF, its perceptron four times as wide as its features."""
-    channels = experiment.model.base_channels
-    return LIIF(channels, 4 * channels, sum(experiment.model.num_residual_blocks))
+    model, group = experiment.model, experiment.upsampling or Upsampling()
+    channels, blocks = model.base_channels, sum(model.num_residual_blocks)
+    return LIIF(channels, 4 * channels, blocks, group.unfold, group.ensemble)

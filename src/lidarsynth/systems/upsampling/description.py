@@ -18,8 +18,10 @@ def _network(experiment: Experiment) -> str:
         program = "Keras" if group.keras else "PyTorch"
         return f"lidar-sr ({program}), base {model.base_channels}, dropout {model.dropout:g}; range only"
     size = f"{sum(model.num_residual_blocks)} blocks of {model.base_channels} channels"
-    layers = f", {group.depth} layers of {model.attn_num_heads} heads" if model.network == "iln" else ""
-    return f"{model.network}, {size}{layers}; range only"
+    if model.network == "iln":
+        return f"iln, {size}, {group.depth} layers of {model.attn_num_heads} heads; range only"
+    told = f"{', of 3x3 pixels' if group.unfold else ''}{'' if group.ensemble else ', of one neighbour'}"
+    return f"{model.network}, {size}{told}; range only"
 
 
 def _shown(experiment: Experiment) -> dict[str, str]:

@@ -18,7 +18,7 @@ from lidarsynth.experiment.record import Card, Data, Experiment, Upsampling
 from lidarsynth.experiment.upsampling_presets import iln, lidar_sr, lidar_sr_keras, liif
 from lidarsynth.networks.iln import ILN
 from lidarsynth.networks.iln import from_official as iln_from_official
-from lidarsynth.networks.lidar_sr import from_keras
+from lidarsynth.networks.lidar_sr import from_keras, official_arguments
 from lidarsynth.networks.lidar_sr import from_official as lidar_sr_from_official
 
 NAMES = {"lsr": lidar_sr, "iln": iln, "liif_lidar": liif}  # of models there -> our preset
@@ -41,7 +41,7 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
     Its images have the beams of the checkpoint's sensor and, evenly between them, as many as LiDAR-SR makes, or as make
     64; a checkpoint that tells no sensor gets the HDL-64E. LiDAR-SR learned from images of 16 and of 64 beams over the
     same view, so that the known beams are 63 / 15 of its rows apart: field `spread`.
-    Raises ValueError for another model or width, or tensors that are missing.
+    Raises ValueError for another model or width, tensors that are missing, or arguments that contradict them.
     """
     model = checkpoint["model"]
     if model["name"] not in NAMES:
@@ -49,14 +49,17 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
     start, sensor = NAMES[model["name"]](), checkpoint.get("lidar_in")
     group = start.upsampling or Upsampling()
     if model["name"] == "lsr":
-        group = replace(group, factor=_scale(model["state_dict"]), spread=True)
+        group = replace(group, factor=_scale(model["state_dict"], official_arguments(checkpoint)), spread=True)
         network: nn.Module = lidar_sr_from_official(checkpoint, group.factor)
+        start = replace(start, model=replace(start.model, dropout=network.dropout))
         width = network.width
     else:
         network = iln_from_official(checkpoint, model["name"])
         if isinstance(network, ILN):
             group = replace(group, depth=len(network.attention.transformer.layers))
             start = replace(start, model=replace(start.model, attn_num_heads=network.heads))
+        else:
+            group = replace(group, unfold=network.unfold, ensemble=network.ensemble)
         width = start.model.base_channels
     if sensor is not None:
         start, group = _with_sensor(start, group, sensor, name)
@@ -65,13 +68,15 @@ def read(checkpoint: Any, name: str, ema: bool = True) -> tuple[Experiment, nn.M
     return replace(experiment, card=replace(CARD, history=history)), network
 
 
-def _scale(weights: object) -> tuple[int, int]:
-    """Factors of rows and columns of the published network that doubles as often as this one."""
+def _scale(weights: object, told: Mapping[str, float]) -> tuple[int, int]:
+    """Factors of rows and columns of the published network that doubles as often as this one; of columns, which leave
+    no trace in the tensors, what its arguments tell."""
     keys = weights if isinstance(weights, Mapping) else {}
     doublings = sum(str(key).startswith("up_scale.") and str(key).endswith(".up_block.0.weight") for key in keys)
     if doublings not in SCALES:
         raise ValueError(f"expected LiDAR-SR with {', '.join(map(str, SCALES))} up-scaling layers, found {doublings}")
-    return SCALES[doublings]
+    rows, columns = SCALES[doublings]
+    return rows, int(told.get("scale_w", columns))
 
 
 def _with_sensor(experiment: Experiment, group: Upsampling, told: object, name: str) -> tuple[Experiment, Upsampling]:
@@ -123,12 +128,10 @@ def read_keras(path: Path) -> tuple[Experiment, nn.Module]:
     except (OSError, KeyError, RuntimeError) as error:
         raise ValueError(f"expected LiDAR-SR's Keras weights, found a damaged file ({error!s:.80})") from None
     start = lidar_sr_keras()
-    group = start.upsampling or Upsampling()
     data = replace(start.data, sensor="os1-64", projection="spherical")
     history = ("official Keras weights of LiDAR-SR",)
     experiment = replace(start, name=path.stem, data=data, card=replace(CARD, history=history))
-    model = replace(start.model, base_channels=network.width)
-    return replace(experiment, model=model, upsampling=replace(group, first=group.factor[0] - 1)), network
+    return replace(experiment, model=replace(start.model, base_channels=network.width)), network
 
 
 def _in_order(group: Any, h5py: Any) -> Iterator[Tensor]:
