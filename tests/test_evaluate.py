@@ -615,6 +615,18 @@ def test_tensors_of_other_beams_than_they_are_taken_for_are_noted(tmp_path: Path
     assert not [text for text in ls.evaluate(tmp_path / "r2dm", STREETS[:2]).warnings if "tensors" in text]
 
 
+@pytest.mark.parametrize(("order", "signs"), [((1, 0, 2), (1, 1, 1)), ((0, 1, 2), (1, -1, 1)), ((0, 1, 2), (-1, 1, 1))])
+def test_tensors_whose_points_are_off_their_columns_are_noted(order, signs):
+    five = [np.concatenate([i.range[None], np.moveaxis(i.points(), -1, 0), i.reflectance[None]]) for i in STREETS[:2]]
+    protocol = replace(STREET_1, networks=(), rows=BEV_1.rows)
+
+    def notes(samples: list[np.ndarray]) -> list[str]:
+        return [text for text in ls.evaluate(samples, REAL[:2], protocol).warnings if "off their columns" in text]
+
+    turned = [np.concatenate([a[:1], a[1:4][list(order)] * np.reshape(signs, (3, 1, 1)), a[4:]]) for a in five]
+    assert notes(five) == [] and len(notes(turned)) == 1
+
+
 def test_what_stands_in_empty_pixels_does_not_count(tmp_path: Path, real: Path):
     def filled(image: RangeImage) -> RangeImage:
         hole = ~image.mask

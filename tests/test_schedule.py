@@ -1,6 +1,7 @@
 """Noise schedules: reference values, inverse pairs, end points, and the forward process."""
 
 import math
+import pickle
 
 import pytest
 import torch
@@ -34,6 +35,12 @@ def test_t_inverts_log_snr(name, dtype, atol):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_a_schedule_can_be_pickled(name):
+    again, t = pickle.loads(pickle.dumps(SCHEDULES[name]())), torch.linspace(0, 1, 9)
+    assert torch.equal(again.log_snr(t), SCHEDULES[name]().log_snr(t))
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
 def test_log_snr_falls_and_is_that_of_alpha_and_sigma(name):
     schedule = SCHEDULES[name]()
     log_snr = schedule.log_snr(torch.linspace(0, 1, 1001, dtype=DOUBLE))

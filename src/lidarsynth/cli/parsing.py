@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -117,6 +118,13 @@ def _refuse(verb: Callable[..., None] | None, event: events.ParseErrorEvent) -> 
     raise ValueError(f"{event.prog}: {_said(verb, event)}") from None
 
 
+def _given(message: str) -> str:
+    """What was given, of the message of a parser of numbers; else the message, which is a type's own."""
+    known = re.match("invalid literal|could not convert|no type matching", message)
+    found = re.search("'([^']*)'", message) if known else None
+    return f" {found[1]!r}" if found else f": {message}"
+
+
 def _said(verb: Callable[..., None] | None, event: events.ParseErrorEvent) -> str:
     """What was expected and what was found."""
     if isinstance(event, events.MissingArgs):
@@ -134,7 +142,7 @@ def _said(verb: Callable[..., None] | None, event: events.ParseErrorEvent) -> st
         return f"expected a value of {event.argument.display_name()}, found {event.offending_value or 'none'}"
     if isinstance(event, events.InstantiationFailure):
         name = "its arguments" if event.argument is None else event.argument.display_name()
-        return f"expected {name} as --help says, found: {event.message}"
+        return f"expected {name} as --help says, found{_given(event.message)}"
     return f"expected what --help says, found {type(event).__name__}"
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lidarsynth.evaluation.image_sets import ImageSet, Item, stem_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
-from lidarsynth.evaluation.sample_tensors import beams_off
+from lidarsynth.evaluation.sample_tensors import beams_off, columns_off
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -76,6 +76,9 @@ def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tup
         if off := max((beams_off(tensor, rays) for tensor in tensors if len(tensor) == 5), default=0.0):
             told.append(f"the points of {side}, which are tensors, lie {off:.1f} degrees off the beams of {rays.name}, "
                         f"for whose rows they are taken: --sensor names theirs ({GRID})")  # fmt: skip
+        if off := max((columns_off(tensor, rays) for tensor in tensors if len(tensor) == 5), default=0.0):
+            told.append(f"the points of {side}, which are tensors, lie {off:.0f} degrees off their columns, which run "
+                        "from behind over the left: is x or y negated, or are they exchanged?")  # fmt: skip
         if named is None and any(len(tensor) == 2 for tensor in tensors):
             told.append(f"{side} are tensors without points, taken for the rays of {rays.name}: --sensor names others "
                         f"({GRID})")  # fmt: skip

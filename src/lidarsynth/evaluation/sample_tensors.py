@@ -17,6 +17,7 @@ NEAREST = GRIDS["hdl-64e-lidargen"].min_range
 # no range is nearer and 0.14 to 0.83 of the variance is between rows; of reflectance 0.08 to 0.17, and 0.08 to 0.29.
 METRE, DARK, NONE, LAYERED = 1 / 6, 0.05, 0.002, 0.3
 ENOUGH = 5  # points of a row whose elevation is told
+ASIDE = 5.0  # degrees between points and their columns: of real scans a fraction of one
 
 
 def from_tensor(tensor: Tensor, sensor: Sensor, whole: bool = False) -> RangeImage:
@@ -116,3 +117,15 @@ def beams_off(tensor: Tensor, sensor: Sensor) -> float:
             off.append(max(seen - beam, lower - seen, 0.0))
     found = float(np.median(off)) if off else 0.0
     return found if found > spacing / 2 else 0.0
+
+
+def columns_off(tensor: Tensor, sensor: Sensor) -> float:
+    """Degrees from the directions of the points of a (5, H, W) tensor to those of their columns, the median; 0 within
+    ASIDE, or where there are few. So much is off where x or y is negated, or one is the other."""
+    x, y = tensor.detach().double().numpy()[1:3]
+    there = np.hypot(x, y) > 0
+    if tensor.shape[2] != sensor.width or tensor.shape[1] != sensor.height or there.sum() < ENOUGH:
+        return 0.0
+    turn = np.arctan2(y, x) - sensor.ray_angles()[1]
+    found = float(np.median(np.degrees(np.abs(np.arctan2(np.sin(turn), np.cos(turn))))[there]))
+    return found if found > ASIDE else 0.0

@@ -42,8 +42,8 @@ MISCOUNTED = 1.25  # as many rings may be counted by the points' order alone
 def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> str | None:
     """What points (N, 3) beyond 3 m, of rings (N,) where these are said, else of those of their order, have that the
     sensor's could not, in words, or None."""
-    if ring is not None and (rings := _count(ring)) > sensor.height:
-        return f"them on {rings} rings, more than its {sensor.height} beams (of two sensors? --rings A-B takes one)"
+    if found := _more_rings(ring, sensor):
+        return found
     if ring is not None and not layers(xyz, ring):
         return EVERYWHERE
     far = _far(xyz)
@@ -79,7 +79,16 @@ def placement(scan: Scan, sensor: Sensor | None) -> tuple[str | None, bool]:
     if frame.lifted and sensor is not None and lies_on(scan, sensor):
         return None, False  # one that was learned in this frame
     alien = None if frame.faults or sensor is None else misfit_of(scan, sensor)
-    return alien or frame.warning(), bool(frame.faults or alien)
+    said = alien or frame.warning()
+    if frame.faults and sensor is not None and (more := _more_rings(scan.ring, sensor)):  # in whichever frame
+        said = f"{said}; expected points of {sensor.name}, found {more}"
+    return said, bool(frame.faults or alien)
+
+
+def _more_rings(ring: np.ndarray | None, sensor: Sensor) -> str | None:
+    if ring is None or (rings := _count(ring)) <= sensor.height:
+        return None
+    return f"them on {rings} rings, more than its {sensor.height} beams (of two sensors? --rings A-B takes one)"
 
 
 def misfit_of(scan: Scan, sensor: Sensor) -> str | None:

@@ -263,12 +263,12 @@ def _viewpoint_warning(job: Job, work: Work) -> str | None:
 
 def _caution(scan: Scan, job: Job, work: Work, alone: bool) -> str | None:
     """What must be said of the points that are to be completed: of each scan, how many were filled in before; of those
-    that are looked at, and of which nothing else is said (`alone`), all that there is to say."""
+    that are looked at, what lacks, and where nothing else is said (`alone`) all that there is to say."""
     if job.verb not in ("complete", "upsample"):
         return None
-    if not (work.check and alone):
+    if not work.check:
         return filled_before(scan)
-    return caution(scan, None if job.sensor is None else get_sensor(job.sensor))
+    return caution(scan, None if job.sensor is None else get_sensor(job.sensor), alone)
 
 
 def _in_one_line(path: Path, warning: str | None, *more: str | None) -> str | None:

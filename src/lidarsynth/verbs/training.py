@@ -244,7 +244,10 @@ def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
     if replace(found, card=experiment.card, training=replace(found.training, steps=steps)) != experiment:
         theirs, ours = (_flat(e.to_dict()) for e in (found, experiment))
         key = next(key for key in ours if _counts(key) and ours[key] != theirs.get(key))
-        raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {theirs.get(key)!r:.60}, "
+        said = theirs.get(
+            key, theirs.get(f"{key}.name", theirs.get(key.removesuffix(".name")))
+        )  # sensors: word or table
+        raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {said!r:.60}, "
                          f"found {ours[key]!r:.60}; another folder begins a new run")  # fmt: skip
     return found
 
