@@ -32,9 +32,7 @@ def streets(
         float | None, arg(metavar="KM/H", help="the car would like to drive; default: as the street has it.")
     ] = None,
     deskewed: Annotated[bool, arg(help="take the car's own motion out of a turn; boxes stand where seen.")] = False,
-    perfect: Annotated[
-        bool, arg(help="as a simulator casts: every beam returns, no noise, no reflectance; `realise` makes it real.")
-    ] = False,
+    perfect: Annotated[bool, arg(help="as a simulator casts: no ray-drop, noise or reflectance; see realise.")] = False,
     inside: Annotated[bool, arg(help="rooms, halls and garages in place of streets, for robots.")] = False,
     traffic: Annotated[float, arg(help="moving vehicles, riders among them: 1 = as usual, 2 = twice, 0 = none.")] = 1.0,
     parking: Annotated[float, arg(help="parked vehicles, likewise; 0 = no car parks or bicycles either.")] = 1.0,
@@ -55,9 +53,7 @@ def streets(
     kerbs: Annotated[float, arg(help="their height: 1 = 12 cm, 0.5 = half of it.")] = 1.0,
     rain: Annotated[float, arg(help="mm/h; 0 = none.")] = 0.0,
     fog: Annotated[float, arg(help="metres that one sees; 0 = none.")] = 0.0,
-    overlap: Annotated[
-        bool, arg(help="as the streets always were; --no-overlap: nobody stands in others or in walls, as in drives.")
-    ] = True,
+    overlap: Annotated[bool, arg(help="--no-overlap: nobody stands in others or in walls, as in drives.")] = True,
     workers: Annotated[int | None, arg(metavar="INT", help="processes, one per processor core if not given.")] = None,
     picture: Annotated[bool, arg(help="write overview.png, four frames with their boxes.")] = True,
 ) -> None:

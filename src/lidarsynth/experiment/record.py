@@ -277,8 +277,8 @@ def _value(value: Any, hint: Any, source: str) -> Any:
     value = tuple(value) if isinstance(value, list) else value
     if not any(_fits(value, choice) for choice in (get_args(hint) if isinstance(hint, UnionType) else (hint,))):
         name = hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint)
-        name = f"a list such as [1, 2] ({name})" if name.startswith("tuple") else name
-        raise ValueError(f"{source}: expected {name}, found {value!r:.60}")
+        form = "; it is written as a list, [1, 2]" if name.startswith("tuple") and isinstance(value, str) else ""
+        raise ValueError(f"{source}: expected {name}, found {value!r:.60}{form}")
     return value
 
 
