@@ -215,11 +215,13 @@ def one_set(
     judged: ImageSet | None, truth: ImageSet | None, hashes: Mapping[str, str], protocol: EvaluationProtocol
 ) -> tuple[str, ...]:
     """A note where both sides are the same images: of one place, or copies, by the hashes of what was read."""
-    one, other = ((images.stamp, images.names) if images else ("", ()) for images in (judged, truth))
-    if (one != other or not one[0]) and hashes["samples"] != hashes["reference"]:
-        return ()
+    one, other = ((images.stamp, images.names, images.source) if images else ("", (), "") for images in (judged, truth))
     same, p = "samples and reference are the same images", protocol
-    if p.reproject or ("samples" in p.gated) != ("real" in p.gated) or (p.clouds and p.clouds.redrawn):
+    apart = p.reproject or ("samples" in p.gated) != ("real" in p.gated) or (p.clouds and p.clouds.redrawn)
+    copies = one[:2] == other[:2] if apart else one == other  # a copy that was damaged since has the same index, too
+    if not (copies and one[0]) and hashes["samples"] != hashes["reference"]:
+        return ()
+    if apart:
         return (
             f"{same}, and {p.title} takes the reference otherwise than samples: distances are what that costs, or 0",
         )
