@@ -66,9 +66,9 @@ def read(
     labels: str | Path | None = None,
     rings: tuple[int, int] | None = None,
 ) -> Scan:
-    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`. Warns of marks that do not fit."""
+    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`. Warns of what `left_out` tells."""
     scan, dropped = read_with_report(path, intensity, labels, rings=rings)
-    for line in marks_left_out(path, scan, dropped):
+    for line in left_out(path, scan, dropped):
         warnings.warn(f"{path}: {line}", stacklevel=2)
     return scan
 
@@ -238,6 +238,23 @@ def _marks_beside(path: Path, count: int) -> Fields:
     marks = {name: path.with_suffix(f".{name}") for name in BESIDE}
     fit = {n: p for n, p in marks.items() if p.is_file() and p.stat().st_size == count * BESIDE[n].itemsize > 0}
     return {name: np.fromfile(place, BESIDE[name]) for name, place in fit.items()}
+
+
+def left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:
+    """What is to be said of a file whose scan was read, a line each: marks beside it, and fields, that are not kept."""
+    return [*marks_left_out(path, scan, dropped), *fields_left_out(path)]
+
+
+def fields_left_out(path: str | Path) -> list[str]:
+    """What is to be said of fields of a file that has been read which are not kept, a line each."""
+    if _suffix(path, READERS, "read") != ".pcd":
+        return []
+    try:
+        with open(path, "rb") as file:
+            told = pcd.fields_left_out(file.read(pcd.MAX_HEADER))
+    except (OSError, FileError):  # reading the scan says so
+        return []
+    return [] if told is None else [told]
 
 
 def marks_left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:

@@ -18,7 +18,16 @@ from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
-from lidarsynth.files.formats import READERS, holds_image, marks_left_out, read_image, read_with_report, sensor_in
+from lidarsynth.files.formats import (
+    READERS,
+    fields_left_out,
+    holds_image,
+    marks_left_out,
+    read_image,
+    read_with_report,
+    sensor_in,
+)
+from lidarsynth.files.several import listed
 from lidarsynth.lidar.columns import columns_note, own_columns
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.ground import LEANING, stance
@@ -98,8 +107,9 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     told = {} if own is None else {"sensor": f"{own.name} (the file holds it)"}
     try:
         read = read_with_report(path, rings=reading.rings)
-        left_out = marks_left_out(path, *read)
-        return scan_lines(*read, reading) | told | ({"beside": "; ".join(left_out)} if left_out else {})
+        beside, left = marks_left_out(path, *read), fields_left_out(path)
+        told |= ({"beside": "; ".join(beside)} if beside else {}) | ({"left out": "; ".join(left)} if left else {})
+        return scan_lines(*read, reading) | told
     except FileError as error:
         if "--intensity none" not in str(error):
             raise
@@ -111,7 +121,7 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
     if reading.transform is not None:
         scan = moved(scan, reading.transform)
     own = [field for field in ("ring", "time", "label") if getattr(scan, field) is not None]
-    fields = " ".join(["x y z reflectance", *own, *(name for name in scan.extra if name not in own)])
+    fields = " ".join(["x y z reflectance", *own, *listed(name for name in scan.extra if name not in own)])
     if not len(scan):
         return {"points": "0", "fields": fields}
     name, reason = recognise(scan)
@@ -169,6 +179,7 @@ def _first_of_topic(bag: Bag, name: str, reading: Reading) -> tuple[Lines, str |
             return {}, None
         scale = _scale(first)
         lines = scan_lines(*scan_from_fields(first.fields, scale, reading.rings), reading)
+        lines |= {} if first.left_out is None else {"left out": first.left_out}
         return lines | (NO_INTENSITY if scale == "none" else {}), None
     except ValueError as error:
         return {}, str(error).removeprefix(f"{bag.path}: ")
