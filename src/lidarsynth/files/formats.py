@@ -126,6 +126,8 @@ def naming(path: str | Path) -> Iterator[None]:
 
 def holds_image(path: str | Path) -> bool:
     """Whether a file is an `.npz` with the arrays of a range image, by their names; damaged files hold none."""
+    if no_file(path) is not None:
+        return False
     try:
         with zipfile.ZipFile(path) as archive:
             return {f"{name}.npy" for name in arrays.NEEDED} <= set(archive.namelist())
@@ -286,13 +288,24 @@ def _suffix(path: str | Path, known: dict, verb: str) -> str:
     raise FileError(f"{path}: expected a name that ends in {', '.join(known)} to {verb}, found {name[-20:]!r}")
 
 
+def no_file(path: str | Path) -> str | None:
+    """What stands where a file is expected, in words, without opening it: a folder, a device or pipe, which may never
+    end, or a link to nothing. None of a file, and where nothing stands."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return f"a link to {os.readlink(path)}, which is not there" if os.path.islink(path) else None
+    except (OSError, ValueError):
+        return None
+    return None if stat.S_ISREG(mode) else "a folder" if stat.S_ISDIR(mode) else "a device or pipe"
+
+
 def _bytes(path: str | Path) -> bytes:
     """The content of a regular file of at most MAX_BYTES."""
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):
-            what = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+        if (what := no_file(path)) is not None:
             raise FileError(f"{path}: expected a file, found {what}")
+        status = os.stat(path)
         if not 0 < status.st_size <= MAX_BYTES:
             raise FileError(f"{path}: expected 1 to {MAX_BYTES} bytes of one scan, found {status.st_size}")
         return Path(path).read_bytes()

@@ -23,6 +23,7 @@ from lidarsynth.files.formats import (
     fields_left_out,
     holds_image,
     marks_left_out,
+    no_file,
     read_image,
     read_with_report,
     sensor_in,
@@ -43,6 +44,7 @@ from lidarsynth.verbs.viewpoint import viewpoint_note
 
 Lines = dict[str, str]
 NO_INTENSITY = {"reflectance": "none in the file: --intensity none for the other verbs"}
+NAMED = 3  # broken files
 LOOKED_AT = 400  # packets of a capture that are counted
 
 
@@ -62,6 +64,8 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
         raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found another kind of file or word")
     if model or absent:
         return None
+    if not path.is_dir() and (what := no_file(path)) is not None:
+        raise FileError(f"{path}: expected a file, found {what}")
     if path.is_dir():
         if not any(path.iterdir()):
             raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
@@ -227,6 +231,8 @@ def _folder(path: Path, reading: Reading) -> Lines:
     lines = {"kind": "folder of scans", "scans": _counted(None, files)}
     if rest := _counted(path, files):
         lines["passed over"] = rest
+    if broken := [f"{file.relative_to(path)}: {what}" for file in files if (what := no_file(file)) is not None]:
+        lines["broken"] = f"{len(broken)} of them: {', '.join(broken[:NAMED])}" + (", ..." if broken[NAMED:] else "")
     try:
         first = {f"first: {key}": text for key, text in _scan_file(files[0], reading).items()}
     except FileError as error:
