@@ -158,6 +158,19 @@ def test_centimetres_are_no_metres(tmp_path: Path):
         read(tmp_path / "cm.npy")
 
 
+def test_kilometres_are_no_metres(street: Scan, tmp_path: Path):
+    write(tmp_path / "km.pcd", replace(street, xyz=street.xyz / 1000, extra={}))
+    with pytest.raises(
+        FileError, match=r"km\.pcd: expected metres .* almost all points 0\.0\d+ and less away: are they k"
+    ):
+        read(tmp_path / "km.pcd")
+    with pytest.raises(ValueError, match="are they kilometres"):
+        ls.load("nearest").into("vlp-16").complete(street.xyz / 1000)
+    near = replace(street, xyz=street.xyz / 100, extra={})  # of a room of dolls
+    write(tmp_path / "near.pcd", near)
+    assert len(read(tmp_path / "near.pcd")) == len(near)
+
+
 def test_new_points_of_a_message_have_the_ring_of_the_nearest_beam_and_its_scale():
     """Rows 0, 4 and 8 of a denser image are the message's rings 2, 1 and 0."""
     given = {"x": np.float32([9, 9, 9]), "y": np.zeros(3, np.float32), "z": np.float32([1, 0, -1]),

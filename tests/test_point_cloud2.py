@@ -72,10 +72,14 @@ def test_rows_with_padding_and_fields_of_several_numbers():
     rows = message.data.reshape(3, 4 * 16)
     message.data = np.concatenate([np.pad(row, (0, 7), constant_values=9) for row in rows])
     message.height, message.width, message.row_step = 3, 4, 4 * 16 + 7
-    message.fields.append(Field("normal", 4, DATATYPE_OF["f4"], count=3))
+    message.fields += [Field("normal", 4, DATATYPE_OF["f4"], count=3), Field("_", 0, DATATYPE_OF["u1"], count=4)]
     found = decode(message)
-    assert found.keys() == values.keys()
+    assert list(found) == [*values, "normal_0", "normal_1", "normal_2"]
     np.testing.assert_array_equal(found["z"], values["z"])
+    np.testing.assert_array_equal(found["normal_1"], values["z"])
+    message.fields[-1].name = "normal_2"  # which is a field of its own
+    message.fields[-1].count = 0
+    assert list(decode(message))[3:] == ["normal_0", "normal_1", "normal_2_2", "normal_2"]
 
 
 def test_rows_of_an_organised_cloud_become_rings():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from hashlib import blake2b
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from lidarsynth.data.bag_writer import BagWriter
     from lidarsynth.systems.scan_model import ScanModel
     from lidarsynth.verbs.batch import Job, Result, Work
-    from lidarsynth.verbs.inputs import Inputs
+    from lidarsynth.verbs.inputs import Input, Inputs
 
 PICTURES = 10  # scans that get a picture unasked
 
@@ -319,20 +320,45 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     out.parent.mkdir(parents=True, exist_ok=True)
     topic, others = _topics(paths[0], many)
     calls = _calls(job, model, many.workers)
+    taken: deque[Input] = deque()
+    copied = []
     with write_bag(out, others) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
         if many.keep_topics:
             _copy(paths[0], writer, others)
-        stream = (Work(item, None, looked_at(number), number) for number, item in enumerate(inputs.stream()))
+        items = enumerate(_noted(inputs.stream(), taken))
+        stream = (Work(item, None, looked_at(number), number) for number, item in items)
         for result in run(replace(job, picture=False), stream, many.workers, model, on_step):
+            item = taken.popleft()
             if result.cloud is not None:
                 writer.write_cloud(topic, result.cloud)
+            elif many.keep_topics and _copied(item, topic, writer):
+                copied.append(Path(result.name).name)
             results.append(replace(result, cloud=None))
             on_scan()
             tell_of_many(result, False, len(results))
         if results and all(result.error is not None for result in results):
             refuse_all(results)  # before the bag is in its place
+    if copied:
+        warn(f"{out}: {plural(len(copied), 'message')} that failed {was(len(copied))} copied unchanged: "
+             f"{', '.join(copied[:NAMED])}{', ...' if copied[NAMED:] else ''}")  # fmt: skip
     say_summary(results, 0, time.perf_counter() - begun, out)
     return results
+
+
+def _noted(stream: Iterator[Input], taken: deque[Input]) -> Iterator[Input]:
+    """The scans, each put into `taken` until its result is there."""
+    for item in stream:
+        taken.append(item)
+        yield item
+
+
+def _copied(item: Input, topic: str, writer: BagWriter) -> bool:
+    """Whether a message of which nothing was made is in the new bag as it was; packets are copied anyway."""
+    from lidarsynth.data.bag_records import POINTS, Message
+    from lidarsynth.verbs.inputs import MessageInput
+
+    message = item.message if isinstance(item, MessageInput) else None
+    return isinstance(message, Message) and message.topic.kind == POINTS and writer.copy_cloud(topic, message)
 
 
 def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:

@@ -13,7 +13,7 @@ from lidarsynth.data.capture import Datagram
 from lidarsynth.data.velodyne import returns
 from lidarsynth.data.whole_turns import TimedTurn
 from lidarsynth.files.fields import Fields, FileError
-from lidarsynth.files.point_cloud2 import decode
+from lidarsynth.files.point_cloud2 import decode, fields_left_out
 
 if TYPE_CHECKING:
     from mcap.records import Attachment, Metadata
@@ -81,6 +81,7 @@ class Cloud:
     time      nanoseconds, when it was recorded
     fields    as `point_cloud2.decode`
     published, sequence  as of a `Message`; of ROS 1 the number is that of the header
+    left_out  what is to be said of fields that are not kept, or None
     """
 
     stamp: int
@@ -89,6 +90,7 @@ class Cloud:
     fields: Fields
     published: int | None = None
     sequence: int = 0
+    left_out: str | None = None
 
 
 @dataclass(frozen=True)
@@ -253,7 +255,8 @@ def cloud_of(message: Message | TimedTurn) -> Cloud:
         number = points.header.seq if message.topic.encoding == "ros1" else message.sequence
         times = stamp.sec * 10**9 + stamp.nanosec, frame_id, message.time
         fields = decode(points) if kind == POINTS else returns(map(_datagram, points.packets))
-        return Cloud(*times, fields, message.published, number)
+        left_out = fields_left_out(points.fields) if kind == POINTS else None
+        return Cloud(*times, fields, message.published, number, left_out)
     except FileError:
         raise
     except (*BROKEN, *library_errors()) as error:

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lidarsynth.data.bag_errors import BROKEN, library_errors, one_line
-from lidarsynth.data.bag_records import POINTS, Attached, Cloud, Message, Topic, typestore
+from lidarsynth.data.bag_records import POINTS, Attached, Cloud, Message, Topic, cloud_of, typestore
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.point_cloud2 import encode
 from lidarsynth.lidar.whole_file import whole_file
@@ -36,11 +36,27 @@ class BagWriter:
 
     def write_cloud(self, topic: str, cloud: Cloud) -> None:
         """A PointCloud2 with the cloud's stamp, frame and fields, recorded at its time."""
-        if topic not in self.topics:
-            self.topics[topic] = points_topic(topic, self.encoding)
         with _telling(self.path):
             data = message_of(cloud, self.encoding)
-            self.put(Message(self.topics[topic], cloud.time, data, cloud.published, cloud.sequence))
+            self.put(Message(self._topic(topic), cloud.time, data, cloud.published, cloud.sequence))
+
+    def copy_cloud(self, topic: str, message: Message) -> bool:
+        """A PointCloud2 of another bag among those of `topic`: its bytes as they are, in a bag of the other ROS its
+        fields. Whether it could be."""
+        if message.topic.encoding != self.encoding:
+            try:
+                self.write_cloud(topic, cloud_of(message))
+            except FileError:  # a broken one
+                return False
+            return True
+        with _telling(self.path):
+            self.put(message._replace(topic=self._topic(topic)))
+        return True
+
+    def _topic(self, name: str) -> Topic:
+        if name not in self.topics:
+            self.topics[name] = points_topic(name, self.encoding)
+        return self.topics[name]
 
     def copy(self, message: Message) -> None:
         """A message of another bag as it is. Raises FileError where this kind of file cannot hold it."""

@@ -13,6 +13,7 @@ from lidarsynth.files.formats import NAMED_ONLY, READERS
 # Folders of published data sets, and of ours, whose .bin and .pcd hold a value a point, or a radar's points: no scans.
 BESIDE = ("labels", "rings", "point_times", "lidarseg", "panoptic", "predictions")
 RADAR = "radar_"
+LOCK = ".#"  # before the names of links to nothing by which editors lock a file
 
 
 def folder(
@@ -49,10 +50,18 @@ def scan_files(root: str | Path) -> list[Path]:
 
 
 def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
-    """The scan files under a folder as `scan_files`, and files of these further endings; there may be none."""
+    """The scan files under a folder as `scan_files`, and files of these further endings; there may be none.
+
+    Links to nothing, as of data that were not fetched, and pipes, of such names are among them: reading tells of them.
+    """
     endings = (*(suffix for suffix in READERS if suffix not in NAMED_ONLY), *more)
     named = (path for path in root.rglob("*") if path.name.lower().endswith(endings))
-    return sorted(path for path in named if not _beside(path.relative_to(root)) and path.is_file())
+    return sorted(path for path in named if not _beside(path.relative_to(root)) and _is_meant(path))
+
+
+def _is_meant(path: Path) -> bool:
+    """Whether a name is of a file, or of what stands for one."""
+    return path.is_file() or not (path.is_dir() or path.name.startswith(LOCK))
 
 
 def stem(path: Path) -> str:

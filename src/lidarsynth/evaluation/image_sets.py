@@ -21,7 +21,7 @@ from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor, within
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import MAX_BYTES
-from lidarsynth.files.formats import READERS, holds_image, naming, read, read_image
+from lidarsynth.files.formats import READERS, holds_image, naming, no_file, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.depth import OVERSHOOT
 from lidarsynth.lidar.projection import project_thinned, thin
@@ -183,6 +183,8 @@ def _files(path: Path) -> list[Path]:
     if doubled := [stem for stem, count in Counter(stems).items() if count > 1]:
         two = [file.name for file, stem in zip(files, stems, strict=True) if stem == doubled[0]][:2]
         raise ValueError(f"{path}: expected one file per scan, found {' and '.join(two)}")
+    if broken := next(((file, what) for file in files if (what := no_file(file)) is not None), None):
+        raise ValueError(f"{broken[0]}: expected a file, found {broken[1]}")
     return files
 
 

@@ -66,9 +66,9 @@ def read(
     labels: str | Path | None = None,
     rings: tuple[int, int] | None = None,
 ) -> Scan:
-    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`. Warns of marks that do not fit."""
+    """One LiDAR turn from a file of any kind in READERS; see `read_with_report`. Warns of what `left_out` tells."""
     scan, dropped = read_with_report(path, intensity, labels, rings=rings)
-    for line in marks_left_out(path, scan, dropped):
+    for line in left_out(path, scan, dropped):
         warnings.warn(f"{path}: {line}", stacklevel=2)
     return scan
 
@@ -126,6 +126,8 @@ def naming(path: str | Path) -> Iterator[None]:
 
 def holds_image(path: str | Path) -> bool:
     """Whether a file is an `.npz` with the arrays of a range image, by their names; damaged files hold none."""
+    if no_file(path) is not None:
+        return False
     try:
         with zipfile.ZipFile(path) as archive:
             return {f"{name}.npy" for name in arrays.NEEDED} <= set(archive.namelist())
@@ -240,6 +242,23 @@ def _marks_beside(path: Path, count: int) -> Fields:
     return {name: np.fromfile(place, BESIDE[name]) for name, place in fit.items()}
 
 
+def left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:
+    """What is to be said of a file whose scan was read, a line each: marks beside it, and fields, that are not kept."""
+    return [*marks_left_out(path, scan, dropped), *fields_left_out(path)]
+
+
+def fields_left_out(path: str | Path) -> list[str]:
+    """What is to be said of fields of a file that has been read which are not kept, a line each."""
+    if _suffix(path, READERS, "read") != ".pcd":
+        return []
+    try:
+        with open(path, "rb") as file:
+            told = pcd.fields_left_out(file.read(pcd.MAX_HEADER))
+    except (OSError, FileError):  # reading the scan says so
+        return []
+    return [] if told is None else [told]
+
+
 def marks_left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:
     """What is to be said of marks beside a file that do not fit its scan, which lost `dropped` points, a line each."""
     lines, count = [], len(scan) + dropped
@@ -269,13 +288,24 @@ def _suffix(path: str | Path, known: dict, verb: str) -> str:
     raise FileError(f"{path}: expected a name that ends in {', '.join(known)} to {verb}, found {name[-20:]!r}")
 
 
+def no_file(path: str | Path) -> str | None:
+    """What stands where a file is expected, in words, without opening it: a folder, a device or pipe, which may never
+    end, or a link to nothing. None of a file, and where nothing stands."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return f"a link to {os.readlink(path)}, which is not there" if os.path.islink(path) else None
+    except (OSError, ValueError):
+        return None
+    return None if stat.S_ISREG(mode) else "a folder" if stat.S_ISDIR(mode) else "a device or pipe"
+
+
 def _bytes(path: str | Path) -> bytes:
     """The content of a regular file of at most MAX_BYTES."""
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):
-            what = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or pipe"
+        if (what := no_file(path)) is not None:
             raise FileError(f"{path}: expected a file, found {what}")
+        status = os.stat(path)
         if not 0 < status.st_size <= MAX_BYTES:
             raise FileError(f"{path}: expected 1 to {MAX_BYTES} bytes of one scan, found {status.st_size}")
         return Path(path).read_bytes()

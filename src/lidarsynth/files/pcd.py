@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarsynth.files.fields import MAX_BYTES, MAX_POINTS, Fields, FileError, check_names, rings_of_grid, scan_table
 from lidarsynth.files.lzf import decompress
+from lidarsynth.files.several import PADDING, numbered, several_left_out
 from lidarsynth.files.whole_numbers import typed
 from lidarsynth.lidar.scan import Scan
 
@@ -41,20 +42,33 @@ class Header(NamedTuple):
 
 
 def read_pcd(data: bytes) -> Fields:
-    """The scalar fields (COUNT 1) of a PCD file under their own names, each (N,) in the file's type.
+    """The fields of a PCD file under their own names, each (N,) in the file's type; of COUNT > 1 each number under its
+    own (`several.numbered`), but for those that `fields_left_out` tells. Padding is skipped.
 
     Organised clouds are flattened row by row; rows that are beams become the field `ring`. Points stay in the file's
     frame, whatever its VIEWPOINT. Raises FileError when header and data do not fit.
     """
     header = read_header(data)
     columns = DECODERS[header.encoding](data[header.start :], header)
-    named = zip(header.names, header.counts, columns, strict=True)
-    scalars = [(name, column) for name, count, column in named if count == 1 and name != "_"]  # _ is padding
-    check_names([name for name, _ in scalars])
-    fields: Fields = dict(scalars)
+    check_names([n for n, count in zip(header.names, header.counts, strict=True) if count == 1 and n != PADDING])
+    fields: Fields = {}
+    for names, column in zip(_kept(header), columns, strict=True):
+        fields |= zip(names, column.T, strict=True) if names else {}
     if header.rows > 1 and (ring := rings_of_grid(fields, header.shape)) is not None:
         fields["ring"] = ring
     return fields
+
+
+def fields_left_out(data: bytes) -> str | None:
+    """What is said of fields of too many numbers to keep, in one line, or None. Raises FileError as `read_header`."""
+    header = read_header(data)
+    return several_left_out(header.names, header.counts)
+
+
+def _kept(header: Header) -> list[list[str]]:
+    """The names of each field's numbers that are read, none of padding."""
+    found = numbered(header.names, header.counts)
+    return [[] if name == PADDING else names for name, names in zip(header.names, found, strict=True)]
 
 
 def viewpoint(data: bytes) -> np.ndarray | None:
@@ -153,6 +167,7 @@ def _points(entries: dict[str, list[str]]) -> tuple[int, int]:
 
 
 def _ascii(body: bytes, header: Header) -> list[np.ndarray]:
+    """(N, COUNT) of each field, as those below; only fields that are kept get their type."""
     width = sum(header.counts)
     words = body.split(maxsplit=header.points * width)
     if len(words) < header.points * width or len(words) > header.points * width:
@@ -162,9 +177,15 @@ def _ascii(body: bytes, header: Header) -> list[np.ndarray]:
         table = np.array(words, dtype=np.bytes_).astype(np.float64).reshape(header.points, width)
     except ValueError as error:
         raise FileError(f"expected numbers in an ascii PCD, found {_tail(error)}") from None
-    starts = np.cumsum([0, *header.counts[:-1]])
-    return [table[:, at] if t.kind == "f" else typed(table[:, at], words[at::width], t)
-            for at, t in zip(starts, header.types, strict=True)]  # fmt: skip
+    starts = np.cumsum([0, *header.counts[:-1]]).tolist()
+    columns = []
+    for at, count, dtype, kept in zip(starts, header.counts, header.types, _kept(header), strict=True):
+        column = table[:, at : at + count]
+        if kept and dtype.kind != "f":
+            own = [word for first in range(at, len(words), width) for word in words[first : first + count]]
+            column = typed(column.reshape(-1), own, dtype).reshape(column.shape)
+        columns.append(column)
+    return columns
 
 
 def _tail(error: Exception) -> str:
@@ -178,8 +199,8 @@ def _binary(body: bytes, header: Header) -> list[np.ndarray]:
     table = np.frombuffer(body, np.uint8, need).reshape(header.points, header.stride)
     columns, at = [], 0
     for dtype, count in zip(header.types, header.counts, strict=True):
-        column = np.ascontiguousarray(table[:, at : at + dtype.itemsize])
-        columns.append(column.view(dtype).reshape(header.points))
+        column = np.ascontiguousarray(table[:, at : at + dtype.itemsize * count])
+        columns.append(column.reshape(-1).view(dtype).reshape(header.points, count))
         at += dtype.itemsize * count
     return columns
 
@@ -198,7 +219,7 @@ def _compressed(body: bytes, header: Header) -> list[np.ndarray]:
     block = decompress(body[8 : 8 + packed], full)
     columns, at = [], 0
     for dtype, count in zip(header.types, header.counts, strict=True):  # field after field, not point after point
-        columns.append(np.frombuffer(block, dtype, header.points * count, at)[::count])
+        columns.append(np.frombuffer(block, dtype, header.points * count, at).reshape(header.points, count))
         at += dtype.itemsize * header.points * count
     return columns
 

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, check_names, rings_of_grid
+from lidarsynth.files.several import numbered, several_left_out
 
 # PointField.datatype -> numpy (ros2/common_interfaces, sensor_msgs/msg/PointField.msg)
 TYPES: dict[int, str] = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -46,10 +47,11 @@ class Layout:
 
 
 def decode(message: PointCloud2) -> Fields:
-    """The scalar fields under their own names, each (N,) in the machine's byte order, N = height * width.
+    """The fields under their own names, each (N,) in the machine's byte order, N = height * width; of several numbers
+    each under its own (`several.numbered`), but for those that `fields_left_out` tells.
 
-    Padding between fields, points and rows is skipped; fields of several numbers are left out. Rows or columns of an
-    organised cloud that are beams become `ring`. Raises FileError where layout and data do not fit.
+    Padding between fields, points and rows is skipped. Rows or columns of an organised cloud that are beams become
+    `ring`. Raises FileError where layout and data do not fit.
     """
     table = _table(message)
     fields = {name: np.ascontiguousarray(table[name].astype(table[name].dtype.newbyteorder("=")))
@@ -58,6 +60,16 @@ def decode(message: PointCloud2) -> Fields:
     if shape[0] > 1 and (ring := rings_of_grid(fields, shape)) is not None:
         fields["ring"] = ring
     return fields
+
+
+def fields_left_out(fields: Sequence[PointField]) -> str | None:
+    """What is said of fields of too many numbers to keep, in one line, or None."""
+    return several_left_out(*_told(fields))
+
+
+def _told(fields: Sequence[PointField]) -> tuple[list[str], list[int]]:
+    """Names, and how many numbers each has: a count of 0 is taken for 1, as drivers do."""
+    return [field.name for field in fields], [max(int(field.count), 1) for field in fields]
 
 
 def _table(message: PointCloud2) -> np.ndarray:
@@ -83,18 +95,17 @@ def _table(message: PointCloud2) -> np.ndarray:
 
 def _dtype(fields: Sequence[PointField], step: int, order: str) -> np.dtype:
     names, formats, offsets = [], [], []
-    for field in fields:
+    check_names([field.name for field in fields if field.count <= 1])
+    for field, own in zip(fields, numbered(*_told(fields)), strict=True):
         if field.datatype not in TYPES:
             raise FileError(f"expected a datatype of 1-8 for the field {field.name}, found {field.datatype}")
         kind = np.dtype(order + TYPES[field.datatype])
         if field.offset + kind.itemsize * max(int(field.count), 1) > step:
             raise FileError(f"expected the field {field.name} within the {step} bytes of a point, "
                             f"found it at {field.offset}")  # fmt: skip
-        if field.count <= 1:  # a count of 0 is taken for 1, as drivers do
-            names.append(field.name)
-            formats.append(kind)
-            offsets.append(int(field.offset))
-    check_names(names)
+        names += own
+        formats += [kind] * len(own)
+        offsets += [int(field.offset) + kind.itemsize * i for i in range(len(own))]
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
 
 

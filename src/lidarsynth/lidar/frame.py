@@ -15,7 +15,7 @@ from lidarsynth.lidar.cones import onto_z
 from lidarsynth.lidar.crowding import ORIGINS
 from lidarsynth.lidar.ground import GROUND, UPSIDE, is_above, levels, road_axis
 from lidarsynth.lidar.origin import BESIDE, TILTED, Turned, place_of, rings_of, to_undo, turned
-from lidarsynth.lidar.recognition import recognise
+from lidarsynth.lidar.recognition import on_one_ring, recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import INVERTED, SENSORS
 
@@ -70,8 +70,10 @@ def check_frame(scan: Scan) -> Frame:
     """In which frame a scan's points are.
 
     Without a ring field, and in an order that does not tell rings, axes are tested by the ground, and height and tilt
-    by where elevations crowd.
+    by where elevations crowd. One ring tells nothing.
     """
+    if on_one_ring(scan.xyz):
+        return Frame((), (), np.eye(4))
     up, points = _upright(scan)
     rotation, words, xyz = np.array(AXES[up][0], np.float64), AXES[up][1], points.xyz
     place = place_of(scan, points)

@@ -13,7 +13,7 @@ from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.frame import rings_of
 from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane
 from lidarsynth.lidar.motion import straighten
-from lidarsynth.lidar.recognition import EVERYWHERE, layers, recognise, rings_in_order
+from lidarsynth.lidar.recognition import EVERYWHERE, ONE_RING, layers, on_one_ring, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
@@ -191,6 +191,8 @@ def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[s
         else:
             found.append((scan, ring))
     if not found:
+        if without and all(on_one_ring(scan.xyz) for scan in without):
+            raise ValueError(f"expected scans of several beams, found {ONE_RING}")
         known = "" if not without or (name := recognise(without[0])[0]) is None else f": {_named(name)}"
         if without and without[0].ring is not None:
             raise ValueError(f"expected rings that are beams, found {EVERYWHERE}")

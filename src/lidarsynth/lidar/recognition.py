@@ -25,6 +25,9 @@ SOME = 30_000  # of a scan tell what its rings are
 # with a carrier's 10 m/s taken out mostly above 0.22; for 400 random sensors of nobody at most 0.17.
 POINTWISE = 0.25
 LAYERED = 0.02  # of the variance of directions, what rings explain: of a Livox 0.001, of spinning sensors 0.8 and more
+ONE, ROUND, SPREAD = 0.006, 0.9, 0.05  # of unit vectors: how far off a ring's plane, that plane, how wide a ring is
+ONE_RING = "points of one ring, as of a laser that looks along one plane (2-D): nothing tells of beams above and " \
+           "below, so that no image of beams can be learned or completed"  # fmt: skip
 LEARN = "lidarsynth sensor SCANS --out my.toml"
 EVERYWHERE = "rings that each look everywhere, as of a sensor that does not spin (Livox), which no model here knows"
 
@@ -53,7 +56,9 @@ def recognise(
     if name is None and told and among is None and _ground_below(scan.xyz):
         name, other = _by_rings(scan.xyz, ring, INVERTED, whole=True)  # type: ignore[arg-type]
         reason = reason if name is None else other
-    if name is None:
+    if name is None and on_one_ring(scan.xyz):
+        reason = f"expected the beams of {', '.join(known)}, found {ONE_RING}"
+    elif name is None:
         spins = scan.ring is None or layers(scan.xyz, scan.ring)
         beams = ring is not None or rings_by_elevation(scan.xyz) is not None
         way = ": name the sensor with --sensor" + (f", or learn it: {LEARN}" if beams else "")
@@ -146,6 +151,24 @@ def layers(xyz: np.ndarray, ring: np.ndarray) -> bool:
     way = xyz / np.maximum(np.linalg.norm(xyz, axis=1, keepdims=True), 1e-6)
     apart = [count @ (np.bincount(ring, v) / count - v.mean()) ** 2 / len(v) for v in way.T.astype(np.float64)]
     return bool((np.array(apart) >= LAYERED * way.var(axis=0, dtype=np.float64)).any())
+
+
+def on_one_ring(xyz: np.ndarray) -> bool:
+    """Whether points (N, 3) lie in one plane through the sensor, or on one cone about any axis: but for one in fifty
+    within a third of a degree, as those of a laser of one beam do. Two beams of a sensor lie farther apart, and of
+    points that all lie in one direction nothing is said."""
+    depth = np.linalg.norm(xyz, axis=1)
+    way = (xyz[depth > 0] / depth[depth > 0, None]).astype(np.float64)
+    way = way[np.linspace(0, len(way) - 1, min(len(way), POINTS)).astype(int)]
+    if len(way) < RINGS:
+        return False
+    for _ in range(2):  # the second time without those that are off
+        middle = way.mean(axis=0)
+        spread, axes = np.linalg.eigh(np.cov((way - middle).T, bias=True))
+        off = np.abs((way - middle) @ axes[:, 0])
+        wide = np.sqrt(spread.clip(0))
+        way = way[off <= np.quantile(off, 0.98)]
+    return bool(wide[0] < ONE and wide[2] > SPREAD and abs(middle @ axes[:, 0]) < ROUND)
 
 
 def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:

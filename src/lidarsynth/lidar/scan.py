@@ -11,6 +11,7 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 ODD = (np.ma.MaskedArray, np.matrix)  # arrays that do not compute as others do
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
+NEAREST, ALMOST, SOME = 0.1, 0.95, 8  # metres: no sensor's returns are almost all nearer; share of them; so many tell
 _UNKNOWN = np.zeros(0, np.float32)  # stands for a reflectance that is not given
 
 
@@ -133,8 +134,13 @@ def as_scan(points: Scan | np.ndarray) -> Scan:
 
 
 def no_metres(far: np.ndarray) -> str:
-    """Why distances (N,), 0 = no return, are none of one turn: half of them are farther than any sensor's; or ''."""
+    """Why distances (N,), 0 = no return, are none of one turn, or '': half of them are farther than any sensor's, or
+    almost all nearer."""
     returns = far[far > 0]
+    if returns.size >= SOME and (most := float(np.quantile(returns, ALMOST))) < NEAREST:
+        return (
+            f"expected metres from the sensor, found almost all points {most:.2g} and less away: are they kilometres?"
+        )
     if not returns.size or (half := float(np.median(returns))) <= MEDIAN:
         return ""
     return (f"expected metres from the sensor, found half of the points {half:.0f} and more away: are they "

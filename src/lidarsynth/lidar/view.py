@@ -47,10 +47,10 @@ def misfit(xyz: np.ndarray, sensor: Sensor, ring: np.ndarray | None = None) -> s
     if ring is not None and not layers(xyz, ring):
         return EVERYWHERE
     far = _far(xyz)
+    if found := out_of_view(xyz, sensor) or _side_by_side(xyz, sensor):
+        return found
     if len(far) < 100:
         return None
-    if found := out_of_view(xyz, sensor):
-        return found
     turns = rings_in_order(xyz) if ring is None else None
     rings = 0 if turns is None else _count(turns)
     if rings > MISCOUNTED * sensor.height:
@@ -113,6 +113,19 @@ def out_of_view(xyz: np.ndarray, sensor: Sensor) -> str | None:
         return f"{outside:.0%} of them outside its view of {_view(sensor)}"
     below = int((np.array(sensor.elevations) < np.quantile(elevation, LOWEST) - MARGIN).sum())
     return f"none on its {below} lowest beams of {sensor.height}" if below > BELOW * sensor.height else None
+
+
+def _side_by_side(xyz: np.ndarray, sensor: Sensor) -> str | None:
+    """That points (N, 3) are all on a few beams of the sensor that lie side by side, in words, or None. The sky may
+    hide the beams above, and the carrier those below, but not both."""
+    if len(xyz) < 100:
+        return None
+    ends = np.quantile(elevations_of(xyz - _lift(sensor)), [1 - LOWEST, LOWEST])
+    first, last = np.abs(np.array(sensor.elevations) - ends[:, None]).argmin(axis=1).tolist()
+    few = last - first + 1
+    if few > max(BELOW * sensor.height, 1) or few == sensor.height:
+        return None
+    return f"them on {few} of its {sensor.height} beams" + (", which lie side by side" if few > 1 else "")
 
 
 def beyond_beams(xyz: np.ndarray, sensor: Sensor) -> str | None:

@@ -18,7 +18,17 @@ from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import FileError, scan_from_fields
-from lidarsynth.files.formats import READERS, holds_image, marks_left_out, read_image, read_with_report, sensor_in
+from lidarsynth.files.formats import (
+    READERS,
+    fields_left_out,
+    holds_image,
+    marks_left_out,
+    no_file,
+    read_image,
+    read_with_report,
+    sensor_in,
+)
+from lidarsynth.files.several import listed
 from lidarsynth.lidar.columns import columns_note, own_columns
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.ground import LEANING, stance
@@ -34,6 +44,7 @@ from lidarsynth.verbs.viewpoint import viewpoint_note
 
 Lines = dict[str, str]
 NO_INTENSITY = {"reflectance": "none in the file: --intensity none for the other verbs"}
+NAMED = 3  # broken files
 LOOKED_AT = 400  # packets of a capture that are counted
 
 
@@ -53,6 +64,8 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
         raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found another kind of file or word")
     if model or absent:
         return None
+    if not path.is_dir() and (what := no_file(path)) is not None:
+        raise FileError(f"{path}: expected a file, found {what}")
     if path.is_dir():
         if not any(path.iterdir()):
             raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
@@ -98,8 +111,9 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     told = {} if own is None else {"sensor": f"{own.name} (the file holds it)"}
     try:
         read = read_with_report(path, rings=reading.rings)
-        left_out = marks_left_out(path, *read)
-        return scan_lines(*read, reading) | told | ({"beside": "; ".join(left_out)} if left_out else {})
+        beside, left = marks_left_out(path, *read), fields_left_out(path)
+        told |= ({"beside": "; ".join(beside)} if beside else {}) | ({"left out": "; ".join(left)} if left else {})
+        return scan_lines(*read, reading) | told
     except FileError as error:
         if "--intensity none" not in str(error):
             raise
@@ -111,7 +125,7 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
     if reading.transform is not None:
         scan = moved(scan, reading.transform)
     own = [field for field in ("ring", "time", "label") if getattr(scan, field) is not None]
-    fields = " ".join(["x y z reflectance", *own, *(name for name in scan.extra if name not in own)])
+    fields = " ".join(["x y z reflectance", *own, *listed(name for name in scan.extra if name not in own)])
     if not len(scan):
         return {"points": "0", "fields": fields}
     name, reason = recognise(scan)
@@ -169,6 +183,7 @@ def _first_of_topic(bag: Bag, name: str, reading: Reading) -> tuple[Lines, str |
             return {}, None
         scale = _scale(first)
         lines = scan_lines(*scan_from_fields(first.fields, scale, reading.rings), reading)
+        lines |= {} if first.left_out is None else {"left out": first.left_out}
         return lines | (NO_INTENSITY if scale == "none" else {}), None
     except ValueError as error:
         return {}, str(error).removeprefix(f"{bag.path}: ")
@@ -216,6 +231,8 @@ def _folder(path: Path, reading: Reading) -> Lines:
     lines = {"kind": "folder of scans", "scans": _counted(None, files)}
     if rest := _counted(path, files):
         lines["passed over"] = rest
+    if broken := [f"{file.relative_to(path)}: {what}" for file in files if (what := no_file(file)) is not None]:
+        lines["broken"] = f"{len(broken)} of them: {', '.join(broken[:NAMED])}" + (", ..." if broken[NAMED:] else "")
     try:
         first = {f"first: {key}": text for key, text in _scan_file(files[0], reading).items()}
     except FileError as error:

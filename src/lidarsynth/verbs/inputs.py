@@ -23,7 +23,7 @@ from lidarsynth.files.fields import (
     scan_from_fields,
     written_names,
 )
-from lidarsynth.files.formats import marks_left_out, read_with_report, sensor_in
+from lidarsynth.files.formats import left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
@@ -72,9 +72,9 @@ class Loaded:
     given    the columns of the message, or x y z of the file
     dropped  points without a return, or not finite
     scale    what a reflectance of 1 is in the intensities of a message
-    stamp, frame_id, time, published, sequence  of a message, as of a `Cloud`
+    stamp, frame_id, time, published, sequence  of a message, as of a `Cloud`, and so is its `left_out`
     sensor   of a range image, whose points were not moved and are on all of its beams; else None
-    left_out  what is to be said of files beside it that do not fit, or None
+    left_out  what is to be said of files beside it that do not fit, and of fields that are not kept, or None
     """
 
     scan: Scan
@@ -113,8 +113,8 @@ class FileInput:
         words = label_path(self.path) if self.reading.labels else None
         words = words if words is not None and words.is_file() else None
         read = read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings)
-        sensor, left_out = None if self.reading.moves else sensor_in(self.path), marks_left_out(self.path, *read)
-        return replace(_loaded(*read, self.reading), sensor=sensor, left_out="; ".join(left_out) or None)
+        sensor, told = None if self.reading.moves else sensor_in(self.path), left_out(self.path, *read)
+        return replace(_loaded(*read, self.reading), sensor=sensor, left_out="; ".join(told) or None)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class MessageInput:
             loaded = replace(_loaded(scan, dropped, self.reading), given=cloud.fields, scale=scale)
         except ValueError as error:
             raise FileError(f"{self.path}: {self.name}: {error}") from None
-        own = {name: vars(cloud)[name] for name in ("stamp", "frame_id", "time", "published", "sequence")}
+        own = {name: vars(cloud)[name] for name in ("stamp", "frame_id", "time", "published", "sequence", "left_out")}
         return replace(loaded, **own)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.files.fields import FileError
+from lidarsynth.files.formats import no_file
 from lidarsynth.files.pcd import MAX_HEADER, viewpoint
 from lidarsynth.lidar.frame import pose_of
 
@@ -14,7 +15,7 @@ from lidarsynth.lidar.frame import pose_of
 def viewpoint_note(path: Path) -> str | None:
     """Where the sensor stood by a `.pcd` file, and what to do if its points are not in the sensor's frame, in one line;
     None of other files, and where it stood at the origin."""
-    if path.suffix.lower() != ".pcd":
+    if path.suffix.lower() != ".pcd" or no_file(path) is not None:
         return None
     try:
         with path.open("rb") as file:

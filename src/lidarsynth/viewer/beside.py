@@ -8,7 +8,7 @@ from typing import Any
 
 from lidarsynth.data.folder import stem
 from lidarsynth.files.fields import FileError, dropped_points
-from lidarsynth.files.formats import marks_left_out, read_with_report
+from lidarsynth.files.formats import left_out, read_with_report
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.verbs.viewpoint import viewpoint_note
@@ -38,7 +38,7 @@ def read_shown(path: Path, intensity: str = "auto", rings: tuple[int, int] | Non
         notes.append(dropped_points(dropped))
     if (placed := viewpoint_note(path)) is not None:
         notes.append(placed)
-    notes += marks_left_out(path, scan, dropped)
+    notes += left_out(path, scan, dropped)
     try:
         boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])
     except ValueError as error:

@@ -79,6 +79,7 @@ class Stream:
         item = self._thread.submit(self._at, index).result()
         loaded = item.read()
         notes = (dropped_points(loaded.dropped),) if loaded.dropped else ()
+        notes += (loaded.left_out,) if loaded.left_out else ()
         return Shown(loaded.scan, notes=notes, name=item.name)
 
     def _at(self, index: int) -> Input:
