@@ -296,7 +296,7 @@ def test_nobody_of_usual_streets_without_overlap_stands_in_walls_or_in_others():
         told[overlap] = (sum(pairs), sum(walled), sum(map(len, boxes)))
     assert told[True][0] > 0 and told[True][1] > 0 and told[False][:2] == (0, 0)
     assert told[True][2] > told[False][2] > 0.9 * told[True][2]
-    with pytest.raises(ValueError, match="expected kerbs of 0 to 3, found 9"):
+    with pytest.raises(ValueError, match="expected kerbs of at most 3 times 12 cm, found 9"):
         Density(kerbs=9)
 
 

@@ -50,7 +50,7 @@ def _strays(scan: Scan, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
     far = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) > FAR
     first = None
-    if ring is not None and far.any() and not is_even_grid(sensor):
+    if ring is not None and far.any() and sensor.height > 1 and not is_even_grid(sensor):
         usual = 0 if ring.max() + 1 == sensor.height else None
         first = usual if scan.ring is None else first_row(ring, scan.xyz, sensor)
     if ring is None or first is None:

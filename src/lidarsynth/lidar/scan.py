@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import MOST, Sensor, get_sensor
 
 ODD = (np.ma.MaskedArray, np.matrix)  # arrays that do not compute as others do
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
@@ -56,6 +56,8 @@ class Scan:
         for name in ("ring", "label"):
             if own[name] is not None:
                 object.__setattr__(self, name, _whole(name, own[name]))
+        if self.ring is not None and (most := self.ring.max(initial=0)) >= MOST:
+            raise ValueError(f"ring: expected numbers of beams below {MOST}, found {most}")
         if self.time is not None:
             _check_numbers("time", self.time)
 

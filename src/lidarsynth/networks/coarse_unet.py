@@ -13,7 +13,7 @@ from lidarsynth.diffusion.schedule import flow
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.efficient_unet import EfficientUNet
 from lidarsynth.networks.fill_unet import ring
-from lidarsynth.networks.rays import decode_range, encode_range, ground_range, level_sines
+from lidarsynth.networks.rays import decode_range, encode_range, ground_range, level_sines, mounts
 
 ROWS, COLUMNS = 16, 128
 RAY_CHANNELS = 8
@@ -40,7 +40,7 @@ def grid_rays(sensor: Sensor, blocked: np.ndarray, rows: np.ndarray, columns: np
     """
     elevation = np.radians(np.asarray(sensor.elevations))[rows]
     azimuth = sensor.ray_angles()[1, 0, columns].astype(np.float64)
-    mount = (sensor.mount + np.asarray(sensor.offsets or np.zeros(sensor.height))[rows])[:, None]
+    mount = mounts(sensor)[rows][:, None]
     sine = np.clip(level_sines(sensor, elevation, azimuth), -1, 1)
     step = np.degrees(np.abs(np.diff(elevation)))
     up, down = (np.log2(s / 1.6 + 0.1)[:, None] / 2 for s in (np.append(0, step), np.append(step, 0)))

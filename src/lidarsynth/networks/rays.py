@@ -84,8 +84,7 @@ def rays_of(
     own = np.radians(np.asarray(sensor.elevations))
     elevation = np.concatenate([own, own[-1] - PADDING_STEP * np.arange(1, extra + 1)])
     azimuth = sensor.ray_angles()[1, 0, chosen].astype(np.float64)
-    offsets = np.asarray(sensor.offsets or np.zeros(sensor.height))
-    mount = sensor.mount + np.concatenate([offsets, np.zeros(extra)])
+    mount = np.concatenate([mounts(sensor), np.full(extra, sensor.mount)])
     step = np.abs(np.diff(own))
     ends = np.zeros(extra + 1)
     dim = np.asarray(dimness or np.zeros(sensor.height))
@@ -113,3 +112,12 @@ def steps_told(rays: Rays, like: Tensor) -> list[Tensor]:
 def stacked(rays: Sequence[Rays]) -> Rays:
     """Images of equal size as one batch."""
     return Rays(*(torch.cat(parts) for parts in zip(*rays, strict=True)))
+
+
+def mounts(sensor: Sensor) -> np.ndarray:
+    """(H,) metres from the ground to where each beam begins. Raises ValueError for one that begins below it."""
+    found = sensor.mount + np.asarray(sensor.offsets or np.zeros(sensor.height))
+    if found.min() <= 0:
+        raise ValueError(f"sensor {sensor.name}: expected beams that begin above the ground (mount and offsets), found "
+                         f"one at {found.min():.2f} m")  # fmt: skip
+    return found

@@ -135,9 +135,10 @@ class Density:
 
     def __post_init__(self):
         for name, factor in vars(self).items():
-            most = HIGHEST if name == "kerbs" else 100
-            if not 0 <= factor <= most:
-                raise ValueError(f"expected {name} of 0 to {most}, found {factor}")
+            if not 0 <= factor <= 100:
+                raise ValueError(f"expected {name} of 0 to 100, found {factor}")
+        if self.kerbs > HIGHEST:
+            raise ValueError(f"expected kerbs of at most {HIGHEST} times 12 cm, found {self.kerbs}")
 
     def of(self, area: Area) -> Area:
         """The kind of street with these factors."""

@@ -32,7 +32,8 @@ def straight_in_gaps(image: RangeImage, told: np.ndarray) -> RangeImage:
     for _ in range(ROUNDS):
         change = np.clip(change + bends.straighter(change), 1 / MOST, MOST)
     metres = image.range.copy()
-    metres[free] = np.minimum(metres[free] / change, max(image.sensor.max_range, float(image.range.max())))
+    straight = np.minimum(metres[free] / change, max(image.sensor.max_range, float(image.range.max())))
+    metres[free] = np.where(straight > image.sensor.min_range, straight, metres[free])
     return replace(image, range=metres)
 
 

@@ -24,6 +24,7 @@ from lidarsynth.systems.cascade.response import Response
 from lidarsynth.systems.cascade.scores import SEAM, lovasz
 from lidarsynth.training.randomness import sample_rng
 
+NARROWEST = 32  # columns: of so few the network's coarsest map is narrower than what it looks at
 JUDGED, NOBODY = 12_000, -1  # pixels of a batch that the Lovasz-softmax sees; the class of what is not judged
 # Of a thousand returns of varied streets, how many are of each class, from unlabeled to traffic sign.
 THOUSAND = (0, 62, 0.8, 1.7, 5.2, 1.6, 13.6, 0.2, 0.1, 237, 26.7, 102, 0, 252, 29.7, 161, 25.5, 66.8, 9.8, 3.8)
@@ -120,6 +121,9 @@ def named(
     alone   each pixel by itself, instead of with those beside it on its surface
     inside  says of images of the insides of buildings what is there, furniture of class 0
     """
+    if sensor.width <= NARROWEST:
+        raise ValueError(f"sensor {sensor.name}: expected more than {NARROWEST} columns to name classes by, found "
+                         f"{sensor.width}")  # fmt: skip
     off = np.tile(_fair(weights())[:, None], sensor.height)
     for word, logit in (more or {}).items():
         off[CLASS_NUMBER[word]] -= logit

@@ -1,0 +1,69 @@
+"""Sensors and scans that a model cannot do anything with are refused in one line; the rest of the odd ones are done."""
+
+import numpy as np
+import pytest
+
+import lidarsynth as ls
+from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.gaps import straight_in_gaps
+
+BEAMS = tuple(np.linspace(10.0, -20.0, 16).tolist())
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ls.load("default")
+
+
+@pytest.fixture(scope="module")
+def street() -> Scan:
+    return SyntheticStreets(3, 1, get_sensor("os1-64"))[0]
+
+
+def test_a_beam_alone_has_nothing_between(model, street: Scan):
+    sensor = Sensor("alone", (-5.0,), width=64)
+    with pytest.warns(UserWarning, match="most of what is put between is a guess"):
+        done = model.upsample(ls.project(street, sensor).to_scan(), sensor, times=2)
+    assert done.shape == (1, 64)
+
+
+def test_classes_of_too_few_columns_are_refused(model, street: Scan):
+    sensor = Sensor("narrow", BEAMS, width=32)
+    with pytest.raises(
+        ValueError, match=r"^sensor narrow: expected more than 32 columns to name classes by, found 32$"
+    ):
+        model.label(ls.project(street, sensor).to_scan(), sensor)
+    assert model.label(ls.project(street, "vlp-16").to_scan(), Sensor("wider", BEAMS, width=33)).label is not None
+
+
+def test_beams_that_begin_below_the_ground_are_refused(model, street: Scan):
+    sensor = Sensor("deep", BEAMS, width=256, offsets=tuple(np.linspace(3.0, -3.0, 16).tolist()))
+    for ask in (lambda m: m.complete(ls.project(street, sensor)), lambda m: m.generate(1)):
+        with pytest.raises(ValueError, match=r"^sensor deep: expected beams that begin above the ground .*-1\.27 m$"):
+            ask(model.into(sensor))
+
+
+def test_a_ring_number_that_means_none_is_refused(street: Scan):
+    ring = np.zeros(len(street), np.int64)
+    ring[::16] = 2**32 - 1
+    with pytest.raises(ValueError, match=r"^ring: expected numbers of beams below 4096, found 4294967295$"):
+        Scan(street.xyz, street.reflectance, ring=ring)
+
+
+def test_known_pixels_without_a_return_are_refused(model, street: Scan):
+    image = ls.project(street, "os1-64")
+    with pytest.raises(ValueError, match=r"^expected known pixels with returns, found none of the image's \d+$"):
+        model.into("os1-64").complete(image, known=np.zeros(image.shape, bool))
+
+
+def test_nothing_in_a_gap_comes_nearer_than_the_sensor_sees():
+    """A round wall just beyond the least range: put straight in a gap it would be before it."""
+    sensor, metres = Sensor("near", BEAMS, width=256, min_range=1.0), np.full((16, 256), 1.0002, np.float32)
+    told = np.ones(metres.shape, bool)
+    told[:, 100:140] = False
+    image = RangeImage(metres, np.zeros_like(metres), np.ones_like(told), sensor)
+    far = RangeImage(metres + 1, np.zeros_like(metres), np.ones_like(told), sensor)
+    assert straight_in_gaps(image, told).range.min() > 1.0
+    assert straight_in_gaps(far, told).range.min() < 2.0002  # it does come nearer where it may
