@@ -1,5 +1,8 @@
 """Sensors and scans that a model cannot do anything with are refused in one line; the rest of the odd ones are done."""
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +59,29 @@ def test_known_pixels_without_a_return_are_refused(model, street: Scan):
     image = ls.project(street, "os1-64")
     with pytest.raises(ValueError, match=r"^expected known pixels with returns, found none of the image's \d+$"):
         model.into("os1-64").complete(image, known=np.zeros(image.shape, bool))
+
+
+def test_values_of_other_types_are_refused_in_one_line(street: Scan):
+    image = ls.project(street, "os1-64")
+    for ask in (
+        lambda: ls.corrupt(image, "points:0.5", seed=2.5),
+        lambda: ls.corrupt(image, "points:0.5", seed=-1),
+        lambda: ls.evaluate([image], [image], ["bev-1"]),
+        lambda: ls.load("bilinear", device=None),
+        lambda: replace(image, label=np.full(image.shape, np.nan)),
+        lambda: replace(image, completed=3),
+    ):
+        with pytest.raises(ValueError, match=r"^(expected .*, found|label: expected|completed must)") as caught:
+            ask()
+        assert "\n" not in str(caught.value)
+    assert replace(image, label=np.full(image.shape, 2.0)).label.dtype == np.int64
+
+
+def test_a_model_can_be_sent_to_another_process(street: Scan):
+    model = ls.load("kitti-streets")
+    again = pickle.loads(pickle.dumps(model))
+    images = [m.generate(1, steps=2, seed=4)[0].range for m in (model, again)]
+    assert np.array_equal(*images)
 
 
 def test_nothing_in_a_gap_comes_nearer_than_the_sensor_sees():

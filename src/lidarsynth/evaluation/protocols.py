@@ -237,6 +237,6 @@ PROTOCOLS: dict[str, EvaluationProtocol] = {
 
 def get_protocol(name: str) -> EvaluationProtocol:
     """A protocol by its name. Raises ValueError that lists the names."""
-    if name not in PROTOCOLS:
-        raise ValueError(f"expected a protocol of {', '.join(PROTOCOLS)}, found {name!r}")
+    if not isinstance(name, str) or name not in PROTOCOLS:
+        raise ValueError(f"expected a protocol of {', '.join(PROTOCOLS)}, found {name!r:.60}")
     return PROTOCOLS[name]

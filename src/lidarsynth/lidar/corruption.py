@@ -98,6 +98,8 @@ def corrupt(image: RangeImage, recipe: str, seed: int = 0) -> np.ndarray:
     """
     if not isinstance(image, RangeImage):
         raise ValueError(f"expected a range image, such as project gives, found a {type(image).__name__}")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"expected a seed of 0 and above, found {seed!r:.40}")
     rng = np.random.default_rng(seed)
     known = np.ones(image.shape, bool)
     for name, values in check_recipe(recipe):

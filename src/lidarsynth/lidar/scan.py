@@ -254,6 +254,10 @@ class RangeImage:
         for name in ("range", "reflectance", "xyz", "confidence", "surface"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _numbers(name, value))
+        if self.label is not None:
+            object.__setattr__(self, "label", _whole("label", self.label))
+        if not isinstance(self.completed, Scan | None):
+            raise ValueError(f"completed must be a Scan, got a {type(self.completed).__name__}")
         self._check_ranges()
 
     def _check_ranges(self) -> None:

@@ -43,7 +43,7 @@ def check_device(device: str | torch.device) -> None:
     try:
         kind = torch.device(device).type
         torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, ImportError) as error:  # which of them is the device's own choice
+    except (RuntimeError, AssertionError, ImportError, TypeError) as error:  # which of them is the device's own choice
         reason = f"{error}".strip().partition("\n")[0].partition(". ")[0]  # what follows is for those who build torch
         raise ValueError(f"expected a device of torch, such as cpu or cuda, found {str(device)!r}: {reason}") from None
     if kind == "meta":
