@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidarsynth.lidar.sensor import MOST, Sensor, get_sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 ODD = (np.ma.MaskedArray, np.matrix)  # arrays that do not compute as others do
 MEDIAN = 250.0  # metres: no turn has half of its returns beyond it, one in centimetres has
 NEAREST, ALMOST, SOME = 0.1, 0.95, 8  # metres: no sensor's returns are almost all nearer; share of them; so many tell
+RINGS = 1 << 20  # rings are counted by their numbers, which need not follow one another
 _UNKNOWN = np.zeros(0, np.float32)  # stands for a reflectance that is not given
 
 
@@ -56,8 +57,8 @@ class Scan:
         for name in ("ring", "label"):
             if own[name] is not None:
                 object.__setattr__(self, name, _whole(name, own[name]))
-        if self.ring is not None and (most := self.ring.max(initial=0)) >= MOST:
-            raise ValueError(f"ring: expected numbers of beams below {MOST}, found {most}")
+        if self.ring is not None and (most := self.ring.max(initial=0)) >= RINGS:
+            raise ValueError(f"ring: expected numbers of beams below {RINGS}, found {most}")
         if self.time is not None:
             _check_numbers("time", self.time)
 
