@@ -256,7 +256,7 @@ class RangeImage:
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _numbers(name, value))
         if self.label is not None:
-            object.__setattr__(self, "label", _whole("label", self.label))
+            _whole("label", self.label)
         if not isinstance(self.completed, Scan | None):
             raise ValueError(f"completed must be a Scan, got a {type(self.completed).__name__}")
         self._check_ranges()
