@@ -80,7 +80,7 @@ class Diffusion:
     kind: str = "eps"  # eps | x_0 | v | velocity | score
     clip: bool = True  # clamp x_0_hat to [-1, 1]
     loss: str = "l2"  # l1 | l2 | huber
-    gamma: float | None = within(5.0, 0)  # min-SNR; None = unweighted
+    gamma: float | None = within(5.0, 0)  # min-SNR; 1e9 = R2DM's off: 1, snr, snr / (snr + 1); None = no weight
     floor: float = within(0.0, 0)  # least min-SNR weight of a sample
     mean_weight: bool = True  # every sample gets the batch's mean weight, as in R2DM's program
 
