@@ -128,6 +128,15 @@ def test_measured_angles_of_a_checkpoint_become_its_sensor(edited, fixture_tenso
     away = np.degrees(np.abs(sensor.ray_angles() - found))
     assert away[0].max() < 1e-5
     assert away[1].max() < 0.51 * 360 / 2048 * 1.05  # the subsampled column lies half a fine step off the centre
+    model = assemble(experiment, network)
+    (image,) = model.generate(1, steps=2, seed=1)
+    level = image.range * np.cos(found[0])
+    expected = np.stack([level * np.cos(found[1]), level * np.sin(found[1]), image.range * np.sin(found[0])], axis=-1)
+    np.testing.assert_allclose(image.points()[image.mask], expected[image.mask], atol=1e-4)  # R2DM's, by `coords`
+    known = np.arange(image.shape[0])[:, None] % 4 + np.zeros(image.shape) == 0
+    filled = model.complete(replace(image, xyz=None), known, steps=2)
+    assert filled.new.any() and np.abs(filled.points() - sensor.points(filled.range))[filled.new].max() > 1e-3
+    assert np.abs(filled.points() - sensor.points(filled.range))[known & filled.mask].max() < 1e-6
 
 
 def test_the_published_angles_of_kitti_raw_have_a_word(tiny, tmp_path, fixture_tensors):

@@ -58,7 +58,7 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
     measured = known & image.mask
     mask = np.where(known, image.mask, filled.mask)
     reflectance = np.where(known & keep_reflectance, image.reflectance, filled.reflectance)
-    points = None if image.xyz is None else np.where(measured[..., None], image.xyz, np.float32(0))
+    points = _points(image, filled, measured)
     before = np.zeros_like(mask) if image.new is None else measured & image.new
     said = np.float32(1) if image.confidence is None else np.where(before, image.confidence, np.float32(1))
     sure = None if filled.confidence is None else np.where(known, said, filled.confidence)
@@ -72,3 +72,11 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
         confidence=sure,
         new=np.where(known, before, mask),
     )
+
+
+def _points(image: RangeImage, filled: RangeImage, measured: np.ndarray) -> np.ndarray | None:
+    """(H, W, 3) points of measured pixels and of filled ones, where either image has its own; 0 where it has none."""
+    if image.xyz is None and filled.xyz is None:
+        return None
+    own, new = (np.float32(0) if of.xyz is None else of.xyz for of in (image, filled))
+    return np.where(measured[..., None], own, np.broadcast_to(new, (*measured.shape, 3)))

@@ -29,6 +29,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.conditional import ConditionalUNet
 from lidarsynth.networks.device import each_usually
+from lidarsynth.networks.efficient_unet import EfficientUNet
 from lidarsynth.systems.description import Description
 from lidarsynth.systems.diffusion.description import DESCRIPTION
 from lidarsynth.systems.filling import Filling
@@ -37,6 +38,7 @@ from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 METHODS = ("auto", "conditional", "repaint", "posterior")
 REPAINT_STEPS, REPAINT_RESAMPLES = 32, 10  # R2DM, section IV-C
+SAME_RAYS = 1e-4  # of unit vectors: coordinates in float32 are even ones within it
 
 
 @dataclass(frozen=True, repr=False)
@@ -203,8 +205,18 @@ class LidarModel(ScanModel):
 
     def _image(self, x_0: Tensor) -> RangeImage:
         """x_0 (2, H, W) as an image; mixed pixels are mended if `data.mend`, R2DM's stay as published."""
-        image = from_x_0(x_0.clamp(-1, 1), self.sensor, self.experiment.data.codec)
+        image = self._along_own_rays(from_x_0(x_0.clamp(-1, 1), self.sensor, self.experiment.data.codec))
         return without_mixed_pixels(image) if self.conditional and self.experiment.data.mend else image
+
+    def _along_own_rays(self, image: RangeImage) -> RangeImage:
+        """The image, with points along the network's `coords` where these are no even turn's: official R2DM files of
+        unfolded scans have measured azimuths, and their program makes points of them."""
+        if not isinstance(self.network, EfficientUNet):
+            return image
+        own, even = directions(self.network.coords[0].cpu().numpy()), directions(self.sensor.ray_angles())
+        if np.abs(own - even).max() < SAME_RAYS:
+            return image
+        return replace(image, xyz=(own * (image.range * image.mask)[..., None]).astype(np.float32))
 
     @property
     def _device(self) -> torch.device:
@@ -212,6 +224,13 @@ class LidarModel(ScanModel):
 
     def _blank(self, count: int) -> Tensor:
         return torch.zeros(count, 2, self.sensor.height, self.sensor.width, device=self._device)
+
+
+def directions(angles: np.ndarray) -> np.ndarray:
+    """(H, W, 3) unit vectors of elevations and azimuths (2, H, W) in radians."""
+    elevation, azimuth = angles.astype(np.float64)
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def _last(states: Iterator[State], on_step: OnStep, calls: int | None = None) -> Tensor:
