@@ -125,7 +125,7 @@ def test_labelled_sets_have_instances_and_furniture(tmp_path):
     assert people > 3
 
 
-@pytest.mark.parametrize("asked", [{"frames": 5}, {"weather": Weather(rain=3.0)}])
+@pytest.mark.parametrize("asked", [{"frames": 5}, {"weather": Weather(rain=3.0)}, {"overlap": False}])
 def test_buildings_have_no_drives_and_no_weather(asked):
     with pytest.raises(
         ValueError,

@@ -144,6 +144,9 @@ def test_a_run_on_scans_of_a_sensor_with_blocked_rays_goes_on(tmp_path: Path):
     own = r"its own run, with data.sensor.blocked = \[\[15, 10, 30\], .*found \[\[15, 10, 31\]\]"
     with pytest.raises(ValueError, match=own):
         list(run(other, tmp_path / "own", out, options=QUIET))
+    word = with_fields(experiment, {"data.sensor": "vlp-16"})
+    with pytest.raises(ValueError, match=r"its own run, with data.sensor = 'mine', found 'vlp-16'"):
+        list(run(word, tmp_path / "own", out, options=QUIET))
 
 
 def test_a_run_goes_on_with_its_own_images(cache: Path, tmp_path: Path):

@@ -85,6 +85,12 @@ def test_a_batch_of_no_images_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "expected at least one range image" in refused(words, capsys)
 
 
+@pytest.mark.parametrize(("option", "found"), [("--steps=2.5", "'2.5'"), ("--count=many", "'many'")])
+def test_what_is_no_number_is_named_and_not_its_parser(option: str, found: str, capsys: pytest.CaptureFixture[str]):
+    said = refused(["generate", option], capsys)
+    assert said.endswith(f"as --help says, found {found}") and "int()" not in said and "Errors" not in said
+
+
 def test_a_report_replaces_reports_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for k in (0, 1):
         list(write_cache(tmp_path / f"c{k}", lambda i, k=k: noise_image(4 * k + i), 4, SMALL, {"name": f"noise {k}"}))

@@ -137,13 +137,8 @@ class _Task:
 
 def _settings(streets: LabelledStreets, layout: str) -> dict[str, Any]:
     options = asdict(streets.options)
-    later: dict[str, Any] = {
-        "perfect": False,
-        "inside": False,
-        "overlap": True,
-        "kerbs": 1,
-        "rough": 1,
-    } | dict.fromkeys(MORE, 0)
+    later: dict[str, Any] = {"perfect": False, "inside": False, "overlap": True, "kerbs": 1, "rough": 1}
+    later |= dict.fromkeys(MORE, 0)
     for of in (options, options["density"], options["optics"]):
         for name in later.keys() & of.keys():
             if of[name] == later[name]:
@@ -157,7 +152,7 @@ def _edition(options: Options, layout: str) -> int:
     vehicles in car parks, one where label_2 lists what the camera sees alone, and two where everyone is set apart since
     2026-11-28, and stands in no wall and goes through none since 2026-11-29: other sets go on."""
     drives = options.frames > 0 and (options.deskewed or options.density.cyclists > 0)
-    apart = options.frames > 0 or options.density != TODAY
+    apart = options.frames > 0 or options.density != TODAY or not options.overlap
     return EDITION + (drives or options.density.parking == 0) + (layout == "kitti") + 2 * apart
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarsynth.lidar.angles import unit_vectors
 from lidarsynth.lidar.small_file import read_json, read_toml
 
 MOST = 4096  # beams that an image may have
@@ -119,9 +120,7 @@ class Sensor:
     @lru_cache(maxsize=4)  # noqa: B019, a few small ones; every scan of a folder asks for the same
     def directions(self) -> np.ndarray:
         """(H, W, 3) float32 unit vectors along `ray_angles`: (cos e cos a, cos e sin a, sin e). Read only."""
-        elevation, azimuth = self.ray_angles()
-        flat = np.cos(elevation)
-        rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        rays = unit_vectors(self.ray_angles())
         rays.flags.writeable = False
         return rays
 

@@ -66,7 +66,7 @@ class Options:
         if self.perfect and self.weather != CLEAR:
             raise ValueError("expected clear weather of a perfect sensor, found rain or fog")
         of_streets = {"frames of a drive": self.frames, "a density": self.density != TODAY,
-                      "rain or fog": self.weather != CLEAR}  # fmt: skip
+                      "rain or fog": self.weather != CLEAR, "no overlap": not self.overlap}  # fmt: skip
         if self.inside and (found := [word for word, given in of_streets.items() if given]):
             raise ValueError(
                 f"expected places of buildings, where nothing drives or rains, found {' and '.join(found)}"

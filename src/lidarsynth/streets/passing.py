@@ -127,7 +127,7 @@ def _least(
     road: Road, start: float, stop: float, right: float, left: float, side: int, things: np.ndarray, houses: np.ndarray
 ) -> float:
     """m outward by which a strip of a sidewalk meets no house, if it may, and then the fewest things; the least of
-    these."""
+    these. Things and houses are footprints (N, 5), the strip goes from `start` to `stop` m along the road."""
     room = max(road.half + road.walk - max(abs(right), abs(left)), 0.0)
     moves, met = np.arange(0.0, room + STRIP / 2, STRIP), []
     for move in side * moves:

@@ -244,9 +244,8 @@ def _same_experiment(checkpoint: Path, experiment: Experiment) -> Experiment:
     if replace(found, card=experiment.card, training=replace(found.training, steps=steps)) != experiment:
         theirs, ours = (_flat(e.to_dict()) for e in (found, experiment))
         key = next(key for key in ours if _counts(key) and ours[key] != theirs.get(key))
-        said = theirs.get(
-            key, theirs.get(f"{key}.name", theirs.get(key.removesuffix(".name")))
-        )  # sensors: word or table
+        words = (key, f"{key}.name", key.removesuffix(".name"))  # a sensor is a word or a table with a name
+        said = next((theirs[word] for word in words if word in theirs), None)
         raise ValueError(f"{checkpoint.parents[1]}: expected its own run, with {key} = {said!r:.60}, "
                          f"found {ours[key]!r:.60}; another folder begins a new run")  # fmt: skip
     return found

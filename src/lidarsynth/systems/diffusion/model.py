@@ -23,6 +23,7 @@ from lidarsynth.diffusion.samplers import (
     starting_noise,
 )
 from lidarsynth.experiment.record import Experiment, Score
+from lidarsynth.lidar.angles import unit_vectors
 from lidarsynth.lidar.depth import from_x_0, to_x_0
 from lidarsynth.lidar.mixed_pixels import without_mixed_pixels
 from lidarsynth.lidar.scan import RangeImage
@@ -213,10 +214,10 @@ class LidarModel(ScanModel):
         unfolded scans have measured azimuths, and their program makes points of them."""
         if not isinstance(self.network, EfficientUNet):
             return image
-        own, even = directions(self.network.coords[0].cpu().numpy()), directions(self.sensor.ray_angles())
-        if np.abs(own - even).max() < SAME_RAYS:
+        own = unit_vectors(self.network.coords[0].cpu().numpy())
+        if np.abs(own - self.sensor.directions()).max() < SAME_RAYS:
             return image
-        return replace(image, xyz=(own * (image.range * image.mask)[..., None]).astype(np.float32))
+        return replace(image, xyz=own * (image.range * image.mask)[..., None])
 
     @property
     def _device(self) -> torch.device:
@@ -224,13 +225,6 @@ class LidarModel(ScanModel):
 
     def _blank(self, count: int) -> Tensor:
         return torch.zeros(count, 2, self.sensor.height, self.sensor.width, device=self._device)
-
-
-def directions(angles: np.ndarray) -> np.ndarray:
-    """(H, W, 3) unit vectors of elevations and azimuths (2, H, W) in radians."""
-    elevation, azimuth = angles.astype(np.float64)
-    level = np.cos(elevation)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def _last(states: Iterator[State], on_step: OnStep, calls: int | None = None) -> Tensor:
