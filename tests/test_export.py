@@ -63,7 +63,9 @@ def test_the_last_known_place_by_counting_is_the_running_maximum(dim: int, share
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("width", "recipe"), [(64, "beams:4"), (128, "points:0.2"), (48, "sector:90")])
+@pytest.mark.parametrize(
+    ("width", "recipe"), [(64, "beams:4"), (128, "points:0.2"), (48, "sector:90"), (128, "region:3:9:-3:3")]
+)
 def test_the_fill_is_the_models_for_any_number_of_columns(exported: Exported, width: int, recipe: str):
     model = cascade().into(SENSOR.resized(width=width))
     image = SyntheticStreets(3, 1, model.sensor).image(0)

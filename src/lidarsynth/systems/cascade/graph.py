@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from lidarsynth.networks.fill_unet import NOISES, Known
 from lidarsynth.networks.rays import COLUMNS, Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.systems.cascade.beneath import certain
 from lidarsynth.systems.cascade.confidence import confidence
 from lidarsynth.systems.cascade.floating import onto_surfaces
 from lidarsynth.systems.cascade.model import CascadeModel
@@ -48,7 +49,8 @@ class FillGraph(nn.Module):
     def forward(self, range: Tensor, reflectance: Tensor, known: Tensor) -> tuple[Tensor, ...]:
         sensor = self.model.sensor
         returned = (known > 0.5) & (range > 0)  # and no other, though a range may stand where a blocked ray is
-        told = (known > 0.5) | self._buffer("closed")
+        closed = self._buffer("closed").expand_as(range)
+        told = (known > 0.5) | closed
         metres = self._padded(torch.where(returned, range, 0.0), 0)
         light = self._padded(calmed(reflectance, range, returned), 0)
         answered = metres > 0
@@ -56,10 +58,10 @@ class FillGraph(nn.Module):
         rays = self._rays(seen.metres)
         noise = torch.zeros_like(seen.metres).expand(-1, NOISES, -1, -1)
         weights = self.model.experiment.confidence
-        filled = self.fill(seen, rays, noise, doubt=weights is not None)
+        filled = certain(self.fill(seen, rays, noise, doubt=weights is not None), seen, closed)
         metres = decode_range(filled.code)[:, :, : sensor.height, : range.shape[3]]
         answers = filled.logit[:, :, : sensor.height, : range.shape[3]] > 0
-        answers = answers & (metres <= sensor.max_range) & (metres >= sensor.min_range) & ~self._buffer("closed")
+        answers = answers & (metres <= sensor.max_range) & (metres >= sensor.min_range) & ~closed
         shade = AS_STREETS._replace(plain=0.0 if self.model.tuned else USUAL).mixed(filled)
         shade = shade[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
         answers = returned | (answers & ~told)

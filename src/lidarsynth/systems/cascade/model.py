@@ -24,6 +24,7 @@ from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
 from lidarsynth.networks.rays import Rays, decode_range, padded
 from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
 from lidarsynth.systems.any_sensor import AnySensorModel
+from lidarsynth.systems.cascade.beneath import certain
 from lidarsynth.systems.cascade.confidence import confidence, signals
 from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.edges import with_edges
@@ -64,6 +65,7 @@ from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.systems.scan_model import OnStep
 
 FILL_STEPS = 1  # after those of the layout
+Each = list[torch.Generator] | None  # a scan's own
 
 
 @dataclass(frozen=True, repr=False)
@@ -114,9 +116,8 @@ class CascadeModel(AnySensorModel):
         Raises ValueError for a number below 1, and for a model without a judge of layouts.
         """
         if self.network.judge is None:
-            raise ValueError(
-                f"expected a model that chooses among layouts, such as default, found {self.experiment.name}"
-            )
+            raise ValueError("expected a model that chooses among layouts, such as default, found "
+                             f"{self.experiment.name}")  # fmt: skip
         if whole("layouts", layouts) < 1:
             raise ValueError(f"expected at least 1 layout, found {layouts}")
         return replace(self, layouts=layouts)
@@ -285,11 +286,11 @@ class CascadeModel(AnySensorModel):
 
         Raises ValueError for a sensor smaller than the grid.
         """
-        (rows, columns), rng = grid_of(self.sensor), generators(checked_seed(seed), len(images))
+        places, rng, sensor = grid_of(self.sensor), generators(checked_seed(seed), len(images)), self.sensor
         rays_of = partial(self._grid_rays, count=len(images))
         with one_thread():
-            parts = told_of(images, rows, columns), (rows, columns), rays_of, self.sensor, unevenness(self.sensor), rng
-            grid = detailed(self.network, *parts)
+            grid = told_of(images, *places), places, rays_of, sensor, unevenness(sensor), rng
+            grid = detailed(self.network, *grid)
         return textured(*self._whole(*grid, rng), rng)
 
     def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
@@ -308,7 +309,7 @@ class CascadeModel(AnySensorModel):
         reflectance: np.ndarray,
         rows: np.ndarray,
         columns: np.ndarray,
-        rng: list | None,
+        rng: Each,
         kinds: list,
     ) -> list[RangeImage]:
         """Samples of whole images, told metres (B, R, C), 0 for no return, and reflectance of rows and columns."""
@@ -331,46 +332,44 @@ class CascadeModel(AnySensorModel):
         reflectance: np.ndarray,
         told: np.ndarray,
         lit: bool,
-        rng: list[torch.Generator] | None,
-        kinds: list[torch.Generator] | None = None,
+        rng: Each,
+        kinds: Each = None,
     ) -> list[RangeImage]:
         """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples.
 
         kinds  generators that draw classes, and edges as one draws them; None = those of samples
         """
-        return self._answers(known_of(metres, reflectance, told, lit, padded(self.sensor)), rng, kinds=kinds or rng)
+        known = known_of(metres, reflectance, told, lit, padded(self.sensor))
+        return self._answers(known, rng, kinds=kinds or rng, recorded=kinds is None)
 
     def _answers(
-        self, known: Known, rng: list | None, surely: np.ndarray | None = None, kinds: list | None = None
+        self, known: Known, rng: Each, surely: np.ndarray | None = None, kinds: Each = None, recorded: bool = False
     ) -> list[RangeImage]:
         """Images of (B, 1, H', W') padded pixels.
 
-        surely  (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
+        surely    (B, H, W) metres of the surfaces, where only is asked which rays return: drawn, each by its chance
+        recorded  of recorded scans, whose holes are filled where they reach the lowest beam, too
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
-        drawn = rng is not None and surely is None  # what has a range gets the roughness of its class
-        reach = ANYHOW if drawn else SNAP
+        reach = ANYHOW if rng is not None and surely is None else SNAP  # what has a range gets its class's roughness
         classify = kinds is not None and bool(self.experiment.model.classes)
         bend = BEND if kinds is None else BEND / 2
         filled, rays = self._network(known, rng, weights is not None, classify, reach, bend)
+        filled = certain(filled, known, self._blocked if recorded else None)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
-        unlit = (known.told & known.returned & ~known.lit).to(logit.device)  # of a scan without reflectance: gets one
-        logit = torch.where(unlit, torch.inf, logit)
         height, width = self.sensor.height, self.sensor.width
         metres = decode_range(filled.code)[:, 0].cpu().numpy() if surely is None else surely
         sure = None if weights is None else confidence(filled, rays, weights)
         parts = (self.response.mixed(filled), logit, filled.classes, with_doubts(filled.classes, kinds), sure)
         cut = [[None] * len(metres) if part is None else part[..., :height, :width].cpu() for part in parts]
-        return [
-            answered(self.sensor, self._blocked, *of_one)
-            for of_one in zip(metres[:, :height, :width], *cut, strict=True)
-        ]
+        each = zip(metres[:, :height, :width], *cut, strict=True)
+        return [answered(self.sensor, self._blocked, *of_one) for of_one in each]
 
     @torch.inference_mode()
     def _network(
         self,
         known: Known,
-        rng: list | None,
+        rng: Each,
         doubt: bool = False,
         classify: bool = False,
         reach: float = SNAP,
