@@ -20,8 +20,9 @@ from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import training as cascade_training
-from lidarsynth.systems.cascade.examples import crop, mixed, pattern
+from lidarsynth.systems.cascade.examples import crop, mixed
 from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.patterns import pattern
 from lidarsynth.systems.cascade.scores import absolute_errors, energy_score, expected_errors, misnamed
 from lidarsynth.systems.cascade.training import fit_standard
 from lidarsynth.training import monitor

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.lidar.corruption import every_beam, without_columns, without_rectangle
+from lidarsynth.lidar.corruption import every_beam
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_beams import with_between
@@ -23,6 +23,7 @@ from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
 from lidarsynth.systems.cascade.lessons import AS_FAR, FARTHEST, HEIGHT, WIDTH, Lessons, lessons, to_height
 from lidarsynth.systems.cascade.losing import losing
+from lidarsynth.systems.cascade.patterns import every_column, pattern
 from lidarsynth.systems.cascade.surfaces import evened
 from lidarsynth.systems.diffusion.training import generation_count
 from lidarsynth.training.randomness import sample_seed
@@ -32,7 +33,6 @@ TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
 LOSING = 0.7  # of what learns the most likely image lack some of their returns
-JOINED = 0.25  # of sparse patterns have holes besides
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -250,67 +250,6 @@ def _window(sensor: Sensor, rng: np.random.Generator, first: bool = False) -> tu
     else:
         rows = int(rng.integers(sensor.height - HEIGHT + 1)) + np.arange(HEIGHT)
     return sensor.rows(rows.tolist()), rows
-
-
-def every_column(shape: tuple[int, int], turn: int, rng: np.random.Generator) -> np.ndarray:
-    """(H, W) bool, True = known: 128 columns of a turn of `turn`, or 256, as the coarse stage gives them."""
-    step = max(1, round(turn / (128 if rng.random() < 0.85 else 256)))
-    known = np.zeros(shape, bool)
-    known[:, rng.integers(step) :: step] = True
-    return known
-
-
-def pattern(shape: tuple[int, int], turn: int, rng: np.random.Generator, sampled: bool) -> np.ndarray:
-    """(H, W) bool, True = known, of a crop of a turn of `turn` columns.
-
-    16 of the beams (what is `sampled`, most of the time), the coarse stage's grids, every k-th beam, any beams, points,
-    `_holed`; at times two of these at once, since sparse scans have holes, too.
-    """
-    height, kind = shape[0], rng.random()
-    known = np.zeros(shape, bool)
-    if sampled and kind < 0.45:
-        known[grid_rows(height, rng.random())] = True
-    elif kind < (0.6 if sampled else 0.12):
-        known = _gridded(shape, turn, rng)
-    elif kind < 0.72:
-        step = int(rng.choice((2, 2, 3, 4, 4, 4, 6, 8)))
-        known = every_beam(shape, step, int(rng.integers(step)))
-    elif kind < 0.79:
-        known[rng.random(height) < rng.uniform(1 / 8, 1 / 2)] = True
-    elif kind < 0.9:
-        known[:] = rng.random(shape) < 0.02 * 30 ** rng.random()
-    else:
-        known = _holed(shape, rng)
-    if kind < 0.9 and rng.random() < JOINED:
-        around = _holed(shape, rng)
-        inside = sampled and rng.random() < 0.5  # as `repaint` draws it
-        known = known & around | (_gridded(shape, turn, rng) & ~around & inside)
-    if rng.random() < 0.08:
-        known &= rng.random(shape) < rng.uniform(0.3, 1)
-    return known
-
-
-def _gridded(shape: tuple[int, int], turn: int, rng: np.random.Generator) -> np.ndarray:
-    """(H, W) bool, True = known: 16 beams, at times 8, of 128 columns of a turn, at times 256."""
-    height, width = shape
-    count, step = (16 if rng.random() < 0.75 else 8), max(1, round(turn / (128 if rng.random() < 0.8 else 256)))
-    rows, known = ((np.arange(count) + rng.random()) * height / count).astype(int), np.zeros(shape, bool)
-    known[np.ix_(np.unique(rows), np.arange(rng.integers(step), width, step))] = True
-    return known
-
-
-def _holed(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """(H, W) bool, True = known: all but a sector, or up to three regions."""
-    height, width = shape
-    if rng.random() < 0.5:
-        lost, shift = int(rng.integers(8, 3 * width // 4)), int(rng.integers(width))
-        return without_columns(shape, range(shift, shift + lost))
-    known = np.ones(shape, bool)
-    for _ in range(int(rng.integers(1, 4))):
-        tall, wide = int(rng.integers(2, height)), int(rng.integers(4, width // 3))
-        top, left = int(rng.integers(height - tall + 1)), int(rng.integers(width - wide))
-        known &= without_rectangle(shape, range(top, top + tall), range(left, left + wide))
-    return known
 
 
 def grid(image: RangeImage, rng: np.random.Generator, count: int = COLUMNS) -> tuple[Tensor, Tensor, Tensor, Tensor]:
