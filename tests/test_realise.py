@@ -1,5 +1,6 @@
 """The verb `realise`: whose points, fields and labels stay, in files, folders and bags; and what is refused."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -234,3 +235,27 @@ def test_labels_of_generated_scans(place: Path):
     from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW
 
     np.testing.assert_array_equal(CLASS_OF_RAW[raw], scan.label)
+
+
+def test_boxes_of_generated_scans(place: Path):
+    words = ["generate", "-n", "2", "--steps", "1", "--model", "model", "--no-picture"]
+    main([*words, "--labels", "--out", "made"])
+    main([*words, "--boxes", "--out", "boxed"])
+    assert json.loads(Path("boxed/generate.json").read_text())["boxes"] is True
+    for name in ("000000", "000001"):
+        scan, plain = (read(f"{folder}/{name}.ply", intensity="unit") for folder in ("boxed", "made"))
+        np.testing.assert_array_equal(scan.xyz, plain.xyz)  # the same scans
+        assert "instance" not in plain.extra
+        told = json.loads(Path(f"boxed/{name}.json").read_text())
+        numbers = np.arange(1, 1 + len(told["boxes"]))
+        assert told["points"] == len(scan) and [box["instance"] for box in told["boxes"]] == numbers.tolist()
+        counts = [(scan.extra["instance"] == number).sum() for number in numbers]
+        assert [box["points"] for box in told["boxes"]] == counts and all(counts)
+        raw = read_words(f"boxed/{name}.label", len(scan))
+        np.testing.assert_array_equal(raw >> 16, scan.extra["instance"])
+        np.testing.assert_array_equal(raw & 0xFFFF, read_words(f"made/{name}.label", len(plain)))
+    Path("boxed/000001.json").unlink()
+    main([*words, "--boxes", "--out", "boxed"])
+    assert Path("boxed/000001.json").exists()
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, "--boxes", "--out", "made"])  # begun without

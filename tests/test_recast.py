@@ -1,11 +1,15 @@
 """Cars and people of generated scans: found, placed, cast, and what else was drawn of them taken away."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lidarsynth as ls
+from lidarsynth.files.formats import read_image, write_labels
+from lidarsynth.files.labels import read_labels, read_words
+from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
@@ -315,3 +319,66 @@ def test_what_is_cast_has_its_class_and_the_rest_what_is_seen() -> None:
     np.testing.assert_array_equal(named.label[~car], seen.label[~car])
     (bare,) = as_cast([replace(seen, label=None)], [image])
     assert bare.label is None
+
+
+def in_box(box: Box, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 3) of the sensor frame within a box."""
+    away, c, s = points - box.centre, np.cos(box.yaw), np.sin(box.yaw)
+    own = np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0], away[:, 2]], 1)
+    return (np.abs(own) <= np.array(box.size) / 2 + 0.02).all(1)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (5.0, -3.0)])
+def test_what_is_cast_has_a_box_and_its_returns_a_number(tilt: tuple[float, float]) -> None:
+    sensor = replace(SENSOR, tilt=tilt)
+    things = standing("car", 1, 9, 3, 0.4), standing("person", 2, -6, 5, 1.0), standing("van", 0, 3, -12, 1.5)
+    image = recast(blob(scene(sensor, *things), PERSON), np.random.default_rng(4))
+    assert image.instance is not None
+    assert sorted(box.kind for box in image.boxes) == ["car", "person", "van"]
+    assert [box.instance for box in image.boxes] == [1, 2, 3]
+    to_sensor, points = turn(sensor), points_of(image)
+    for box in image.boxes:
+        own = image.instance == box.instance
+        assert box.points == own.sum() > 50
+        assert set(image.label[own]) == {PERSON if box.kind == "person" else CAR}
+        inside = in_box(box, points[own])
+        assert inside.mean() > 0.97 if tilt == (0.0, 0.0) else 0.9  # boxes stand upright in the sensor's frame
+        x, y, yaw = {"car": (9, 3, 0.4), "person": (-6, 5, 0), "van": (3, -12, 1.5)}[box.kind]
+        assert np.linalg.norm((to_sensor @ box.centre)[:2] - (x, y)) < 0.7
+        if box.kind != "person":
+            assert abs((box.yaw - yaw + np.pi / 2) % np.pi - np.pi / 2) < 0.2
+            assert 3.5 < box.size[0] < 7 and 1.7 < box.size[1] < 2.5 and 1.3 < box.size[2] < 3
+        assert box.occlusion < 0.05
+    assert not image.instance[~image.mask].any() and image.instance.max() == 3
+
+
+def test_a_box_tells_how_much_of_it_is_hidden() -> None:
+    image = scene(SENSOR, standing("car", 1, 14, 4.5, 1.5), standing("van", 0, 7, 0, 1.5))
+    boxes = recast(image, np.random.default_rng(1)).boxes
+    near, far = sorted(boxes, key=lambda box: box.centre[0])
+    assert near.occlusion < 0.05 and 0.3 < far.occlusion < 0.95
+
+
+def test_boxes_of_what_is_kept_are_counted_anew() -> None:
+    image = recast(scene(SENSOR, standing("car", 1, 9, 3, 0.4)), np.random.default_rng(4))
+    (box,), half = image.boxes, np.zeros(image.shape, bool)
+    half[::2] = True
+    kept = image.keep(half)
+    assert kept.boxes[0].points == (image.instance[half] == 1).sum() < box.points
+    assert not kept.instance[~half].any()
+
+
+def test_a_label_file_has_the_instances(tmp_path: Path) -> None:
+    image = recast(scene(SENSOR, standing("car", 1, 9, 3, 0.4)), np.random.default_rng(4))
+    scan = image.to_scan()
+    write_labels(tmp_path / "a.label", scan)
+    words = read_words(tmp_path / "a.label", len(scan))
+    np.testing.assert_array_equal(words >> 16, scan.extra["instance"])
+    np.testing.assert_array_equal(read_labels(tmp_path / "a.label", len(scan)), scan.label)
+    for other in (-1, 70000):
+        odd = replace(scan, extra={"instance": np.full(len(scan), other)})  # another program's numbers
+        write_labels(tmp_path / "b.label", odd)
+        np.testing.assert_array_equal(read_words(tmp_path / "b.label", len(scan)), words & 0xFFFF)
+    ls.write(tmp_path / "a.npz", image)
+    again = read_image(tmp_path / "a.npz")
+    np.testing.assert_array_equal(again.instance, image.instance)

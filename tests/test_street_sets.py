@@ -16,10 +16,10 @@ from lidarsynth.data.nuscenes import nuscenes
 from lidarsynth.data.street_sets import LAYOUTS, chunks, write_streets
 from lidarsynth.files.formats import read
 from lidarsynth.files.labels import read_labels
+from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.areas import Density
-from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 

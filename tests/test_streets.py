@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lidarsynth.files.labels import CLASS_OF_RAW
+from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.streets.actors import actors_of
+from lidarsynth.streets.actors import MARGIN, actors_of
 from lidarsynth.streets.apart import boxes_on_ground, meet, stand_apart, walls, what_stands
 from lidarsynth.streets.areas import TODAY, Density
-from lidarsynth.streets.boxes import MARGIN, Box
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.ground import Ground

@@ -29,6 +29,9 @@ def generate(
     format: Format = "ply",
     sensor: Annotated[SensorWord, arg(help="of the scans, for a model of any sensor; default the model's.")] = None,
     labels: Annotated[bool, arg(help="the class of each point too: as a field, and SemanticKITTI's .label.")] = False,
+    boxes: Annotated[
+        bool, arg(help="with labels, whose instances they have: a .json of the boxes of cars and people of each scan.")
+    ] = False,
     steps: GenerationSteps = None,
     sampler: Sampler = None,
     layouts: Annotated[
@@ -53,7 +56,8 @@ def generate(
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
-    endings = generation.endings_of(format, labels, picture)
+    labels = labels or boxes
+    endings = generation.endings_of(format, labels, picture, boxes)
     source = generation.Drawing(model, device, sensor, labels, layouts, precision)
     loaded = source.of(load_with_bar(model, device))
     calls = loaded.generation_steps(steps, sampler)
@@ -61,6 +65,7 @@ def generate(
     settings = {"weights": fingerprint(loaded), "format": format} | generation.steps_of(loaded, steps, sampler)
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
     settings |= {"labels": True} if labels else {}
+    settings |= {"boxes": True} if boxes else {}
     settings |= {} if layouts is None else {"layouts": layouts}
     settings |= generation.precision_of(loaded)
     with only_writer(out, "generation"):

@@ -24,6 +24,7 @@ from lidarsynth.files.fields import (
     rings_of_grid,
     written_names,
 )
+from lidarsynth.files.labels import MOST_INSTANCES
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, from_dict
 
@@ -226,6 +227,7 @@ IMAGE: dict[str, tuple[str, float, float]] = {  # array -> numpy kinds, least an
     "xyz": ("f", -MAX_METRES, MAX_METRES),
     "confidence": ("f", 0, 1),
     "new": ("biu", 0, 1),
+    "instance": ("iu", 0, MOST_INSTANCES),
 }
 
 
@@ -249,7 +251,8 @@ def image_of(arrays: dict[str, np.ndarray]) -> RangeImage:
         sure = arrays["confidence"].astype(np.float32) if "confidence" in arrays else None
         numbers = arrays["range"].astype(np.float32), arrays["reflectance"].astype(np.float32)
         new = arrays["new"].astype(bool) if "new" in arrays else _filled_in(mask, xyz, sure)
-        return RangeImage(*numbers, mask, from_dict(values), label, xyz, confidence=sure, new=new)
+        number = arrays["instance"].astype(np.int32) if "instance" in arrays else None
+        return RangeImage(*numbers, mask, from_dict(values), label, xyz, confidence=sure, new=new, instance=number)
     except FileError:
         raise
     except (ValueError, TypeError, RecursionError) as error:

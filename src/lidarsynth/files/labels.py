@@ -12,6 +12,7 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_OF_RAW, RAW
 
 WORDS = 1 << 32  # that 4 bytes tell apart
+MOST_INSTANCES = (1 << 16) - 1
 
 
 def read_labels(path: str | Path, n: int) -> np.ndarray:
@@ -38,8 +39,9 @@ def read_words(path: str | Path, n: int) -> np.ndarray:
 
 
 def words_of(scan: Scan) -> np.ndarray | None:
-    """(N,) uint32 words of a scan's `.label` file: its `extra["raw_label"]`, else its classes' raw ids; None where it
-    has neither. Raises FileError (without the path) for what is no such word, or no class."""
+    """(N,) uint32 words of a scan's `.label` file: its `extra["raw_label"]`, else its classes' raw ids, with its
+    `extra["instance"]` in the upper half where all of these are numbers of 0-65535; None where it has neither. Raises
+    FileError (without the path) for what is no such word, or no class."""
     if "raw_label" in scan.extra:
         words = scan.extra["raw_label"]
         check_length("raw_label", words, len(scan))
@@ -53,7 +55,10 @@ def words_of(scan: Scan) -> np.ndarray | None:
     if (found := stray(scan.label, len(RAW) - 1)) is not None:
         raise FileError(f"expected labels of 0-{len(RAW) - 1}, SemanticKITTI's training classes, for a .label file, "
                         f'found {found}; extra["raw_label"] takes other ids')  # fmt: skip
-    return RAW[scan.label].astype("<u4")
+    number = scan.extra.get("instance")
+    if number is None or number.dtype.kind not in "iu" or stray(number, MOST_INSTANCES) is not None:
+        return RAW[scan.label].astype("<u4")
+    return RAW[scan.label].astype("<u4") | number.astype("<u4") << np.uint32(16)
 
 
 def label_path(scan: Path) -> Path:

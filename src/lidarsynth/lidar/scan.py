@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lidarsynth.lidar.boxes import Box, counted
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 ODD = (np.ma.MaskedArray, np.matrix)  # arrays that do not compute as others do
@@ -220,6 +221,9 @@ class RangeImage:
     new          (H, W) bool: of a completed image, which of its pixels were filled in, now or before; or None
     surface      (H, W) float32, metres: of virtual streets, where exactly each ray meets something, whether it returned
                  or not, 0 for nothing; or None. It is not saved
+    instance     (H, W) int: of generated images with classes, the number of the box that a return is of, 0 for none; or
+                 None
+    boxes        of these, in the sensor frame. They are not saved
 
     Points of the image are `xyz` where it has them, and of a completed scan `completed`: who changes `range` alone
     changes neither. Numbers of other types become float32. Raises ValueError when a shape does not fit, for a mask that
@@ -237,11 +241,13 @@ class RangeImage:
     confidence: np.ndarray | None = None
     surface: np.ndarray | None = None
     new: np.ndarray | None = None
+    instance: np.ndarray | None = None
+    boxes: tuple[Box, ...] = ()
 
     def __post_init__(self):
         object.__setattr__(self, "sensor", get_sensor(self.sensor))
         shape = (self.sensor.height, self.sensor.width)
-        for name in ("range", "reflectance", "mask", "label", "confidence", "surface", "new"):
+        for name in ("range", "reflectance", "mask", "label", "confidence", "surface", "new", "instance"):
             value = getattr(self, name)
             if value is not None and not isinstance(value, np.ndarray):
                 raise ValueError(f"{name} must be an array, got a {type(value).__name__}")
@@ -255,8 +261,9 @@ class RangeImage:
         for name in ("range", "reflectance", "xyz", "confidence", "surface"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _numbers(name, value))
-        if self.label is not None:
-            _whole("label", self.label)
+        for name in ("label", "instance"):
+            if (value := getattr(self, name)) is not None:
+                _whole(name, value)
         if not isinstance(self.completed, Scan | None):
             raise ValueError(f"completed must be a Scan, got a {type(self.completed).__name__}")
         self._check_ranges()
@@ -272,9 +279,8 @@ class RangeImage:
     def __repr__(self) -> str:
         """One line: sensor, size, how many pixels are measured, how far away, and what else there is."""
         has = ["reflectance"] * bool(self.reflectance.any())
-        has += [
-            n for n in ("label", "xyz", "completed", "confidence", "surface", "new") if getattr(self, n) is not None
-        ]
+        more = ("label", "xyz", "completed", "confidence", "surface", "new", "instance")
+        has += [name for name in more if getattr(self, name) is not None]
         count = f"{np.count_nonzero(self.mask):,} measured{_span(self.range[self.mask])}"
         return f"RangeImage({', '.join([self.sensor.name, '{} x {}'.format(*self.shape), count, *has])})"
 
@@ -294,10 +300,11 @@ class RangeImage:
         if self.completed is not None:
             return self.completed
         chosen = np.flatnonzero(self.mask)
-        kept = (self.reflectance, self.label, self.confidence, self.new)
-        shade, label, sure, new = (None if values is None else values.reshape(-1).take(chosen) for values in kept)
+        kept = (self.reflectance, self.label, self.confidence, self.new, self.instance)
+        shade, label, sure, new, number = (None if v is None else v.reshape(-1).take(chosen) for v in kept)
         extra = {} if new is None else {"new": new.astype(np.uint8)}
         extra |= {} if sure is None else {"confidence": sure}
+        extra |= {} if number is None else {"instance": number.astype(np.int32)}
         assert shade is not None
         return Scan(self._points_of(chosen), shade, chosen // self.sensor.width, None, label, extra)
 
@@ -331,7 +338,7 @@ class RangeImage:
         if known.shape != self.shape:
             raise ValueError(f"known must be {self.shape}, got {known.shape}")
         mask = self.mask & known
-        label = None if self.label is None else np.where(mask, self.label, 0)
+        label, number = (None if part is None else np.where(mask, part, 0) for part in (self.label, self.instance))
         xyz = None if self.xyz is None else np.where(mask[..., None], self.xyz, np.float32(0))
         zero = np.float32(0)
         return replace(
@@ -344,4 +351,6 @@ class RangeImage:
             completed=None,
             confidence=None if self.confidence is None else np.where(mask, self.confidence, zero),
             new=None if self.new is None else mask & self.new,
+            instance=number,
+            boxes=self.boxes if number is None else counted(self.boxes, number),
         )

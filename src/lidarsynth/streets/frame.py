@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.streets.actors import KINDS, actors_of, numbers_of
 from lidarsynth.streets.apart import stand_apart
 from lidarsynth.streets.areas import TODAY, Density
-from lidarsynth.streets.boxes import Box, boxes_of
+from lidarsynth.streets.boxes import boxes_of
 from lidarsynth.streets.drive import Drive, Moment, check_drives, draw_drive, parked_world
 from lidarsynth.streets.hdl64e import NAME
 from lidarsynth.streets.interiors import buildings

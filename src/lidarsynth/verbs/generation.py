@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
@@ -28,16 +29,17 @@ from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL
 
 RECORD = "generate.json"
+BOXES = ".json"  # as `streets --format pcd` has it
 NAMED = frozenset({"model", "sensor"})  # in words what `weights` says in digits, by which alone folders are compared
 MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
 
 
-def endings_of(format: str, labels: bool, picture: bool) -> tuple[str, ...]:
+def endings_of(format: str, labels: bool, picture: bool, boxes: bool = False) -> tuple[str, ...]:
     """Of a finished scan's files, such as (".ply", ".png"). Raises ValueError for a format that is not written."""
     if f".{format}" not in WRITERS:
         words = ", ".join(ending.removeprefix(".") for ending in WRITERS)
         raise ValueError(f"expected a format of {words}, found {format!r}")
-    return (f".{format}", *([LABEL] if labels else []), *([".png"] if picture else []))
+    return (f".{format}", *([LABEL] if labels else []), *([BOXES] if boxes else []), *([".png"] if picture else []))
 
 
 def steps_of(model: ScanModel, steps: int | None = None, sampler: str | None = None) -> dict[str, int]:
@@ -225,13 +227,21 @@ def _opened(source: Drawing, threads: int) -> ScanModel:
     return source.of(load(source.model, device=source.device))
 
 
+def boxes_record(image: RangeImage) -> dict[str, Any]:
+    """What the JSON file of a generated scan holds: how many points it has, and its boxes."""
+    return {"points": int(image.mask.sum()), "boxes": [box.record() for box in image.boxes]}
+
+
 def _store(folder: Path, name: str, image: RangeImage, endings: tuple[str, ...]) -> Path:
-    """Write the files of one scan, the scan last."""
+    """Write the files of one scan, the scan last; instances with boxes alone."""
+    image = image if BOXES in endings else replace(image, instance=None, boxes=())
     for ending in reversed(endings):
         if ending == ".png":
             save_png(folder / f"{name}.png", portrait(image))
         elif ending == LABEL:
             write_labels(folder / f"{name}{LABEL}", image.to_scan())
+        elif ending == BOXES:
+            write_whole(folder / f"{name}{BOXES}", json.dumps(boxes_record(image)))
         else:
             write(folder / f"{name}{ending}", image)
     return folder / f"{name}{endings[0]}"

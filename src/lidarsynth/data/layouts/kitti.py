@@ -15,8 +15,8 @@ from PIL import Image
 
 from lidarsynth.data.layouts.calibration import AXES, IMAGE, PROJECTION, object_calibration
 from lidarsynth.data.layouts.layout import Content, Layout, Sizes, is_held_out, numbered
+from lidarsynth.lidar.boxes import Box
 from lidarsynth.streets.actors import KINDS
-from lidarsynth.streets.boxes import Box
 from lidarsynth.streets.frame import Frame, LabelledStreets
 
 HIDDEN = (0.2, 0.6)  # shares from which an object is partly, and largely occluded

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarsynth.lidar.boxes import MOVES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.actors import KINDS
-from lidarsynth.streets.boxes import MOVES
 
 # Categories by their number in nuScenes-lidarseg.
 CATEGORIES = (

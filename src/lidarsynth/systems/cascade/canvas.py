@@ -3,11 +3,12 @@ in its place."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
+from lidarsynth.lidar.boxes import Box, counted
 from lidarsynth.lidar.pieces import connected
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
@@ -46,6 +47,8 @@ class Canvas:
     starts: np.ndarray
     azimuth: np.ndarray
     elevation: np.ndarray
+    instance: np.ndarray  # (H, W) int32: which of `boxes`, from 1 on, a return is of
+    boxes: list[Box] = field(default_factory=list)  # of what was cast, in the sensor's frame
 
     @cached_property
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +57,18 @@ class Canvas:
 
     def on(self, image: RangeImage) -> RangeImage:
         """The image (H, W) that the canvas was made of, as it is now."""
-        return replace(image, range=self.metres, reflectance=self.reflectance, mask=self.metres > 0, label=self.label)
+        boxes = [box for box in counted(tuple(self.boxes), self.instance) if box.points]
+        number = np.zeros(1 + len(self.boxes), np.int32)
+        number[[box.instance for box in boxes]] = 1 + np.arange(len(boxes))
+        return replace(
+            image,
+            range=self.metres,
+            reflectance=self.reflectance,
+            mask=self.metres > 0,
+            label=self.label,
+            instance=number[self.instance],
+            boxes=tuple(replace(box, instance=int(number[box.instance])) for box in boxes),
+        )
 
     def points_at(self, at: np.ndarray) -> np.ndarray:
         """Points (N, 3), metres."""
@@ -114,16 +128,23 @@ class Canvas:
         starts, rays = self.starts[at // sensor.width], self.rays_at(at)
         return sense(_world(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
 
-    def put(self, at: np.ndarray, metres: np.ndarray, reflectance: np.ndarray, label: np.ndarray) -> None:
+    def put(
+        self, at: np.ndarray, metres: np.ndarray, reflectance: np.ndarray, label: np.ndarray, instance: int = 0
+    ) -> None:
         """Sets what rays bring back, (N,) each, 0 for no return."""
         for whole, values in ((self.metres, metres), (self.reflectance, reflectance), (self.label, label)):
             whole.flat[at] = np.where(metres > 0, values, 0)
+        self.instance.flat[at] = np.where(metres > 0, instance, 0)
         self.points.reshape(-1, 3)[at] = _upright(self.sensor, self.sensor.points(self.metres, at))
 
-    def put_returns(self, at: np.ndarray, found: Returns, where: np.ndarray) -> None:
+    def put_returns(self, at: np.ndarray, found: Returns, where: np.ndarray, instance: int = 0) -> None:
         """`put` of what `cast` found at `at` (N,), `where` (N,) bool it is seen."""
         metres = np.where(found.distance >= self.sensor.min_range, found.distance, 0)
-        self.put(at[where], metres[where], found.reflectance[where], found.label[where])
+        self.put(at[where], metres[where], found.reflectance[where], found.label[where], instance)
+
+    def to_sensor(self, upright: np.ndarray) -> np.ndarray:
+        """Vectors (..., 3) of the frame that stands upright, in the sensor's."""
+        return upright @ sensor_pose(self.sensor, np.zeros(6))[:3, :3]
 
 
 def canvas_of(image: RangeImage) -> Canvas:
@@ -136,7 +157,7 @@ def canvas_of(image: RangeImage) -> Canvas:
     metres, reflectance = image.range * image.mask, image.reflectance * image.mask
     points = _upright(sensor, sensor.points(metres))
     angles = np.arctan2(rays[..., 1], rays[..., 0]), np.arcsin(rays[..., 2].clip(-1, 1))
-    return Canvas(sensor, metres, reflectance, label, points, rays, starts, *angles)
+    return Canvas(sensor, metres, reflectance, label, points, rays, starts, *angles, np.zeros(label.shape, np.int32))
 
 
 def pieces(cells: np.ndarray, steps: list[int]) -> np.ndarray:

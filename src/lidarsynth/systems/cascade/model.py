@@ -51,7 +51,7 @@ from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unan
 from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, one_thread, sampling, times, told_of
 from lidarsynth.systems.cascade.naming import GROWING, RARER, class_of_points, named, sketched
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
-from lidarsynth.systems.cascade.recast import all_recast, as_cast
+from lidarsynth.systems.cascade.recast import all_recast, as_cast, unnamed
 from lidarsynth.systems.cascade.request import calls, resolved
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.shading import shaded
@@ -258,7 +258,7 @@ class CascadeModel(AnySensorModel):
         cast = all_recast(grown(drawn, shades, self._blocked, rng), rng)
         if self.network.drawn is None:
             return as_cast(self._named(cast), cast)
-        return cast if self.labelled else [replace(image, label=None) for image in cast]
+        return cast if self.labelled else [unnamed(image) for image in cast]
 
     def _whole(
         self, metres: Tensor, reflectance: Tensor, rows: np.ndarray, columns: np.ndarray, rng: list[torch.Generator]
@@ -297,7 +297,7 @@ class CascadeModel(AnySensorModel):
         """The images with the classes that `network.classes` sees in them, or without any that nobody asked for; of
         `recorded` ones of the insides of buildings, those of `network.inside`, unless the scans' own were learned."""
         if not self.labelled:
-            return [replace(image, label=None) for image in images]
+            return [unnamed(image) for image in images]
         assert self.network.classes is not None
         inside = self.network.inside if recorded and not self.experiment.model.own_classes else None
         told = self.network.classes, images, self.response, self.sensor, self.precision, least

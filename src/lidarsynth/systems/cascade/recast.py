@@ -15,8 +15,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
+from lidarsynth.streets.actors import MARGIN
 from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.objects import cars_and_people
 from lidarsynth.streets.sensor_model import Returns, range_noise
@@ -24,7 +26,7 @@ from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, canvas_of, mirrored, pieces, tint_of
 from lidarsynth.systems.cascade.fences import cast_fences
 from lidarsynth.systems.cascade.hanging import beside, one_surface
-from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes, within
+from lidarsynth.systems.cascade.placing import LONG, Shape, View, best_place, length, parts_of, two_boxes, within
 
 
 class Kind(NamedTuple):
@@ -81,9 +83,14 @@ def as_cast(named: list[RangeImage], cast: list[RangeImage]) -> list[RangeImage]
     return [
         a
         if a.label is None or b.label is None
-        else replace(a, label=np.where(np.isin(b.label, things), b.label, a.label))
+        else replace(a, label=np.where(np.isin(b.label, things), b.label, a.label), instance=b.instance, boxes=b.boxes)
         for a, b in zip(named, cast, strict=True)
     ]
+
+
+def unnamed(image: RangeImage) -> RangeImage:
+    """The image without classes, instances and boxes."""
+    return replace(image, label=None, instance=None, boxes=())
 
 
 def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
@@ -133,8 +140,11 @@ def _thing(
     there = np.array([[place.x, place.y, place.yaw]])
     mine = at[within(points, there, shape, kind.margin if len(parts) == 1 else TIGHT)[0]]
     shade = float(np.median(canvas.reflectance.flat[mine if len(mine) else at]))
-    found, rays = canvas.cast(_mesh(kind, shape, place, level, rng), tint_of(kind.material, shade, rng), rng)
-    _put(canvas, found, rays, mine, level, rng)
+    mesh, yaw = _mesh(kind, shape, rng, place.yaw)
+    there = moved(mesh, place.x, place.y, level, yaw=yaw)
+    found, rays = canvas.cast(there, tint_of(kind.material, shade, rng), rng)
+    shown = _put(canvas, found, rays, mine, level, rng)
+    canvas.boxes.append(_box(canvas, shape.words, mesh, (place.x, place.y, level), yaw, shown))
     rest = at[~np.isin(at, mine)]
     return rest if len(rest) >= FEW and len(mine) else None
 
@@ -215,20 +225,32 @@ def _swallowed(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float)
     return both[len(at) :][np.isin(piece[len(at) :], piece[: len(at)])]
 
 
-def _mesh(kind: Kind, shape: Shape, place: Place, level: float, rng: np.random.Generator) -> Mesh:
-    """One of the streets' own, there, its front ahead or behind."""
+def _mesh(kind: Kind, shape: Shape, rng: np.random.Generator, yaw: float) -> tuple[Mesh, float]:
+    """One of the streets' own, in its own frame, and the direction of its front, radians: ahead or behind."""
     words = cars_and_people()[shape.words]
     mesh = words[int(rng.integers(len(words)))]
-    yaw = place.yaw + np.pi * rng.integers(2) if kind.turns > 1 else rng.uniform(0, 2 * np.pi)
-    larger = np.float32(rng.uniform(*SIZE))
-    return moved(replace(mesh, corners=mesh.corners * larger), place.x, place.y, level, yaw=yaw)
+    yaw = yaw + np.pi * rng.integers(2) if kind.turns > 1 else rng.uniform(0, 2 * np.pi)
+    return replace(mesh, corners=mesh.corners * np.float32(rng.uniform(*SIZE))), float(yaw)
+
+
+def _box(canvas: Canvas, word: str, mesh: Mesh, place: tuple[float, float, float], yaw: float, shown: float) -> Box:
+    """The next box of a canvas, around a thing's mesh, put to a place, metres, and turned by yaw, as streets have it;
+    `shown` of its rays nothing hides."""
+    corners = mesh.corners.reshape(-1, 3).astype(np.float64)
+    low, high = corners.min(0), corners.max(0)
+    (x, y, z), (c, s) = (low + high) / 2, (np.cos(yaw), np.sin(yaw))
+    middle = canvas.to_sensor(np.array([c * x - s * y, s * x + c * y, z]) + place)
+    front = canvas.to_sensor(np.array([c, s, 0]))
+    yaw, still = float(np.arctan2(front[1], front[0])), (0.0, 0.0, 0.0)
+    centre, size = tuple(middle.tolist()), tuple((high - low + 2 * MARGIN).tolist())
+    return Box(word, 1 + len(canvas.boxes), centre, size, yaw, still, centre, yaw, still, 0, 1 - shown)
 
 
 def _put(
     canvas: Canvas, found: Returns, at: np.ndarray, mine: np.ndarray, level: float, rng: np.random.Generator
-) -> None:
-    """The thing in the scan, where nothing nearer hides it and rays do not go through it; what else was drawn of it,
-    pixels `mine`, is as it is beside it."""
+) -> float:
+    """The thing in the scan as its next box, where nothing nearer hides it and rays do not go through it; what else was
+    drawn of it, pixels `mine`, is as it is beside it. Returns which share of the rays that meet it nothing hides."""
     own = np.isin(at, mine)
     there = canvas.metres.flat[at]
     there = np.where(there > 0, there, np.inf)
@@ -238,7 +260,8 @@ def _put(
     put = np.isfinite(found.surface) & ~hidden_there & ~through
     left = mine[~np.isin(mine, at[put])]
     _fill(canvas, left, np.concatenate([at[put], mine]), level, rng)
-    canvas.put_returns(at, found, put)
+    canvas.put_returns(at, found, put, 1 + len(canvas.boxes))
+    return float(put.sum() / max((put | np.isfinite(found.surface) & hidden_there).sum(), 1))
 
 
 def _fill(canvas: Canvas, left: np.ndarray, taken: np.ndarray, level: float, rng: np.random.Generator) -> None:
