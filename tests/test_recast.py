@@ -13,6 +13,7 @@ from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.apart import meet
 from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.objects import cars_and_people, library
 from lidarsynth.streets.raycast import Caster, FewTriangles
@@ -353,7 +354,7 @@ def test_what_is_cast_has_a_box_and_its_returns_a_number(tilt: tuple[float, floa
 
 
 def test_a_box_tells_how_much_of_it_is_hidden() -> None:
-    image = scene(SENSOR, standing("car", 1, 14, 4.5, 1.5), standing("van", 0, 7, 0, 1.5))
+    image = scene(SENSOR, standing("car", 1, 12, 5, 1.5), standing("van", 0, 8, 0, 1.5))
     boxes = recast(image, np.random.default_rng(1)).boxes
     near, far = sorted(boxes, key=lambda box: box.centre[0])
     assert near.occlusion < 0.05 and 0.3 < far.occlusion < 0.95
@@ -382,3 +383,17 @@ def test_a_label_file_has_the_instances(tmp_path: Path) -> None:
     ls.write(tmp_path / "a.npz", image)
     again = read_image(tmp_path / "a.npz")
     np.testing.assert_array_equal(again.instance, image.instance)
+
+
+@pytest.mark.parametrize("rough", [False, True])
+def test_nothing_is_cast_in_another(rough: bool) -> None:
+    """What was left of a heap became a car in the one that had been put there."""
+    row = [standing("car", number, 7, y, 1.5) for number, y in ((0, -4.6), (1, 0.0), (2, 4.4))]
+    image = scene(SENSOR, *row, standing("person", 1, 4, 5, 0))
+    image = blob(image, CAR) if rough else image
+    boxes = [box for seed in range(4) for box in recast(image, np.random.default_rng(seed)).boxes]
+    assert len(boxes) >= 8
+    for k in range(4):
+        some = recast(image, np.random.default_rng(k)).boxes
+        stands = [np.array([*box.centre[:2], box.yaw, box.size[0] / 2, box.size[1] / 2]) for box in some]
+        assert not any(meet(one, other) for i, one in enumerate(stands) for other in stands[:i])

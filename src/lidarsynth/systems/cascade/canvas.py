@@ -49,6 +49,7 @@ class Canvas:
     elevation: np.ndarray
     instance: np.ndarray  # (H, W) int32: which of `boxes`, from 1 on, a return is of
     boxes: list[Box] = field(default_factory=list)  # of what was cast, in the sensor's frame
+    taken: list[np.ndarray] = field(default_factory=list)  # where these stand, as `streets.apart.footprints`
 
     @cached_property
     def reach(self) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarsynth.streets.apart import meet
+
 
 class Shape(NamedTuple):
     """What things of one kind are like: two boxes one upon the other, (2, 2, 3) least and greatest x, y, z in metres,
@@ -45,7 +47,7 @@ def two_boxes(
 class View(NamedTuple):
     """N rays, (N, 3), from the origin through some of what a thing may hide; metres (N,), inf for none; own (N,) bool:
     they met what suggests the thing; ground (N,) bool; lost (N,) bool: what the thing may have swallowed; weight (N,):
-    how many rays each one stands for."""
+    how many rays each one stands for; taken (K, 5): where others stand, as `streets.apart.footprints`."""
 
     rays: np.ndarray
     metres: np.ndarray
@@ -53,6 +55,7 @@ class View(NamedTuple):
     ground: np.ndarray
     lost: np.ndarray
     weight: np.ndarray
+    taken: np.ndarray = np.zeros((0, 5), np.float32)
 
 
 class Place(NamedTuple):
@@ -69,8 +72,8 @@ class Place(NamedTuple):
 
 # Of each ray, in what a missed one of the thing's own costs: one that ends so many metres off; one that hides what is
 # farther; one that ends inside, or where something else is; one that did not return, and that it misses; then, how far
-# off a return may be.
-OFF, HIDES, INSIDE, ANOTHER, LOST, ABOUT = 2.0, 0.35, 0.6, 0.5, 0.15, 1.0
+# off a return may be. Then of all of the thing's own rays, where it stands in another.
+OFF, HIDES, INSIDE, ANOTHER, LOST, ABOUT, MEETS = 2.0, 0.35, 0.6, 0.5, 0.15, 1.0, 3.0
 GAP, BEHIND = 0.3, 0.15  # metres
 ENDS = (0.06, 0.94)  # quantiles of what is seen of a thing
 ASKEW = 0.15  # cost of standing at 45 degrees to everything around
@@ -110,7 +113,8 @@ def best_place(
     few = [points[:: max(len(points) // SEEN, 1), :2] for points in parts]
     places = np.concatenate([_corners(seen, shape.size, yaws) for seen in few])
     if len(places) > BEST:
-        some = View(*(part[:: max(len(view.rays) // SOME, 1)] for part in view))
+        step = max(len(view.rays) // SOME, 1)
+        some = view._replace(**{name: part[::step] for name, part in view._asdict().items() if name != "taken"})
         places = places[np.argsort(_costs(places, shape, some, level, axis)[0], kind="stable")[:BEST]]
     costs = _costs(places, shape, view, level, axis)
     for metres, radians in STEPS:
@@ -155,6 +159,10 @@ def _costs(
     own = np.maximum(near @ view.weight, 1)
     cost, share = ((missed * near) @ view.weight + wrong) / own, (hit & near & (off < ABOUT)) @ view.weight / own
     total = missed @ view.weight + wrong + LOST * (~hit & view.lost) @ view.weight
+    if len(view.taken):
+        stands = np.concatenate([places, np.broadcast_to(shape.size / 2, (len(places), 2))], 1)
+        crossing = MEETS * meet(stands[:, None], view.taken).any(1)
+        total, cost = total + crossing * own, cost + crossing
     if axis is not None:
         askew = ASKEW * np.abs((places[:, 2] - axis + np.pi / 4) % (np.pi / 2) - np.pi / 4) / (np.pi / 4)
         total, cost = total + askew * own, cost + askew

@@ -19,6 +19,7 @@ from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.streets.actors import MARGIN
+from lidarsynth.streets.apart import footprints, meet
 from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.objects import cars_and_people
 from lidarsynth.streets.sensor_model import Returns, range_noise
@@ -26,7 +27,7 @@ from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, canvas_of, mirrored, pieces, tint_of
 from lidarsynth.systems.cascade.fences import cast_fences
 from lidarsynth.systems.cascade.hanging import beside, one_surface
-from lidarsynth.systems.cascade.placing import LONG, Shape, View, best_place, length, parts_of, two_boxes, within
+from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes, within
 
 
 class Kind(NamedTuple):
@@ -133,18 +134,20 @@ def _thing(
     place, shape = min(zip(places, shapes, strict=True), key=lambda both: both[0].total)
     if (place.cost > SURE[0] or place.share < SURE[1]) and _a_wall(points):
         return None
-    if place.cost > kind.most or place.share < kind.least:
+    found = None if place.cost > kind.most or place.share < kind.least else _mesh(canvas, kind, shape, place, rng)
+    if found is None:
         gone = _with_lost(canvas, at)
         _fill(canvas, gone, gone, level, rng)
         return None
     there = np.array([[place.x, place.y, place.yaw]])
     mine = at[within(points, there, shape, kind.margin if len(parts) == 1 else TIGHT)[0]]
     shade = float(np.median(canvas.reflectance.flat[mine if len(mine) else at]))
-    mesh, yaw = _mesh(kind, shape, rng, place.yaw)
+    mesh, yaw, stands = found
     there = moved(mesh, place.x, place.y, level, yaw=yaw)
-    found, rays = canvas.cast(there, tint_of(kind.material, shade, rng), rng)
-    shown = _put(canvas, found, rays, mine, level, rng)
+    returns, rays = canvas.cast(there, tint_of(kind.material, shade, rng), rng)
+    shown = _put(canvas, returns, rays, mine, level, rng)
     canvas.boxes.append(_box(canvas, shape.words, mesh, (place.x, place.y, level), yaw, shown))
+    canvas.taken.append(stands)
     rest = at[~np.isin(at, mine)]
     return rest if len(rest) >= FEW and len(mine) else None
 
@@ -208,7 +211,8 @@ def _view(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float, long
     metres = np.where(canvas.metres.flat[of] > 0, canvas.metres.flat[of], np.inf).astype(np.float32)
     lost = np.isin(of, _swallowed(canvas, at, middle, level))
     ground = GROUND[canvas.label.flat[of]] | (canvas.points_at(of)[:, 2] < level + LOW)
-    return View(canvas.rays_at(of), metres, np.arange(len(of)) < len(chosen[0]), ground, lost, weight)
+    own = np.arange(len(of)) < len(chosen[0])
+    return View(canvas.rays_at(of), metres, own, ground, lost, weight, np.array(canvas.taken).reshape(-1, 5))
 
 
 def _swallowed(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float) -> np.ndarray:
@@ -225,12 +229,22 @@ def _swallowed(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float)
     return both[len(at) :][np.isin(piece[len(at) :], piece[: len(at)])]
 
 
-def _mesh(kind: Kind, shape: Shape, rng: np.random.Generator, yaw: float) -> tuple[Mesh, float]:
-    """One of the streets' own, in its own frame, and the direction of its front, radians: ahead or behind."""
-    words = cars_and_people()[shape.words]
-    mesh = words[int(rng.integers(len(words)))]
-    yaw = yaw + np.pi * rng.integers(2) if kind.turns > 1 else rng.uniform(0, 2 * np.pi)
-    return replace(mesh, corners=mesh.corners * np.float32(rng.uniform(*SIZE))), float(yaw)
+def _mesh(
+    canvas: Canvas, kind: Kind, shape: Shape, place: Place, rng: np.random.Generator
+) -> tuple[Mesh, float, np.ndarray] | None:
+    """One of the streets' own, in its own frame, the direction of its front, radians: ahead or behind, and its
+    footprint (5,) at that place; None where all would stand in others."""
+    meshes = cars_and_people()[shape.words]
+    first = int(rng.integers(len(meshes)))
+    yaw = float(place.yaw + np.pi * rng.integers(2) if kind.turns > 1 else rng.uniform(0, 2 * np.pi))
+    larger = np.float32(rng.uniform(*SIZE))
+    for mesh in (*meshes[first:], *meshes[:first]):
+        mesh = replace(mesh, corners=mesh.corners * larger)
+        low, high = (each(mesh.corners.reshape(-1, 3)[:, :2], 0) for each in (np.min, np.max))
+        stands = footprints(np.array([place.x, place.y]), np.array(yaw), (low + high) / 2, (high - low) / 2 + MARGIN)
+        if not len(canvas.taken) or not meet(stands, np.stack(canvas.taken)).any():
+            return mesh, yaw, stands
+    return None
 
 
 def _box(canvas: Canvas, word: str, mesh: Mesh, place: tuple[float, float, float], yaw: float, shown: float) -> Box:
