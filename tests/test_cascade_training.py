@@ -19,6 +19,7 @@ from lidarsynth.networks.fill_unet import Filled, Known
 from lidarsynth.networks.rays import encode_range, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import VirtualStreets
+from lidarsynth.systems.cascade import patterns
 from lidarsynth.systems.cascade import training as cascade_training
 from lidarsynth.systems.cascade.examples import crop, mixed
 from lidarsynth.systems.cascade.model import CascadeModel
@@ -187,6 +188,27 @@ def test_what_is_sparse_has_holes_at_times():
         lost = np.convolve(known.any(0), np.ones(24), "valid").min() == 0
         found += lost and known.any(1).sum() < 40 and known.any(1).sum() > 4 and known.mean() > 0.01
     assert 10 < found < 120
+
+
+def test_what_learns_the_likeliest_image_knows_some_columns_alone_at_times():
+    """A fill that had never met such ones left half of a scan empty that lacks columns."""
+    counts = []
+    for sampled in (False, True):
+        each = [pattern((64, 256), 1024, np.random.default_rng(i), sampled) for i in range(600)]
+        counts.append(sum(0.05 < known.mean() < 0.9 and (known == known[:1]).all() for known in each))
+    assert 30 < counts[0] < 120
+    assert counts[1] < counts[0] / 2  # generation needs none but holes
+
+
+def test_one_part_of_a_scan_may_know_less_than_another(monkeypatch: pytest.MonkeyPatch):
+    whole, none = np.ones((64, 256), bool), np.zeros((64, 256), bool)
+    monkeypatch.setattr(patterns, "PARTED", 1)
+    for i in range(8):
+        some = iter((whole, none))
+        monkeypatch.setattr(patterns, "pattern", lambda *_, some=some: next(some))
+        known = pattern(whole.shape, 1024, np.random.default_rng(i), False)
+        assert 0 < known.mean() < 1
+        assert (known == known[:1]).all() or (known == known[:, :1]).all()  # a sector, or what is above a beam
 
 
 def test_standards_make_the_ground_as_wide_as_the_horizon():
