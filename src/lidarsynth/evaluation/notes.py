@@ -10,6 +10,7 @@ from torch import Tensor
 from lidarsynth.evaluation.image_sets import ImageSet, Item, stem_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.sample_tensors import beams_off, columns_off
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -95,7 +96,7 @@ def unused_sensor(named: str | Sensor | None, images: ImageSet | None, own: Sens
         return ()
     first, given = images.item(0) if images else None, get_sensor(named)
     own = first.sensor if isinstance(first, RangeImage) else own
-    if given.height % own.height == 0 and given.resized(own.height, own.width).elevations == own.elevations:
+    if given.height % own.height == 0 and same_beams(given.resized(own.height, own.width), own):
         return ()
     drawn = images is not None and not isinstance(first, RangeImage)
     why = f"are drawn into the reference's images, of {own.name}" if drawn else f"know their own sensor, {own.name}"
