@@ -668,6 +668,13 @@ def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, 
         ls.evaluate(STREETS, REAL, seed=-1)
     with pytest.raises(ValueError, match="expected a batch_size of at least 1, found 0"):
         evaluation.gather_part(real, "1/1", part, batch_size=0)
+    for wrong in (1.0, "1", True, None, np.ones(2)):
+        for name in ("seed", "batch_size"):
+            with pytest.raises(ValueError, match=f"^expected a {name} that is a whole number, found .*$"):
+                ls.evaluate(STREETS, REAL, **{name: wrong})
+    with pytest.raises(ValueError, match="^expected a seed of at most 4294967295, found 4294967296$"):
+        ls.evaluate(STREETS, REAL, seed=2**32)
+    assert json.loads(ls.evaluate(STREETS, REAL, seed=np.int64(2**32 - 1)).json())["seeds"]["subsets"] == 2**32 - 1
     told = "the samples know their own sensor, hdl-64e: vlp-16, named for points and tensors, is not used"
     assert told in ls.evaluate(STREETS, REAL, sensor="vlp-16").warnings
     assert told not in ls.evaluate(STREETS, REAL, sensor="hdl-64e").warnings

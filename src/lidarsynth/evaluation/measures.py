@@ -23,6 +23,7 @@ from lidarsynth.metrics.point_sets import earth_movers_distance, sphere_counts
 from lidarsynth.metrics.sensor_report import BeamCounts, compare_beams, drop_rate_error
 from lidarsynth.metrics.sharpness import KINDS
 
+LARGEST_SEED = 2**32 - 1  # of the generator that `_kernel` draws from
 OnPair = Callable[[int, int], object] | None  # (done, in all), for progress bars
 SetDistances = tuple[np.ndarray, np.ndarray, np.ndarray]
 
