@@ -610,7 +610,8 @@ def test_tensors_of_other_beams_than_they_are_taken_for_are_noted(tmp_path: Path
         points,
     )
     assert notes("lidargen") == ["samples are tensors without points, taken for the rays of hdl-64e-kitti: --sensor "
-                                 "names others (R2DM's grid is hdl-64e)"]  # fmt: skip
+                                 "names others (R2DM's grid is hdl-64e); and their ranges for LiDARGen's code "
+                                 "log2(r + 1) / 6, no other"]  # fmt: skip
     assert notes("lidargen", side=1)[0].startswith("the reference are tensors without points")
     assert not [text for text in ls.evaluate(tmp_path / "r2dm", STREETS[:2]).warnings if "tensors" in text]
 
@@ -741,6 +742,24 @@ def test_batches_in_one_file_are_images_like_others(tmp_path: Path, real: Path):
     with pytest.raises(ValueError, match=r"b.npz.*expected a batch of arrays \(B, ...\)") as caught:
         ls.evaluate(tmp_path / "batches", real)
     assert str(caught.value).count("b.npz") == 1, "the file is named once"
+
+
+@pytest.mark.parametrize("form", ["r2dm", "lidargen"])
+def test_stacked_tensors_in_one_file_are_images_like_others(form: str, tmp_path: Path, real: Path):
+    alone = saved(tmp_path / "alone", STREETS, form)
+    each = [torch.load(path, weights_only=True) for path in sorted(alone.iterdir())]
+    (tmp_path / "stacks").mkdir()
+    torch.save(torch.stack(each[:4]), tmp_path / "stacks/a.pth")
+    torch.save(torch.stack(each[4:]), tmp_path / "stacks/b.pth", _use_new_zipfile_serialization=False)
+    report, expected = ls.evaluate(tmp_path / "stacks", real), ls.evaluate(alone, real)
+    assert report.values == expected.values and report.hashes["samples"] == expected.hashes["samples"]
+    assert image_set(tmp_path / "stacks").names[4].endswith("b.pth[0]")
+    torch.save(torch.stack(each)[:, :1], tmp_path / "stacks/b.pth")
+    with pytest.raises(ValueError, match=r"b.pth\[0\]: expected a tensor .*, found \(1, 64, 64\)$"):
+        ls.evaluate(tmp_path / "stacks/b.pth", real)
+    torch.save(torch.zeros(1, 5, 64, 64).expand(1 << 40, 5, 64, 64), tmp_path / "stacks/b.pth")
+    with pytest.raises(ValueError, match=r"b.pth: expected tensors of plain numbers, found"):
+        ls.evaluate(tmp_path / "stacks/b.pth", real)
 
 
 def test_a_range_image_may_name_its_sensor(tmp_path: Path, real: Path):
