@@ -688,7 +688,7 @@ def test_samples_that_are_nowhere_are_told_before_the_first_scan(generation: Pat
         text = generation.read_text() + f'[[method]]\nname = "last"\n{words}\n'
         with pytest.raises(ValueError, match=message):
             benchmark("generation", written(tmp_path / "last.toml", text), tmp_path / "out", lambda word: model)
-    with pytest.raises(ValueError, match="^real.safetensors: expected scans, .*, found statistics"):
+    with pytest.raises(ValueError, match=r"^real.safetensors: expected scans, .*, found statistics"):
         benchmark("generation", generation, tmp_path / "out", lambda word: model, data="real.safetensors")
     assert not model.calls
 

@@ -673,7 +673,7 @@ def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, 
         for name in ("seed", "batch_size"):
             with pytest.raises(ValueError, match=f"^expected a {name} that is a whole number, found .*$"):
                 ls.evaluate(STREETS, REAL, **{name: wrong})
-    with pytest.raises(ValueError, match="^expected a seed of at most 4294967295, found 4294967296$"):
+    with pytest.raises(ValueError, match=r"^expected a seed of at most 4294967295, found 4294967296$"):
         ls.evaluate(STREETS, REAL, seed=2**32)
     assert json.loads(ls.evaluate(STREETS, REAL, seed=np.int64(2**32 - 1)).json())["seeds"]["subsets"] == 2**32 - 1
     told = "the samples know their own sensor, hdl-64e: vlp-16, named for points and tensors, is not used"

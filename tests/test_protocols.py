@@ -133,8 +133,8 @@ def test_statistics_depend_neither_on_batches_nor_on_who_gathered_them(tmp_path:
     assert first.bev and whole.bev and torch.equal(first.bev.pooled, whole.bev.pooled)
     assert first.beams and whole.beams and np.array_equal(first.beams.histogram, whole.beams.histogram)
     real = gathered(images(9, seed=1), role="real")
-    for own, merged in zip(evaluate.results_of(whole, real), evaluate.results_of(first, real), strict=True):
-        assert own.value == pytest.approx(merged.value, rel=1e-5)
+    for own, its in zip(evaluate.results_of(whole, real), evaluate.results_of(first, real), strict=True):
+        assert own.value == pytest.approx(its.value, rel=1e-5)
     assert gathered(images(9, seed=2)).digest != whole.digest
 
 

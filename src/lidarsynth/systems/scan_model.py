@@ -17,7 +17,7 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import Pixels, occupied, pixel_of_points, project_thinned
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, same_rays
 from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.systems.description import Description
@@ -139,7 +139,7 @@ class ScanModel(ABC):
     ) -> RangeImage:
         """Fill what was not measured; what was comes back exactly.
 
-        scan       points: a scan, an array or tensor (N, 3) x y z or (N, 4) x y z reflectance; or an image of this sensor
+        scan       points: a scan, array or tensor (N, 3) x y z or (N, 4) x y z reflectance; or an image of this sensor
         known      (H, W) bool: pixels to keep bit by bit, where an empty pixel means that nothing returned. None =
                    those measured, and of points also rays that only have some beyond the range limits
         method, steps, resamples, sampler, precision  as `Filling` says; which words and defaults, the class of the
@@ -206,9 +206,7 @@ class ScanModel(ABC):
         """Raises ValueError for a model that cannot `realise`."""
         raise self._lacks("which rays return")
 
-    def label(
-        self, scan: Points | RangeImage, sensor: Sensor | str | None = None, least: float = 0.0
-    ) -> Scan:
+    def label(self, scan: Points | RangeImage, sensor: Sensor | str | None = None, least: float = 0.0) -> Scan:
         """The scan, bit by bit, with the class of each point: SemanticKITTI's 1-19, 0 out of the sensor's view or
         limits.
 
@@ -238,13 +236,13 @@ class ScanModel(ABC):
 
     def filled(
         self,
-        scan: Scan | RangeImage | np.ndarray,
+        scan: Points | RangeImage,
         how: Filling,
         known: np.ndarray | None = None,
         on_step: OnStep = None,
     ) -> RangeImage:
         """`complete` of a record."""
-        scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
+        scan = scan if isinstance(scan, RangeImage) else taken(scan)
         model = self if how.precision is None else self.at_precision(how.precision)
         model = model.suited_to(scan) if isinstance(scan, Scan) else model.suited_to_image(scan)
         if model is not self:
