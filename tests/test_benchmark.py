@@ -16,6 +16,9 @@ from PIL import Image
 
 import lidarsynth as ls
 from lidarsynth.benchmark import drawings, run
+from lidarsynth.benchmark import generation as judging
+from lidarsynth.benchmark import setup as setups
+from lidarsynth.benchmark import upsampling as completing
 from lidarsynth.benchmark.config import read_config, rows
 from lidarsynth.benchmark.published import PUBLISHED, published, why_not
 from lidarsynth.benchmark.rows import Row
@@ -24,15 +27,18 @@ from lidarsynth.benchmark.store import Seconds
 from lidarsynth.benchmark.tables import RANK, Column, notes, protocol_columns, table
 from lidarsynth.cli.main import main
 from lidarsynth.data.dataset import CachedImages, write_cache
+from lidarsynth.evaluation.accumulation import Loaded
 from lidarsynth.evaluation.protocols import PROTOCOLS, R2DM_UPSAMPLING
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
+from lidarsynth.files.formats import write
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.networks.rangenet import RangeNet
 from lidarsynth.systems.interpolation.model import interpolated
+from lidarsynth.verbs.learned_sensor import sensor_toml
 
 REPO_ROOT = Path(__file__).resolve().parents[1]
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
@@ -523,6 +529,47 @@ def test_samples_of_others_compete_and_other_sizes_are_told(generation: Path, da
     assert "\n- bev-1 v1 judges 10,000 samples, found 4\n" in text, "and one of all rows says nothing more"
 
 
+@pytest.fixture
+def points(tmp_path: Path) -> Path:
+    """A generation of samples that are points, drawn into the images of a sensor of the user's own file."""
+    for side, seeds in (("samples", range(3)), ("real", range(10, 13))):
+        (tmp_path / side).mkdir()
+        for seed in seeds:
+            write(tmp_path / side / f"{seed}.ply", street(seed))
+    (tmp_path / "my.toml").write_text(sensor_toml(SENSOR))
+    text = f'reference = "{tmp_path}/real"\nsensor = "{tmp_path}/my.toml"\n'
+    return written(tmp_path / "g.toml", f'{text}[[method]]\nname = "mine"\nsamples = "{tmp_path}/samples"\n')
+
+
+def test_samples_are_judged_again_where_the_file_of_their_sensor_says_something_else(points: Path, tmp_path: Path):
+    first = benchmark("generation", points, tmp_path / "out", no_model)
+    assert benchmark("generation", points, tmp_path / "out", no_model) == first
+    (tmp_path / "my.toml").write_text(sensor_toml(replace(SENSOR, max_range=20.0)))
+    again = benchmark("generation", points, tmp_path / "out", no_model)
+    assert again != first and again == benchmark("generation", points, tmp_path / "anew", no_model)
+
+
+@pytest.mark.parametrize("changed", ["GATHERED", "weights", "neither"])
+def test_samples_are_judged_again_by_other_networks_or_rules(changed: str, points: Path, tmp_path: Path, monkeypatch):
+    counts = []
+    monkeypatch.setattr(judging, "evaluate", lambda *args, **more: counts.append(1) or ls.evaluate(*args, **more))
+    benchmark("generation", points, tmp_path / "out", no_model)
+    if changed == "GATHERED":
+        monkeypatch.setattr(judging, "GATHERED", judging.GATHERED + 1)
+    elif changed == "weights":
+        monkeypatch.setattr(setups, "load_networks", lambda *_, **more: Loaded({}, {"rangenet": "other"}, {}))
+    benchmark("generation", points, tmp_path / "out", no_model)
+    assert len(counts) == (1 if changed == "neither" else 2)
+
+
+def test_completions_are_judged_again_by_other_rules(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
+    for step in (0, 0, 1):
+        monkeypatch.setattr(completing, "GATHERED", completing.GATHERED + step)
+        benchmark("upsampling", config, tmp_path / "out", no_model)
+    assert len(list((tmp_path / "out").rglob("report-*.json"))) == 2
+
+
 def test_scores_are_drawn_over_the_numbers_of_steps(generation: Path, tiny: Path, tmp_path: Path, figures: None):
     benchmark("generation", generation, tmp_path / "out", lambda word: ls.load(tiny))
     for name in ("scores.png", "figure.png"):
@@ -620,6 +667,8 @@ def test_a_generation_takes_one_source_per_row_and_only_its_own_keys(tmp_path: P
             read_config("generation", written(tmp_path / "g.toml", head + body))
     with pytest.raises(ValueError, match="expected a readable file"):
         read_config("generation", tmp_path / "nothing.toml")
+    with pytest.raises(ValueError, match=r"g.toml.seed: expected at most 4294967295, found 4294967296$"):
+        read_config("generation", written(tmp_path / "g.toml", head + "noise = true\n"), seed=2**32)
     replaced = read_config("generation", written(tmp_path / "g.toml", head + "noise = true\n"), data="x", seed=3)
     assert (replaced.reference, replaced.seed) == ("x", 3)
 
@@ -634,10 +683,13 @@ def test_a_model_that_is_none_is_told_before_the_first_scan(data: Path, tmp_path
 def test_samples_that_are_nowhere_are_told_before_the_first_scan(generation: Path, tiny: Path, tmp_path: Path):
     model = Counted(ls.load(tiny))
     for words, message in (('held_out = "nowhere"', "nowhere: expected a cache, or samples"),
+                           ('samples = "a.safetensors"', "a.safetensors: expected scans, .*, found statistics: evalu"),
                            ('samples = "synthetic:2"', "expected synthetic:COUNT:SEED")):  # fmt: skip
         text = generation.read_text() + f'[[method]]\nname = "last"\n{words}\n'
         with pytest.raises(ValueError, match=message):
             benchmark("generation", written(tmp_path / "last.toml", text), tmp_path / "out", lambda word: model)
+    with pytest.raises(ValueError, match=r"^real.safetensors: expected scans, .*, found statistics"):
+        benchmark("generation", generation, tmp_path / "out", lambda word: model, data="real.safetensors")
     assert not model.calls
 
 

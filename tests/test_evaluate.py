@@ -610,7 +610,8 @@ def test_tensors_of_other_beams_than_they_are_taken_for_are_noted(tmp_path: Path
         points,
     )
     assert notes("lidargen") == ["samples are tensors without points, taken for the rays of hdl-64e-kitti: --sensor "
-                                 "names others (R2DM's grid is hdl-64e)"]  # fmt: skip
+                                 "names others (R2DM's grid is hdl-64e); and their ranges for LiDARGen's code "
+                                 "log2(r + 1) / 6, no other"]  # fmt: skip
     assert notes("lidargen", side=1)[0].startswith("the reference are tensors without points")
     assert not [text for text in ls.evaluate(tmp_path / "r2dm", STREETS[:2]).warnings if "tensors" in text]
 
@@ -668,6 +669,13 @@ def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, 
         ls.evaluate(STREETS, REAL, seed=-1)
     with pytest.raises(ValueError, match="expected a batch_size of at least 1, found 0"):
         evaluation.gather_part(real, "1/1", part, batch_size=0)
+    for wrong in (1.0, "1", True, None, np.ones(2)):
+        for name in ("seed", "batch_size"):
+            with pytest.raises(ValueError, match=f"^expected a {name} that is a whole number, found .*$"):
+                ls.evaluate(STREETS, REAL, **{name: wrong})
+    with pytest.raises(ValueError, match=r"^expected a seed of at most 4294967295, found 4294967296$"):
+        ls.evaluate(STREETS, REAL, seed=2**32)
+    assert json.loads(ls.evaluate(STREETS, REAL, seed=np.int64(2**32 - 1)).json())["seeds"]["subsets"] == 2**32 - 1
     told = "the samples know their own sensor, hdl-64e: vlp-16, named for points and tensors, is not used"
     assert told in ls.evaluate(STREETS, REAL, sensor="vlp-16").warnings
     assert told not in ls.evaluate(STREETS, REAL, sensor="hdl-64e").warnings
@@ -734,6 +742,24 @@ def test_batches_in_one_file_are_images_like_others(tmp_path: Path, real: Path):
     with pytest.raises(ValueError, match=r"b.npz.*expected a batch of arrays \(B, ...\)") as caught:
         ls.evaluate(tmp_path / "batches", real)
     assert str(caught.value).count("b.npz") == 1, "the file is named once"
+
+
+@pytest.mark.parametrize("form", ["r2dm", "lidargen"])
+def test_stacked_tensors_in_one_file_are_images_like_others(form: str, tmp_path: Path, real: Path):
+    alone = saved(tmp_path / "alone", STREETS, form)
+    each = [torch.load(path, weights_only=True) for path in sorted(alone.iterdir())]
+    (tmp_path / "stacks").mkdir()
+    torch.save(torch.stack(each[:4]), tmp_path / "stacks/a.pth")
+    torch.save(torch.stack(each[4:]), tmp_path / "stacks/b.pth", _use_new_zipfile_serialization=False)
+    report, expected = ls.evaluate(tmp_path / "stacks", real), ls.evaluate(alone, real)
+    assert report.values == expected.values and report.hashes["samples"] == expected.hashes["samples"]
+    assert image_set(tmp_path / "stacks").names[4].endswith("b.pth[0]")
+    torch.save(torch.stack(each)[:, :1], tmp_path / "stacks/b.pth")
+    with pytest.raises(ValueError, match=r"b.pth\[0\]: expected a tensor .*, found \(1, 64, 64\)$"):
+        ls.evaluate(tmp_path / "stacks/b.pth", real)
+    torch.save(torch.zeros(1, 5, 64, 64).expand(1 << 40, 5, 64, 64), tmp_path / "stacks/b.pth")
+    with pytest.raises(ValueError, match=r"b.pth: expected tensors of plain numbers, found"):
+        ls.evaluate(tmp_path / "stacks/b.pth", real)
 
 
 def test_a_range_image_may_name_its_sensor(tmp_path: Path, real: Path):

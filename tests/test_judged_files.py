@@ -17,6 +17,7 @@ from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.evaluation.protocols import BEV_1, LIDARGEN, STREET_1
 from lidarsynth.evaluation.report import Report
 from lidarsynth.files.formats import read_image, write
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 
@@ -273,6 +274,35 @@ def test_pairs_of_other_beams_are_told():
             of = "hdl-64e-kitti against hdl-64e"
             assert note == f"{told_of} of 2 samples are of other beams than their reference, first {of}"
     assert not told(ls.evaluate([street(0)], [street(1)], "iln-2022"), "other beams")
+
+
+def test_beams_that_differ_by_rounding_are_the_same(tmp_path: Path):
+    """A generator of float32 has them, and a file of a sensor says them in six digits."""
+    off = 1e-6 * np.random.default_rng(0).uniform(-1, 1, SENSOR.height)
+    rounded = replace(SENSOR, elevations=tuple((np.array(SENSOR.elevations) + off).tolist()))
+    samples, real = [street(seed) for seed in range(3)], [street(seed) for seed in range(10, 13)]
+    expected = ls.evaluate(samples, real)
+    for given, sensor in (([replace(i, sensor=rounded) for i in samples], None), (samples, rounded)):
+        report = ls.evaluate(given, real, sensor=sensor)
+        assert not told(report, "other beams") and not told(report, "is not used")
+        assert report.beams is not None and report.values == pytest.approx(expected.values, rel=1e-3)
+    mixed = ls.evaluate([samples[0], replace(samples[1], sensor=rounded)], real)
+    assert not told(mixed, "other beams") and mixed.values["range, per beam"] is not None
+    pairs = ls.evaluate([replace(samples[0], sensor=rounded)], real[:1], "iln-2022")
+    assert not told(pairs, "other beams")
+    other = replace(SENSOR, elevations=tuple((np.array(SENSOR.elevations) + 1e-3).tolist()))
+    assert not same_beams(SENSOR, other) and not same_beams(SENSOR, SENSOR.resized(32))
+
+
+def test_rays_without_return_are_counted_however_far_a_sensor_sees():
+    """Only the row of ranges needs the same bins."""
+    samples, real = [street(seed) for seed in range(3)], [street(seed) for seed in range(10, 13)]
+    nearer = replace(SENSOR, max_range=60.0)
+    expected = ls.evaluate(samples, real).values
+    report = ls.evaluate([replace(image, sensor=nearer) for image in samples], real)
+    assert report.values["no return, per beam"] == expected["no return, per beam"] and report.beams is None
+    (row,) = (result for result in report.results if result.name == "range, per beam")
+    assert row.value is None and "120 bins of 0.5 m" in row.reason
 
 
 def test_images_of_other_points_or_sensors_are_not_the_same():

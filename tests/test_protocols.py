@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lidarsynth.evaluation import pairs
 from lidarsynth.evaluation import report as evaluate
+from lidarsynth.evaluation.parts import merged
 from lidarsynth.evaluation.protocols import BEV_1, LIDARGEN, PROTOCOLS, R2DM, Network, get_protocol
 from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
@@ -132,8 +133,8 @@ def test_statistics_depend_neither_on_batches_nor_on_who_gathered_them(tmp_path:
     assert first.bev and whole.bev and torch.equal(first.bev.pooled, whole.bev.pooled)
     assert first.beams and whole.beams and np.array_equal(first.beams.histogram, whole.beams.histogram)
     real = gathered(images(9, seed=1), role="real")
-    for own, merged in zip(evaluate.results_of(whole, real), evaluate.results_of(first, real), strict=True):
-        assert own.value == pytest.approx(merged.value, rel=1e-5)
+    for own, its in zip(evaluate.results_of(whole, real), evaluate.results_of(first, real), strict=True):
+        assert own.value == pytest.approx(its.value, rel=1e-5)
     assert gathered(images(9, seed=2)).digest != whole.digest
 
 
@@ -256,3 +257,19 @@ def test_the_squared_mmd_is_drawn_from_the_kept_features_of_bounded_number():
     expected = kernel_distance(kept[0], kept[1], np.random.RandomState(0), 2, 4)
     found = {r.name: r.value for r in evaluate.results_of(*both)}
     assert found["FPD squared MMD"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_parts_merge_in_the_order_of_their_numbers_however_their_files_are_named(tmp_path: Path):
+    """As a shell's glob has them, 1, 10, 11, 2: the squared MMD's subsets are of other features in another order."""
+    protocol = replace(R2DM, networks=(Network("pointnet", (), "given", 8),), keep=16, subsets=2, subset_size=4)
+    values, drawn = np.random.default_rng(0).normal(size=(12, 2, 8)).astype(np.float32), images(12)
+    for i in range(12):
+        part = gathered(drawn[i : i + 1], protocol=protocol)
+        part.add_features("pointnet", values[i], [True, True])
+        save_statistics(tmp_path / f"part-{i + 1}.safetensors", part, {"part": f"{i + 1}/12"})
+    files = sorted(tmp_path.iterdir())
+    assert files[1].name == "part-10.safetensors"
+    for given in (files, files[::-1]):
+        total, told = merged(given, protocol)
+        assert not told and torch.equal(total.features("pointnet"), torch.from_numpy(values[:8].reshape(16, 8)))
+        assert total.bev and torch.equal(total.bev.scans, gathered(drawn, protocol=protocol).bev.scans)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from lidarsynth.evaluation.measures import LARGEST_SEED
 from lidarsynth.experiment.record import from_dict
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.small_file import read_toml
@@ -115,6 +116,8 @@ def read_config(
     methods = tuple(from_dict(table, f"{path}: method {i}", method) for i, table in enumerate(tables, 1))
     config = replace(from_dict(values, str(path), record), method=methods)
     _check_numbers(config, str(path))
+    if isinstance(config, Generation) and config.seed > LARGEST_SEED:  # `evaluate` takes it, too
+        raise ValueError(f"{path}.seed: expected at most {LARGEST_SEED}, found {config.seed}")
     for item in methods:
         _check_numbers(item, f"{path}: method {item.name!r}")
         _check_source(item, f"{path}: method {item.name!r}")

@@ -18,13 +18,13 @@ from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.setup import OnDone, Setup
 from lidarsynth.benchmark.sources import located
 from lidarsynth.benchmark.store import Seconds, Store
-from lidarsynth.evaluation.evaluate import evaluate
+from lidarsynth.evaluation.evaluate import GATHERED, evaluate
 from lidarsynth.evaluation.image_sets import ImageSet, image_set, sensor_of
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.statistics import definition
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.systems.scan_model import ScanModel
 
 Draw = Callable[[int, int], list[RangeImage]]  # seed of the first scan, how many -> scans
@@ -93,7 +93,7 @@ def generation_row(
     return replace(
         row,
         count=count,
-        reports={name: _judged(setup, config, name, kept, reference, store) for name in protocols_of(config)},
+        reports={name: _judged(setup, config, name, kept, reference, sensor, store) for name in protocols_of(config)},
         seconds=() if word or method.noise else store.seconds(count),
         evaluations=evaluations,
         published={name: published(name, method.published, reference.names, "") for name in protocols_of(config)},
@@ -116,9 +116,13 @@ def _judged(
     name: str,
     samples: Path | Sequence[RangeImage],
     reference: ImageSet,
+    sensor: Sensor,
     store: Store,
 ) -> dict[str, Any]:
-    """A protocol's report; one that lacks a network is made again, since it may be there the next time."""
+    """A protocol's report; one that lacks a network is made again, since it may be there the next time.
+
+    sensor  of samples that are points, where the file names none
+    """
     protocol = get_protocol(name)
 
     def judge() -> dict[str, Any]:
@@ -135,5 +139,14 @@ def _judged(
     def final(report: dict[str, Any]) -> bool:
         return "values" in report and all(report["values"][r.name]["value"] is not None for r in protocol.rows)
 
-    key = [definition(protocol), image_set(samples).stamp, reference.stamp, config.seed, config.sensor]
+    images, named = image_set(samples), get_sensor(config.sensor) if config.sensor else None
+    try:
+        width = images.sensor(named or sensor).width
+        if protocol.clouds:  # drawn for its networks as its own sensor sees them
+            width = named.width if named else protocol.width
+        weights = setup.weights(name, width)
+    except ValueError as error:
+        return {"reason": str(error)}
+    told = named and named.to_dict()  # what its file says now, not only how it is called
+    key = [definition(protocol), images.stamp, reference.stamp, config.seed, told, weights, GATHERED]
     return store.report(key, judge, final)

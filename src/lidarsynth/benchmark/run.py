@@ -21,6 +21,7 @@ from lidarsynth.benchmark.upsampling import Problem, upsampling_row
 from lidarsynth.evaluation.accumulation import OnImages
 from lidarsynth.evaluation.image_sets import emptied, image_set, sensor_of
 from lidarsynth.evaluation.pairs import classes_of
+from lidarsynth.evaluation.parts import ENDING
 from lidarsynth.evaluation.protocols import R2DM_UPSAMPLING, get_protocol
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
@@ -148,10 +149,13 @@ def _coloured(
 
 def generation(setup: Setup, config: Generation) -> Outcome:
     """Every method's scans meet the same reference. Raises ValueError for a reference that cannot be used."""
+    words = [word for method in config.method if (word := method.samples or method.held_out)]
+    for word in (config.reference, *words):
+        if word.endswith(ENDING):
+            raise ValueError(f"{word}: expected scans, which pictures show too, found statistics: evaluate takes them")
     reference = image_set(located(config.reference, setup.folder, config.sensor, setup.on_images))
-    for method in config.method:
-        if word := method.samples or method.held_out:  # its lack is told now, not after hours
-            image_set(located(word, setup.folder, config.sensor, setup.on_images))
+    for word in words:  # their lack is told now, not after hours
+        image_set(located(word, setup.folder, config.sensor, setup.on_images))
     first = get_protocol(protocols_of(config)[0])
     sensor = sensor_of(reference.item(0), get_sensor(config.sensor or first.sensor))
     found = [generation_row(setup, config, group, method, reference, sensor) for group, method in rows(config.method)]

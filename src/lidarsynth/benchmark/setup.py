@@ -44,6 +44,7 @@ class Setup:
     on_images: OnImages = None
     _judges: dict[tuple[str, int], Loaded] = field(default_factory=dict)
     _seen: dict[tuple[str, int], dict[int, np.ndarray]] = field(default_factory=dict)
+    _weights: dict[tuple[str, int], dict[str, str]] = field(default_factory=dict)
 
     def model(self, word: str | None) -> ScanModel | None:
         """The model of a word, None for None."""
@@ -91,6 +92,14 @@ class Setup:
         if (protocol, width) not in self._judges:
             self._judges[protocol, width] = self._loaded(protocol, width)
         return self._judges[protocol, width]
+
+    def weights(self, protocol: str, width: int) -> dict[str, str]:
+        """Kind -> SHA-256 of the networks that `evaluate` takes for a protocol of sets. Raises ValueError for a damaged
+        file."""
+        if (protocol, width) not in self._weights:
+            loaded = load_networks(get_protocol(protocol), width, on_images=self.on_images)
+            self._weights[protocol, width] = loaded.weights
+        return self._weights[protocol, width]
 
     def seen(self, protocol: str, width: int) -> dict[int, np.ndarray]:
         """Where `Pairs` keeps the classes that these networks see in the truths, the same for all methods."""

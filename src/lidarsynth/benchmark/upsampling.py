@@ -15,6 +15,7 @@ from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.setup import Setup
 from lidarsynth.benchmark.sources import Corrupted
 from lidarsynth.benchmark.store import Seconds, Store
+from lidarsynth.evaluation.evaluate import GATHERED
 from lidarsynth.evaluation.image_sets import emptied
 from lidarsynth.evaluation.pairs import Pairs, classes_of
 from lidarsynth.evaluation.protocols import get_protocol
@@ -115,5 +116,5 @@ def _judged(setup: Setup, name: str, data: Corrupted, store: Store, stamps: Sequ
         columns = dict(zip(ERRORS, map(list, zip(*errors, strict=True)), strict=True))
         return {"report": report, "errors": {k: v for k, v in columns.items() if pairs.lit or "reflectance" not in k}}
 
-    key = [definition(protocol), list(stamps), judges.weights]
+    key = [definition(protocol), list(stamps), judges.weights, GATHERED]
     return store.report(key, judge)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from operator import index
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -16,6 +17,7 @@ from lidarsynth.data.cache import sha256 as sha256_of_file
 from lidarsynth.evaluation import accumulation
 from lidarsynth.evaluation.accumulation import Loaded, OnImages, gather, load_networks, part_of, select, unlike_names
 from lidarsynth.evaluation.image_sets import ImageSet, Numbered, image_set, is_numbered, resized
+from lidarsynth.evaluation.measures import LARGEST_SEED
 from lidarsynth.evaluation.notes import (
     columns_apart,
     one_set,
@@ -29,6 +31,7 @@ from lidarsynth.evaluation.notes import (
     upside_down,
 )
 from lidarsynth.evaluation.pairs import Pairs, classes_of
+from lidarsynth.evaluation.parts import ENDING, merged, statistics_files
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
@@ -39,8 +42,6 @@ from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.networks.device import check_device
 from lidarsynth.weights.download import cache_folder
 
-ENDING = ".safetensors"  # of a file of statistics
-NAMED = 8  # parts that lack, of a note
 GATHERED = 3  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
@@ -65,7 +66,7 @@ def evaluate(
                such samples; or files of statistics that `gather_part` wrote, which are merged
     reference  the same. What is gathered of it stays in the cache folder, as a file of statistics to share
     sensor     of samples that are points or tensors, where neither the reference nor the protocol tells
-    seed       of the subsets of the squared MMDs
+    seed       of the subsets of the squared MMDs, below 2**32
     intensity  scale of files of points, as `read` takes it; "none" of scans without: rows that need it are N/A
 
     Published networks that a protocol asks for are downloaded once, as `load` downloads releases; rows whose network is
@@ -73,7 +74,7 @@ def evaluate(
     finite, statistics of another protocol, a device that is not here.
     """
     start = time.monotonic()
-    _check_numbers({"batch_size": (batch_size, 1), "seed": (seed, 0)})
+    batch_size, seed = _whole("batch_size", batch_size, 1), _whole("seed", seed, 0, LARGEST_SEED)
     check_device(device)
     record = protocol if isinstance(protocol, EvaluationProtocol) else get_protocol(protocol)
     judge = _judge_pairs if record.pairs else _judge_sets
@@ -83,11 +84,19 @@ def evaluate(
     return replace(report, seconds=time.monotonic() - start)
 
 
-def _check_numbers(numbers: Mapping[str, tuple[int, int]]) -> None:
-    """Raises ValueError by name unless each (number, least) is that at least."""
-    for name, (number, least) in numbers.items():
-        if number < least:
-            raise ValueError(f"expected a {name} of at least {least}, found {number}")
+def _whole(name: str, number: int, least: int, most: int | None = None) -> int:
+    """The number as Python's own. Raises ValueError by its name for one that is not whole, or out of its limits."""
+    try:
+        found = index(number)
+    except TypeError:
+        found = None
+    if found is None or isinstance(number, bool):
+        raise ValueError(f"expected a {name} that is a whole number, found {' '.join(repr(number).split()):.60}")
+    if found < least:
+        raise ValueError(f"expected a {name} of at least {least}, found {found}")
+    if most is not None and found > most:
+        raise ValueError(f"expected a {name} of at most {most}, found {found}")
+    return found
 
 
 @dataclass(frozen=True)
@@ -114,7 +123,7 @@ class _Run:
         """Of points and tensors that are judged against this."""
         if reference is None or self.sensor:
             return self.fallback()
-        if files := _statistics_files(_single(reference)):
+        if files := statistics_files(_single(reference)):
             return load_statistics(files[0], self.protocol)[0].sensor
         return self.sensor_of(self.images(reference), self.fallback())
 
@@ -213,7 +222,7 @@ class _Run:
 
 
 def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
-    files, real_files = _statistics_files(samples), _statistics_files(reference)
+    files, real_files = statistics_files(samples), statistics_files(reference)
     warnings, hashes, told = (), {}, {}
     real, truth = None, None
     judged = None if files else run.images(samples)  # first: what is wrong with these is said first
@@ -255,7 +264,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
 
 
 def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> Report:
-    if _statistics_files(samples) or _statistics_files(reference):
+    if statistics_files(samples) or statistics_files(reference):
         raise ValueError(f"{run.protocol.title} compares images one by one: expected images, found statistics")
     judged, truth = run.images(samples), run.images(reference)
     if len(judged) != len(truth):
@@ -296,14 +305,14 @@ def gather_part(
     intensity  as in `evaluate`
     Raises ValueError as `evaluate` does.
     """
-    _check_numbers({"batch_size": (batch_size, 1)})
+    batch_size = _whole("batch_size", batch_size, 1)
     check_device(device)
     record, out = get_protocol(protocol) if isinstance(protocol, str) else protocol, Path(out)
     samples = _single(samples)
     if out.suffix != ENDING or record.pairs:
         raise ValueError(f"{out}: expected a name that ends in {ENDING} and a protocol of sets, "
                          f"found {out.name[-20:]!r} and {record.name}")  # fmt: skip
-    if files := _statistics_files(samples):
+    if files := statistics_files(samples):
         statistics, lacking = merged(files, record)
         if lacking or part != "1/1":
             raise ValueError(*lacking or [f"expected the part 1/1 to merge files of statistics, found {part}"])
@@ -321,34 +330,6 @@ def gather_part(
     return save_statistics(out, statistics, {"source": images.source, "part": part})
 
 
-def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statistics, tuple[str, ...]]:
-    """One set of statistics of several files, and a warning where parts are lacking.
-
-    Raises ValueError where two hold the same images, or may: parts of different divisions.
-    """
-    loaded = [load_statistics(file, protocol) for file in files]
-    parts = [tuple(map(int, metadata.get("part", "1/1").split("/"))) for _, metadata in loaded]
-    digests = [statistics.digest for statistics, _ in loaded]
-    shared = [part for part in parts if part[1] > 1]
-    for i, file in enumerate(files):
-        again = int(digests[i], 16) and digests[i] in digests[:i]  # parts without an image are alike
-        if again or (parts[i] in shared and parts[i] in parts[:i]):
-            raise ValueError(f"{file}: expected a part of its own, found the images of another part")
-    if len({n for _, n in parts}) > 1:  # a whole beside parts, too: the images of these may be in it
-        raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in parts)}")
-    total, _ = loaded[0]
-    for file, (other, _) in zip(files[1:], loaded[1:], strict=True):
-        try:
-            total.merge(other)
-        except ValueError as error:
-            raise ValueError(f"{files[0]} and {file}: {error}") from None
-    if shared and len(shared) < (n := shared[0][1]):
-        lacking = [f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared]
-        more = f" and {len(lacking) - NAMED} more" if len(lacking) > NAMED else ""
-        return total, (f"expected all parts of the images, found none of {', '.join(lacking[:NAMED])}{more}",)
-    return total, ()
-
-
 def _single(samples: Samples) -> Samples:
     """A list of one path as the path. Raises ValueError for what is no set of scans."""
     if not isinstance(samples, str | Path) and not is_numbered(samples):
@@ -356,20 +337,6 @@ def _single(samples: Samples) -> Samples:
     if isinstance(samples, list | tuple) and len(samples) == 1 and isinstance(samples[0], str | Path):
         return samples[0]
     return samples
-
-
-def _statistics_files(source: Samples) -> list[Path]:
-    """The files of statistics that a source names, or [] where it names images. Raises ValueError for both at once."""
-    sources = [source] if isinstance(source, str | Path) else source if isinstance(source, list | tuple) else []
-    paths = [Path(item) for item in sources if isinstance(item, str | Path)]
-    if not [path for path in paths if path.suffix == ENDING]:
-        if len(paths) > 1 and len(paths) == len(sources):
-            raise ValueError(f"expected one folder or file of images, or several of statistics ({ENDING}), found "
-                             f"{', '.join(map(str, paths[:3]))}")  # fmt: skip
-        return []
-    if len(paths) != len(sources) or not all(path.suffix == ENDING for path in paths):
-        raise ValueError(f"expected only files of statistics ({ENDING}), or none, found {', '.join(map(str, sources))}")
-    return paths
 
 
 def _at_size(sensor: Sensor, like: Sensor) -> Sensor:

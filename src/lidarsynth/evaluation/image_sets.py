@@ -28,9 +28,9 @@ from lidarsynth.lidar.projection import project_thinned, thin
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, no_metres
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import check_regular
-from lidarsynth.networks.tensors import read_pickle
+from lidarsynth.networks.tensors import as_array, read_pickle, saved_shape
 
-TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen
+TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen, or (B, ...) of either
 Item: TypeAlias = RangeImage | Scan | Tensor
 HELD = "a range image, a scan, points (N, 3) or (N, 4), or a tensor (5, H, W) or (2, H, W)"  # by a list
 
@@ -153,8 +153,7 @@ def _taken(given: object, name: str) -> Item:
     if isinstance(given, RangeImage):
         return given
     if isinstance(given, Tensor):
-        given = given.detach().cpu()
-        given = given if given.ndim == 3 else given.float().numpy()
+        given = given.detach().cpu() if given.ndim == 3 else as_array(given)
     elif isinstance(given, np.ndarray) and given.ndim == 3:
         given = torch.from_numpy(np.ascontiguousarray(given))
     if isinstance(given, Tensor):
@@ -196,7 +195,10 @@ def stem_of(name: str) -> str:
 
 
 def _numbers(path: Path) -> Sequence[int | None]:
-    """Numbers of the images of a batch, by the header of its `.npz`; [None] for a file of one scan."""
+    """Numbers of the images of a batch, by the header of its `.npz` or `.pth`; [None] for a file of one scan."""
+    if path.suffix.lower() in TENSORS:
+        shape = saved_shape(path)
+        return range(shape[0]) if len(shape) == 4 else [None]
     if path.suffix.lower() != ".npz":
         return [None]
     try:
@@ -212,23 +214,26 @@ def _numbers(path: Path) -> Sequence[int | None]:
 def read_item(path: Path, number: int | None = None, intensity: str = "auto") -> Item:
     """A range image (our `.npz`), points of any readable file, or the tensor of a published sample (`.pth`).
 
-    number     which image of a batch: an `.npz` whose range, reflectance, mask, and label, xyz are (B, ...)
+    number     which image of a batch: an `.npz` whose range, reflectance, mask, and label, xyz are (B, ...), or tensors
+               (B, 5, H, W) or (B, 2, H, W)
     intensity  scale of points, as in `files.formats.read`
     Raises ValueError that begins with the path.
     """
+    if path.suffix.lower() in TENSORS:
+        tensor = _tensor(path, _stamp(path))
+        return tensor if number is None else tensor[number]
     if number is not None:
-        arrays = {name: array if name == "sensor" else array[number] for name, array in _batch(path).items()}
+        batch = _arrays(path, _stamp(path))
+        arrays = {name: array if name == "sensor" else array[number] for name, array in batch.items()}
         with naming(f"{path}[{number}]"):
             return image_of(arrays)
-    if path.suffix.lower() in TENSORS:
-        return _read_tensor(path)
     return read_image(path) if holds_image(path) else read(path, intensity)
 
 
-def _batch(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a batch as it is now."""
+def _stamp(path: Path) -> tuple[int, ...]:
+    """Of a file as it is now."""
     s = path.stat()
-    return _arrays(path, (s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino))
+    return s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino
 
 
 @lru_cache(maxsize=1)  # images of a batch are read one after the other
@@ -241,11 +246,13 @@ def _arrays(path: Path, stamp: tuple[int, ...]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _read_tensor(path: Path) -> Tensor:
+@lru_cache(maxsize=1)
+def _tensor(path: Path, stamp: tuple[int, ...]) -> Tensor:
     check_regular(path, MAX_BYTES)
     tensor = read_pickle(path, str(path))
     if not isinstance(tensor, Tensor):
-        raise ValueError(f"{path}: expected a tensor (5, H, W) or (2, H, W), found {type(tensor).__name__}")
+        raise ValueError(f"{path}: expected a tensor (5, H, W) or (2, H, W), or a stack of such, found "
+                         f"{type(tensor).__name__}")  # fmt: skip
     return tensor
 
 

@@ -20,9 +20,10 @@ from lidarsynth.metrics.neighbours import (
 )
 from lidarsynth.metrics.occupancy import Occupancy, cells_along, minimum_matching, total_variation
 from lidarsynth.metrics.point_sets import earth_movers_distance, sphere_counts
-from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
+from lidarsynth.metrics.sensor_report import BeamCounts, compare_beams, drop_rate_error
 from lidarsynth.metrics.sharpness import KINDS
 
+LARGEST_SEED = 2**32 - 1  # of the generator that `_kernel` draws from
 OnPair = Callable[[int, int], object] | None  # (done, in all), for progress bars
 SetDistances = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -67,20 +68,21 @@ def filled_scans(statistics: Statistics) -> Tensor:
 
 
 def _drop_rate(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    return _beams(samples, real).drop_rate_error
+    return drop_rate_error(*_beams(samples, real))
 
 
 def _beam_range(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
-    return _beams(samples, real).range_error
+    return compare_beams(*_beams(samples, real)).range_error
 
 
-def _beams(samples: Statistics, real: Statistics) -> BeamReport:
+def _beams(samples: Statistics, real: Statistics) -> tuple[BeamCounts, BeamCounts]:
+    """Of both sides. Raises ValueError where rows are no one's beams."""
     if not samples.beams or not real.beams:
         raise ValueError(f"{samples.protocol.title} does not count beams")
     for side, name in ((samples, "samples"), (real, "reference")):
         if side.others:
             raise ValueError(f"images of the {name} are of several sensors, so that rows are no one's beams")
-    return compare_beams(samples.beams, real.beams)
+    return samples.beams, real.beams
 
 
 def _sharpness(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:

@@ -10,6 +10,7 @@ from torch import Tensor
 from lidarsynth.evaluation.image_sets import ImageSet, Item, stem_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.sample_tensors import beams_off, columns_off
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
@@ -69,7 +70,7 @@ def _numbers(images: ImageSet) -> range:
 
 def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tuple[str, ...]:
     """Notes where a side, by some from everywhere, has tensors whose rows are other beams than the sensor's they are
-    taken for; or, unless a sensor was named for them, which rays those have that hold no points."""
+    taken for; or, unless a sensor was named for them, which rays and code of ranges those have that hold no points."""
     told = []
     for side, images in sides.items():
         tensors = [t for t in _some(images) if isinstance(t, Tensor) and t.ndim == 3] if images else []
@@ -81,7 +82,7 @@ def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tup
                         "from behind over the left: is x or y negated, or are they exchanged?")  # fmt: skip
         if named is None and any(len(tensor) == 2 for tensor in tensors):
             told.append(f"{side} are tensors without points, taken for the rays of {rays.name}: --sensor names others "
-                        f"({GRID})")  # fmt: skip
+                        f"({GRID}); and their ranges for LiDARGen's code log2(r + 1) / 6, no other")  # fmt: skip
     return tuple(told)
 
 
@@ -95,7 +96,7 @@ def unused_sensor(named: str | Sensor | None, images: ImageSet | None, own: Sens
         return ()
     first, given = images.item(0) if images else None, get_sensor(named)
     own = first.sensor if isinstance(first, RangeImage) else own
-    if given.height % own.height == 0 and given.resized(own.height, own.width).elevations == own.elevations:
+    if given.height % own.height == 0 and same_beams(given.resized(own.height, own.width), own):
         return ()
     drawn = images is not None and not isinstance(first, RangeImage)
     why = f"are drawn into the reference's images, of {own.name}" if drawn else f"know their own sensor, {own.name}"

@@ -15,6 +15,7 @@ from lidarsynth.evaluation.image_sets import Cloud, points_of
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.report import Report, Result, dark
 from lidarsynth.evaluation.statistics import hash_of, hash_of_points
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.metrics.reconstruction import (
@@ -67,7 +68,7 @@ class Pairs:
             if self.voxels is not None:
                 self.voxels.append(_voxels(result, truth))
             self._lit = [n + bool(i.reflectance.any()) for n, i in zip(self._lit, (result, truth), strict=True)]
-            if result.sensor.elevations != truth.sensor.elevations:
+            if not same_beams(result.sensor, truth.sensor):
                 self.others.append(f"{result.sensor.name} against {truth.sensor.name}")
             self._add_digests([hash_of(result), hash_of(truth)])
         if self.classes and results:

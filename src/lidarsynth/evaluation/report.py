@@ -13,6 +13,7 @@ from typing import Any
 from lidarsynth.evaluation.measures import MEASURES, SHARED, filled_scans, kept_distances
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
 
 DEFINITIONS = "## Definitions"  # every page has them
@@ -142,7 +143,7 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
                         f"{statistics.sensor.name}, which all are judged as")  # fmt: skip
         if "rangenet" in statistics.moments and 0 < statistics.lit < statistics.count:
             told.append(dark(statistics.count - statistics.lit, statistics.count, name))
-    if samples.sensor.elevations != real.sensor.elevations:
+    if not same_beams(samples.sensor, real.sensor):
         told.append(f"samples are of {samples.sensor.name}, the reference of {real.sensor.name}: other beams")
     return tuple(told)
 

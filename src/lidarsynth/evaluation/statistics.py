@@ -19,6 +19,7 @@ from lidarsynth.evaluation.features import cloud_features, drawn_again, features
 from lidarsynth.evaluation.image_sets import Cloud
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Side
 from lidarsynth.evaluation.protocols import get_protocol
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, from_dict
 from lidarsynth.lidar.small_file import LARGEST_WEIGHTS, check_regular
@@ -115,7 +116,7 @@ class Statistics:
         """
         for image in images:
             self._check(image)
-            self.others += image.sensor.elevations != self.sensor.elevations
+            self.others += not same_beams(image.sensor, self.sensor)
             self._digest = (self._digest + hash_of(image)) % (1 << 128)
         self.update_features([i for i, n in zip(images, features, strict=True) if n],
                              [b for b, n in zip(bev, features, strict=True) if n])  # fmt: skip

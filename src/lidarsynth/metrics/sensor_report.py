@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from lidarsynth.lidar.beams import same_beams
 from lidarsynth.lidar.sensor import Sensor
 
 
@@ -64,10 +65,10 @@ class BeamCounts:
         return np.where(total > 0, (reached.argmax(1) + 0.5) * self.step, np.nan)
 
 
-def check_comparable(a: BeamCounts, b: BeamCounts) -> None:
-    """Raises ValueError unless both count the same beams in the same bins; widths may differ."""
-    own, its = ((c.sensor.elevations, c.histogram.shape, c.step) for c in (a, b))
-    if own != its:
+def check_comparable(a: BeamCounts, b: BeamCounts, binned: bool = True) -> None:
+    """Raises ValueError unless both count the same beams, and where `binned` in the same bins; widths may differ."""
+    own, its = ((c.histogram.shape, c.step) for c in (a, b))
+    if not same_beams(a.sensor, b.sensor) or (binned and own != its):
         names = (
             f"{c.sensor.name} ({len(c.histogram)} beams, {c.histogram.shape[1]} bins of {c.step} m)" for c in (a, b)
         )
@@ -127,13 +128,27 @@ class BeamReport:
         return "\n".join(lines)
 
 
-def compare_beams(counts: BeamCounts, real: BeamCounts) -> BeamReport:
-    """The report of judged images against a reference. Raises ValueError for other beams or steps, or no images."""
-    check_comparable(counts, real)
+def drop_rate_error(counts: BeamCounts, real: BeamCounts) -> float:
+    """As `BeamReport.drop_rate_error`, also of ranges in other bins, which it does not look at.
+
+    Raises ValueError for other beams, or no images.
+    """
+    _check_both(counts, real, binned=False)
+    return float(np.abs(counts.drop_rate - real.drop_rate).mean())
+
+
+def _check_both(counts: BeamCounts, real: BeamCounts, binned: bool) -> None:
+    """Raises ValueError unless both are comparable, and have images."""
+    check_comparable(counts, real, binned)
     if not counts.pixels.all() or not real.pixels.all():
         raise ValueError(
             f"expected images on both sides, found {counts.pixels.max()} and {real.pixels.max()} rays per beam"
         )
+
+
+def compare_beams(counts: BeamCounts, real: BeamCounts) -> BeamReport:
+    """The report of judged images against a reference. Raises ValueError for other beams or steps, or no images."""
+    _check_both(counts, real, binned=True)
     with np.errstate(invalid="ignore"):  # a beam without returns has no histogram
         shares = [c.histogram.cumsum(1) / c.histogram.sum(1, keepdims=True) for c in (counts, real)]
     moved = np.abs(shares[0] - shares[1]).sum(1) * counts.step

@@ -49,6 +49,26 @@ def read_pickle(file: str | Path | BinaryIO, where: str, advice: str = "") -> An
     return plain(content, where)
 
 
+def saved_shape(path: Path) -> tuple[int, ...]:
+    """Of a file in which torch.save put one tensor, without its numbers; () of any other, and where the tensor claims
+    more numbers than the file has bytes."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = torch.load(path, map_location="meta", weights_only=True)
+    except Exception:  # `read_pickle` says what is wrong
+        return ()
+    return tuple(content.shape) if isinstance(content, Tensor) and content.numel() <= path.stat().st_size else ()
+
+
+def as_array(given: Any) -> Any:
+    """A tensor's numbers as an array, floating ones as float32, from any device; anything else as it is."""
+    if not isinstance(given, Tensor):
+        return given
+    given = given.detach().cpu()
+    return (given.float() if given.is_floating_point() else given).numpy()
+
+
 def plain(content: Any, where: str) -> Any:
     """The same tables and lists with every tensor detached. Raises ValueError for tensors that hold no plain numbers.
 

@@ -6,18 +6,16 @@ from abc import ABC
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
 from lidarsynth.experiment.record import Experiment, with_fields
 from lidarsynth.lidar.columns import as_scanned, usual_at_most
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import pixel_of_points
 from lidarsynth.lidar.recognition import lies_on, recognise
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 from lidarsynth.systems.denser import TIMES, beam_step, denser, spread
 from lidarsynth.systems.filling import Filling, whole
-from lidarsynth.systems.notes import IN_PYTHON
+from lidarsynth.systems.notes import IN_PYTHON, Points, taken
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
 if TYPE_CHECKING:
@@ -66,7 +64,7 @@ class AnySensorModel(ScanModel, ABC):
 
     def upsampled(
         self,
-        scan: Scan | np.ndarray,
+        scan: Points,
         how: Filling,
         sensor_in: Sensor | str | None = None,
         on_step: OnStep = None,
@@ -88,7 +86,7 @@ class AnySensorModel(ScanModel, ABC):
         if how.precision is not None:
             model = self.at_precision(how.precision)
             return model.upsampled(scan, replace(how, precision=None), sensor_in, on_step, times)
-        scan, times = as_scan(scan), TIMES if times is None else whole("times", times)
+        scan, times = taken(scan), TIMES if times is None else whole("times", times)
         own, how = self.suited_to(scan).sensor if sensor_in is None else get_sensor(sensor_in), self.resolved(how)
         sparse = check_seen(self.into(own).image_of(scan), len(scan))
         beams, dense, every = denser(own, beam_step(sparse), times)

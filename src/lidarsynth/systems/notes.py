@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeAlias
+
+import numpy as np
+from torch import Tensor
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
@@ -11,7 +14,9 @@ from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution
 from lidarsynth.lidar.view import beyond_beams, out_of_view
+from lidarsynth.networks.tensors import as_array
 
+Points: TypeAlias = Scan | np.ndarray | Tensor  # that a model is given: a scan, or (N, 3) or (N, 4), on any device
 IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
 
 
@@ -23,13 +28,18 @@ class Knows(Protocol):
     any_sensor: ClassVar[bool]
 
 
+def taken(points: Points) -> Scan:
+    """The points as a scan. Raises ValueError as `lidar.scan.as_scan`."""
+    return as_scan(as_array(points))
+
+
 def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: bool = False) -> Any:
-    """The scan or image, or an array as a scan, with a warning of what should be known of the result.
+    """The scan or image, or an array or tensor as a scan, with a warning of what should be known of the result.
 
     sensor   that made the scan, None = recognised
     filling  whether points are to be added
     """
-    scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
+    scan = scan if isinstance(scan, RangeImage) else taken(scan)
     if isinstance(scan, RangeImage):
         check_image(scan)
     else:

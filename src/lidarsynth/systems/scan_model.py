@@ -17,7 +17,7 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import Pixels, occupied, pixel_of_points, project_thinned
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, same_rays
 from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.systems.description import Description
@@ -25,7 +25,7 @@ from lidarsynth.systems.filling import Filling, check_counts, whole
 from lidarsynth.systems.hub import push
 from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
-from lidarsynth.systems.notes import made_by, noted, stranger
+from lidarsynth.systems.notes import Points, made_by, noted, stranger, taken
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -127,7 +127,7 @@ class ScanModel(ABC):
 
     def complete(
         self,
-        scan: Scan | RangeImage | np.ndarray,
+        scan: Points | RangeImage,
         known: np.ndarray | None = None,
         method: str = "auto",
         steps: int | None = None,
@@ -139,7 +139,7 @@ class ScanModel(ABC):
     ) -> RangeImage:
         """Fill what was not measured; what was comes back exactly.
 
-        scan       points, as a scan or an array (N, 3) x y z or (N, 4) x y z reflectance; or an image of this sensor
+        scan       points: a scan, array or tensor (N, 3) x y z or (N, 4) x y z reflectance; or an image of this sensor
         known      (H, W) bool: pixels to keep bit by bit, where an empty pixel means that nothing returned. None =
                    those measured, and of points also rays that only have some beyond the range limits
         method, steps, resamples, sampler, precision  as `Filling` says; which words and defaults, the class of the
@@ -155,7 +155,7 @@ class ScanModel(ABC):
 
     def upsample(
         self,
-        scan: Scan | np.ndarray,
+        scan: Points,
         sensor_in: Sensor | str | None = None,
         method: str = "auto",
         steps: int | None = None,
@@ -183,13 +183,13 @@ class ScanModel(ABC):
         with usual_torch():
             return self.upsampled(scan, how, sensor_in, on_step, times)
 
-    def realise(self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
+    def realise(self, scan: Points | RangeImage, sensor: Sensor | str | None = None, seed: int = 0) -> Scan:
         """A simulator's scan, in which every ray returns, as the real sensor would have reported it.
 
         Points that return stay bit by bit with their fields, and get a reflectance; others, and those out of the
         sensor's view or limits, are gone. Which ones is drawn from the seed.
 
-        scan    points, as a scan or an array (N, 3) x y z; their reflectance does not matter
+        scan    points: a scan, or an array or tensor (N, 3) x y z; their reflectance does not matter
         sensor  that the simulator plays; None = an image's own, else recognised from the points, or that of `into`
 
         Raises ValueError for a model that has not learned it, and where no point is in view.
@@ -206,13 +206,11 @@ class ScanModel(ABC):
         """Raises ValueError for a model that cannot `realise`."""
         raise self._lacks("which rays return")
 
-    def label(
-        self, scan: Scan | RangeImage | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0
-    ) -> Scan:
+    def label(self, scan: Points | RangeImage, sensor: Sensor | str | None = None, least: float = 0.0) -> Scan:
         """The scan, bit by bit, with the class of each point: SemanticKITTI's 1-19, 0 out of the sensor's view or
         limits.
 
-        scan    points, as a scan or an array (N, 3) x y z
+        scan    points: a scan, or an array or tensor (N, 3) x y z
         sensor  that made the scan; None = an image's own, else recognised from the points, or that of `into`
         least   points of whose class the network is less sure get 0 too; 0 to 1
 
@@ -238,13 +236,13 @@ class ScanModel(ABC):
 
     def filled(
         self,
-        scan: Scan | RangeImage | np.ndarray,
+        scan: Points | RangeImage,
         how: Filling,
         known: np.ndarray | None = None,
         on_step: OnStep = None,
     ) -> RangeImage:
         """`complete` of a record."""
-        scan = scan if isinstance(scan, RangeImage) else as_scan(scan)
+        scan = scan if isinstance(scan, RangeImage) else taken(scan)
         model = self if how.precision is None else self.at_precision(how.precision)
         model = model.suited_to(scan) if isinstance(scan, Scan) else model.suited_to_image(scan)
         if model is not self:
@@ -261,7 +259,7 @@ class ScanModel(ABC):
 
     def upsampled(
         self,
-        scan: Scan | np.ndarray,
+        scan: Points,
         how: Filling,
         sensor_in: Sensor | str | None = None,
         on_step: OnStep = None,
@@ -273,7 +271,7 @@ class ScanModel(ABC):
                              f"beams, found one with images of {self.sensor.name}")  # fmt: skip
         if how.precision is not None:
             return self.at_precision(how.precision).upsampled(scan, replace(how, precision=None), sensor_in, on_step)
-        scan = as_scan(scan)
+        scan = taken(scan)
         how, sensor_in = self.resolved(how), sensor_that_made(scan, sensor_in)
         sparse, known = sparse_image(scan, sensor_in, self.sensor)
         loose = replace(scan, ring=None)  # its rings are not the model's

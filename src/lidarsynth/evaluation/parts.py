@@ -1,0 +1,58 @@
+"""Files of statistics that several machines gathered, each of its part of the images, as one set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lidarsynth.evaluation.protocol import EvaluationProtocol
+from lidarsynth.evaluation.statistics import Statistics, load_statistics
+
+ENDING = ".safetensors"  # of a file of statistics
+NAMED = 8  # parts that lack, of a note
+
+
+def statistics_files(source: object) -> list[Path]:
+    """The files of statistics that a source names, or [] where it names images. Raises ValueError for both at once."""
+    sources = [source] if isinstance(source, str | Path) else source if isinstance(source, list | tuple) else []
+    paths = [Path(item) for item in sources if isinstance(item, str | Path)]
+    if not [path for path in paths if path.suffix == ENDING]:
+        if len(paths) > 1 and len(paths) == len(sources):
+            raise ValueError(f"expected one folder or file of images, or several of statistics ({ENDING}), found "
+                             f"{', '.join(map(str, paths[:3]))}")  # fmt: skip
+        return []
+    if len(paths) != len(sources) or not all(path.suffix == ENDING for path in paths):
+        raise ValueError(f"expected only files of statistics ({ENDING}), or none, found {', '.join(map(str, sources))}")
+    return paths
+
+
+def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statistics, tuple[str, ...]]:
+    """One set of statistics of several files, and a warning where parts are lacking.
+
+    Parts come in the order of their numbers, however the files are named and given: which features the subsets of the
+    squared MMD draw depends on their order. Wholes, which have none, stay as they are given.
+
+    Raises ValueError where two hold the same images, or may: parts of different divisions.
+    """
+    loaded = [load_statistics(file, protocol) for file in files]
+    parts = [tuple(map(int, metadata.get("part", "1/1").split("/"))) for _, metadata in loaded]
+    digests = [statistics.digest for statistics, _ in loaded]
+    shared = [part for part in parts if part[1] > 1]
+    for i, file in enumerate(files):
+        again = int(digests[i], 16) and digests[i] in digests[:i]  # parts without an image are alike
+        if again or (parts[i] in shared and parts[i] in parts[:i]):
+            raise ValueError(f"{file}: expected a part of its own, found the images of another part")
+    if len({n for _, n in parts}) > 1:  # a whole beside parts, too: the images of these may be in it
+        raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in parts)}")
+    first, *others = sorted(range(len(files)), key=parts.__getitem__)  # of equal ones in their own order
+    total, _ = loaded[first]
+    for i in others:
+        try:
+            total.merge(loaded[i][0])
+        except ValueError as error:
+            raise ValueError(f"{files[first]} and {files[i]}: {error}") from None
+    if shared and len(shared) < (n := shared[0][1]):
+        lacking = [f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared]
+        more = f" and {len(lacking) - NAMED} more" if len(lacking) > NAMED else ""
+        return total, (f"expected all parts of the images, found none of {', '.join(lacking[:NAMED])}{more}",)
+    return total, ()
