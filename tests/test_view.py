@@ -402,6 +402,38 @@ def test_many_ask_at_once_and_a_dead_one_holds_nobody_up(served: tuple[str, str,
     assert found == [packed(read_shown(folder / "0.npy"))] * 8
 
 
+def test_a_browser_that_went_away_is_no_fault(capsys: pytest.CaptureFixture[str]):
+    """While its scan was read, as a tab is closed, or the slider moved on: the socket is reset."""
+    asked, gone = threading.Event(), threading.Event()
+
+    class Slow:
+        names, count, cut = ["a"], 1, ()
+
+        def __getitem__(self, index: int) -> Shown:
+            if threading.current_thread() is not threading.main_thread():
+                asked.set()
+                gone.wait(30)
+            return Shown(turn())
+
+    show = Show("scans", {"scans": Slow()})
+    with serve(show) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        host = urlsplit(address(server, show)).netloc
+        with socket.create_connection((host.split(":")[0], int(host.split(":")[1]))) as browser:
+            browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            browser.sendall(f"GET /{show.token}/scan/0/0 HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+            assert asked.wait(30)
+        gone.set()
+        assert ask(host, f"/{show.token}/scan/0/0")[0] == 200
+        server.shutdown()
+        thread.join()
+    for other in threading.enumerate():
+        if "process_request_thread" in other.name:
+            other.join(30)
+    assert capsys.readouterr().err == ""
+
+
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     with pytest.raises(SystemExit) as end:
         main(["view", *arguments])
