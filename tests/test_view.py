@@ -273,8 +273,9 @@ def test_going_back_starts_at_the_mark_and_nothing_is_held():
     assert stream.count == 100 == len(stream.names)
 
 
-def test_partners_are_found_by_name_else_by_number(tmp_path: Path):
-    for folder, names in (("a", "xyz"), ("b", "zyxw"), ("c", "123")):
+def test_partners_are_found_by_name_or_by_number(tmp_path: Path):
+    """And where some have one of their name and others none, it is said: by number unlike ones would be compared."""
+    for folder, names in (("a", "xyz"), ("b", "zyxw"), ("c", "123"), ("d", "wxy"), ("e", "12")):
         (tmp_path / folder).mkdir()
         for i, name in enumerate(names):
             write(tmp_path / folder / f"{name}.npy", turn(far=10.0 + i))
@@ -285,8 +286,34 @@ def test_partners_are_found_by_name_else_by_number(tmp_path: Path):
 
     assert distances("b") == [12, 11, 10]
     assert distances("c") == [10, 11, 12]
-    with pytest.raises(ValueError, match=r"a: expected 4 scans to compare, or one of each name, found 3"):
-        compared([tmp_path / "b"], tmp_path / "a", Reading())
+    with pytest.raises(ValueError, match=r"e: expected 3 scans to compare, or one of each name, found 2"):
+        distances("e")
+    for one, other, told in (("b", "a", "1 of 4 scans, the first: w"), ("a", "d", "1 of 3 scans, the first: z")):
+        with pytest.raises(ValueError, match=f"{other}: expected a scan of each name, .* found none for {told}"):
+            compared([tmp_path / one], tmp_path / other, Reading())
+
+
+def test_scans_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """By their whole paths, and none takes the other's place."""
+    monkeypatch.chdir(tmp_path)
+    for folder, far in (("X/S", 10.0), ("S", 20.0), ("1 scan", 30.0), ("2 scans", 40.0)):
+        Path(folder).mkdir(parents=True)
+        write(Path(folder, "a.npy"), turn(far=far))
+
+    def seen(*paths: str) -> dict[str, int]:
+        *scans, other = map(Path, paths)
+        series = compared(scans, other, Reading())
+        return {caption: round(float(np.linalg.norm(scan[0].scan.xyz[0]))) for caption, scan in series.items()}
+
+    assert seen("X/S/a.npy", "S/a.npy") == {"X/S/a.npy": 10, "S/a.npy": 20}
+    assert seen("X/S", "S") == {"X/S": 10, "S": 20}
+    assert seen("S", "1 scan") == {"S": 20, "1 scan": 30}
+    write(Path("X/S/b.npy"), turn())
+    write(Path("2 scans/b.npy"), turn())
+    assert seen("X/S/a.npy", "X/S/b.npy", "2 scans") == {"2 scans": 10, str(tmp_path / "2 scans"): 40}
+    for same in ("./S", "S", str(tmp_path / "S")):
+        with pytest.raises(ValueError, match="S: expected another scan to compare, found the same"):
+            seen("S", same)
 
 
 @pytest.fixture
