@@ -273,6 +273,59 @@ def test_going_back_starts_at_the_mark_and_nothing_is_held():
     assert stream.count == 100 == len(stream.names)
 
 
+def test_frames_play_in_the_order_of_their_numbers(tmp_path: Path):
+    """In a folder and by a pattern, and of a data set; files that are named keep the order they were named in."""
+    drive, odometry = tmp_path / "drive", tmp_path / "sequences" / "2" / "velodyne"
+    for folder in (drive, odometry):
+        folder.mkdir(parents=True)
+        for k in (8, 9, 10, 11):
+            write(folder / f"frame_{k}.npy", turn(far=float(k)))
+    frames = [f"frame_{k}" for k in (8, 9, 10, 11)]
+    for found in (drive, Path(f"{drive}/frame_*"), tmp_path / "sequences"):
+        series = series_of([found], Reading())
+        assert list(series.names) == frames
+        assert [round(float(np.linalg.norm(series[i].scan.xyz[0]))) for i in range(4)] == [8, 9, 10, 11]
+    named = [drive / f"{frames[2]}.npy", drive / f"{frames[0]}.npy"]
+    assert list(series_of(named, Reading()).names) == [frames[2], frames[0]]
+
+
+def test_a_scan_without_intensities_is_shown_without_reflectance(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Alone, in a folder beside others, with its labels; where a scale was named, it is not there to be read."""
+    scan, page = turn(), tmp_path / "page.html"
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    np.save(folder / "a.npy", scan.xyz)
+    np.full(len(scan), 40, "<u4").tofile(folder / "a.label")
+    write(folder / "b.npy", scan)
+    bare, whole = series_of([folder], Reading())[0], series_of([folder], Reading())[1]
+    assert not bare.scan.reflectance.any() and bare.scan.label is not None and whole.notes == ()
+    (note,) = bare.notes
+    assert note.startswith(f"reflectance left out: {folder / 'a.npy'}: expected an intensity field")
+    assert note.endswith("found only x, y, z")
+    main(["view", str(folder), "--out", str(page)])
+    assert capsys.readouterr().err == "" and page.read_text().count('id="scan-') == 2
+    assert "a.npy: expected an intensity field" in refused(
+        capsys, str(folder / "a.npy"), "--out", str(page), "--intensity", "byte"
+    )
+    (folder / "c.npy").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"c\.npy: expected"):
+        read_shown(folder / "c.npy")
+
+
+def test_a_message_without_intensities_is_shown_without_reflectance(tmp_path: Path):
+    pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
+    scan = turn()
+    with write_bag(tmp_path / "a.mcap") as writer:
+        writer.write_cloud(
+            "/points", Cloud(1, "lidar", 1, {axis: scan.xyz[:, k].copy() for k, axis in enumerate("xyz")})
+        )
+    shown = series_of([tmp_path / "a.mcap"], Reading())[0]
+    np.testing.assert_array_equal(shown.scan.xyz, scan.xyz)
+    assert not shown.scan.reflectance.any() and "expected an intensity field" in shown.notes[0]
+    with pytest.raises(ValueError, match="expected an intensity field"):
+        series_of([tmp_path / "a.mcap"], Reading("unit"))[0]
+
+
 def test_partners_are_found_by_name_or_by_number(tmp_path: Path):
     """And where some have one of their name and others none, it is said: by number unlike ones would be compared."""
     for folder, names in (("a", "xyz"), ("b", "zyxw"), ("c", "123"), ("d", "wxy"), ("e", "12")):

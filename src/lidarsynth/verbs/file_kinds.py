@@ -17,7 +17,7 @@ from lidarsynth.data.frames import moved
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
-from lidarsynth.files.fields import FileError, scan_from_fields
+from lidarsynth.files.fields import WITHOUT, FileError, scan_from_fields
 from lidarsynth.files.formats import (
     READERS,
     fields_left_out,
@@ -115,7 +115,7 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
         told |= ({"beside": "; ".join(beside)} if beside else {}) | ({"left out": "; ".join(left)} if left else {})
         return scan_lines(*read, reading) | told
     except FileError as error:
-        if "--intensity none" not in str(error):
+        if WITHOUT not in str(error):
             raise
         return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | NO_INTENSITY
 
