@@ -97,6 +97,45 @@ def test_drives_whose_names_repeat_and_results_whose_scans_are_gone(scans: Path,
     assert len(list(inputs_of([drives / "d1" / "a.ply"], None, drives).stream())) == 1  # named: meant
 
 
+def test_scans_that_get_other_names_are_said_to_be_made_anew(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """As a file of a known name comes to another folder, and as it goes again; no more than once."""
+    drives, out = tmp_path / "drives", tmp_path / "out"
+    for drive, name in (("d1", "a.bin"), ("d2", "b.pcd"), ("d3", "a.bin")):
+        (drives / drive).mkdir(parents=True)
+        shutil.copy(scans / name, drives / drive)
+    (drives / "d3" / "a.bin").rename(tmp_path / "a.bin")
+    project(drives, out)
+    assert capsys.readouterr().err == "" and files(out) == ["a.npz", "b.npz", "report.json"]
+    (tmp_path / "a.bin").rename(drives / "d3" / "a.bin")
+    project(drives, out)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "found 2 scans under others, such as a.npz for d1/a.npz: made anew" in line
+    assert files(out) == ["a.npz", "b.npz", "d1/a.npz", "d2/b.npz", "d3/a.npz", "report.json"]
+    project(drives, out)
+    assert capsys.readouterr().err == ""
+    (out / "a.npz").unlink()
+    (drives / "d3" / "a.bin").unlink()
+    project(drives, out)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "found 1 scan under others, such as d1/a.npz for a.npz: made anew" in line, "b.npz is there"
+
+
+def test_bags_that_get_other_names_are_told_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+    for drive in ("d1", "d2"):
+        (tmp_path / "in" / drive).mkdir(parents=True)
+        bag(tmp_path / "in" / drive / "drive.bag", turn(SENSORS["vlp-16"]))
+    (tmp_path / "in" / "d2" / "drive.bag").rename(tmp_path / "later")
+    project(tmp_path / "in", tmp_path / "out")
+    (tmp_path / "later").rename(tmp_path / "in" / "d2" / "drive.bag")
+    assert capsys.readouterr().err == ""
+    project(tmp_path / "in", tmp_path / "out")
+    said = capsys.readouterr().err
+    assert "found 2 scans under others, such as drive/000000.npz for d1/drive/000000.npz" in said
+
+
 def test_turns_of_a_bag_do_not_take_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
     (tmp_path / "in").mkdir()

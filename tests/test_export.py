@@ -64,7 +64,8 @@ def test_the_last_known_place_by_counting_is_the_running_maximum(dim: int, share
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
-    ("width", "recipe"), [(64, "beams:4"), (128, "points:0.2"), (48, "sector:90"), (128, "region:3:9:-3:3")]
+    ("width", "recipe"),
+    [(64, "beams:4"), (128, "points:0.2"), (48, "sector:90"), (128, "region:3:9:-3:3"), (32, "beams:2")],
 )
 def test_the_fill_is_the_models_for_any_number_of_columns(exported: Exported, width: int, recipe: str):
     model = cascade().into(SENSOR.resized(width=width))
@@ -102,7 +103,7 @@ def test_the_file_says_what_it_is(exported: Exported):
     onnx.checker.check_model(proto)
     facts = {entry.key: entry.value for entry in proto.metadata_props}
     assert json.loads(facts["sensor"])["elevations"] == list(SENSOR.elevations)
-    assert facts["does"] == "completion in one step" and "multiple of 16" in facts["columns"]
+    assert facts["does"] == "completion in one step" and facts["columns"] == "any multiple of 16 from 32 to 4096"
     assert exported.opset == 18 and exported.inputs["range"] == (1, 1, 20, "columns")
     assert list(exported.outputs) == ["filled_range", "filled_reflectance", "confidence"]
     assert [path.name for path in exported.path.parent.iterdir()] == ["fill.onnx"]

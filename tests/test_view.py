@@ -273,8 +273,62 @@ def test_going_back_starts_at_the_mark_and_nothing_is_held():
     assert stream.count == 100 == len(stream.names)
 
 
-def test_partners_are_found_by_name_else_by_number(tmp_path: Path):
-    for folder, names in (("a", "xyz"), ("b", "zyxw"), ("c", "123")):
+def test_frames_play_in_the_order_of_their_numbers(tmp_path: Path):
+    """In a folder and by a pattern, and of a data set; files that are named keep the order they were named in."""
+    drive, odometry = tmp_path / "drive", tmp_path / "sequences" / "2" / "velodyne"
+    for folder in (drive, odometry):
+        folder.mkdir(parents=True)
+        for k in (8, 9, 10, 11):
+            write(folder / f"frame_{k}.npy", turn(far=float(k)))
+    frames = [f"frame_{k}" for k in (8, 9, 10, 11)]
+    for found in (drive, Path(f"{drive}/frame_*"), tmp_path / "sequences"):
+        series = series_of([found], Reading())
+        assert list(series.names) == frames
+        assert [round(float(np.linalg.norm(series[i].scan.xyz[0]))) for i in range(4)] == [8, 9, 10, 11]
+    named = [drive / f"{frames[2]}.npy", drive / f"{frames[0]}.npy"]
+    assert list(series_of(named, Reading()).names) == [frames[2], frames[0]]
+
+
+def test_a_scan_without_intensities_is_shown_without_reflectance(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Alone, in a folder beside others, with its labels; where a scale was named, it is not there to be read."""
+    scan, page = turn(), tmp_path / "page.html"
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    np.save(folder / "a.npy", scan.xyz)
+    np.full(len(scan), 40, "<u4").tofile(folder / "a.label")
+    write(folder / "b.npy", scan)
+    bare, whole = series_of([folder], Reading())[0], series_of([folder], Reading())[1]
+    assert not bare.scan.reflectance.any() and bare.scan.label is not None and whole.notes == ()
+    (note,) = bare.notes
+    assert note.startswith(f"reflectance left out: {folder / 'a.npy'}: expected an intensity field")
+    assert note.endswith("found only x, y, z")
+    main(["view", str(folder), "--out", str(page)])
+    assert capsys.readouterr().err == "" and page.read_text().count('id="scan-') == 2
+    assert "a.npy: expected an intensity field" in refused(
+        capsys, str(folder / "a.npy"), "--out", str(page), "--intensity", "byte"
+    )
+    (folder / "c.npy").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"c\.npy: expected"):
+        read_shown(folder / "c.npy")
+
+
+def test_a_message_without_intensities_is_shown_without_reflectance(tmp_path: Path):
+    pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
+    scan = turn()
+    with write_bag(tmp_path / "a.mcap") as writer:
+        writer.write_cloud(
+            "/points", Cloud(1, "lidar", 1, {axis: scan.xyz[:, k].copy() for k, axis in enumerate("xyz")})
+        )
+    shown = series_of([tmp_path / "a.mcap"], Reading())[0]
+    np.testing.assert_array_equal(shown.scan.xyz, scan.xyz)
+    assert not shown.scan.reflectance.any() and "expected an intensity field" in shown.notes[0]
+    with pytest.raises(ValueError, match="expected an intensity field"):
+        series_of([tmp_path / "a.mcap"], Reading("unit"))[0]
+
+
+def test_partners_are_found_by_name_or_by_number(tmp_path: Path):
+    """And where some have one of their name and others none, it is said: by number unlike ones would be compared."""
+    for folder, names in (("a", "xyz"), ("b", "zyxw"), ("c", "123"), ("d", "wxy"), ("e", "12")):
         (tmp_path / folder).mkdir()
         for i, name in enumerate(names):
             write(tmp_path / folder / f"{name}.npy", turn(far=10.0 + i))
@@ -285,8 +339,34 @@ def test_partners_are_found_by_name_else_by_number(tmp_path: Path):
 
     assert distances("b") == [12, 11, 10]
     assert distances("c") == [10, 11, 12]
-    with pytest.raises(ValueError, match=r"a: expected 4 scans to compare, or one of each name, found 3"):
-        compared([tmp_path / "b"], tmp_path / "a", Reading())
+    with pytest.raises(ValueError, match=r"e: expected 3 scans to compare, or one of each name, found 2"):
+        distances("e")
+    for one, other, told in (("b", "a", "1 of 4 scans, the first: w"), ("a", "d", "1 of 3 scans, the first: z")):
+        with pytest.raises(ValueError, match=f"{other}: expected a scan of each name, .* found none for {told}"):
+            compared([tmp_path / one], tmp_path / other, Reading())
+
+
+def test_scans_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """By their whole paths, and none takes the other's place."""
+    monkeypatch.chdir(tmp_path)
+    for folder, far in (("X/S", 10.0), ("S", 20.0), ("1 scan", 30.0), ("2 scans", 40.0)):
+        Path(folder).mkdir(parents=True)
+        write(Path(folder, "a.npy"), turn(far=far))
+
+    def seen(*paths: str) -> dict[str, int]:
+        *scans, other = map(Path, paths)
+        series = compared(scans, other, Reading())
+        return {caption: round(float(np.linalg.norm(scan[0].scan.xyz[0]))) for caption, scan in series.items()}
+
+    assert seen("X/S/a.npy", "S/a.npy") == {"X/S/a.npy": 10, "S/a.npy": 20}
+    assert seen("X/S", "S") == {"X/S": 10, "S": 20}
+    assert seen("S", "1 scan") == {"S": 20, "1 scan": 30}
+    write(Path("X/S/b.npy"), turn())
+    write(Path("2 scans/b.npy"), turn())
+    assert seen("X/S/a.npy", "X/S/b.npy", "2 scans") == {"2 scans": 10, str(tmp_path / "2 scans"): 40}
+    for same in ("./S", "S", str(tmp_path / "S")):
+        with pytest.raises(ValueError, match="S: expected another scan to compare, found the same"):
+            seen("S", same)
 
 
 @pytest.fixture
@@ -400,6 +480,38 @@ def test_many_ask_at_once_and_a_dead_one_holds_nobody_up(served: tuple[str, str,
         thread.join(30)
     idle.close()
     assert found == [packed(read_shown(folder / "0.npy"))] * 8
+
+
+def test_a_browser_that_went_away_is_no_fault(capsys: pytest.CaptureFixture[str]):
+    """While its scan was read, as a tab is closed, or the slider moved on: the socket is reset."""
+    asked, gone = threading.Event(), threading.Event()
+
+    class Slow:
+        names, count, cut = ["a"], 1, ()
+
+        def __getitem__(self, index: int) -> Shown:
+            if threading.current_thread() is not threading.main_thread():
+                asked.set()
+                gone.wait(30)
+            return Shown(turn())
+
+    show = Show("scans", {"scans": Slow()})
+    with serve(show) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        host = urlsplit(address(server, show)).netloc
+        with socket.create_connection((host.split(":")[0], int(host.split(":")[1]))) as browser:
+            browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            browser.sendall(f"GET /{show.token}/scan/0/0 HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+            assert asked.wait(30)
+        gone.set()
+        assert ask(host, f"/{show.token}/scan/0/0")[0] == 200
+        server.shutdown()
+        thread.join()
+    for other in threading.enumerate():
+        if "process_request_thread" in other.name:
+            other.join(30)
+    assert capsys.readouterr().err == ""
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

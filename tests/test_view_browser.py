@@ -5,6 +5,8 @@ import io
 import json
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +17,11 @@ from PIL import Image
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.pictures.colours import height_colours, label_colours, range_colours, reflectance_colours
-from lidarsynth.verbs.inputs import Reading
+from lidarsynth.verbs.inputs import Loaded, Reading
 from lidarsynth.viewer.packing import Shown
 from lidarsynth.viewer.page import Entry, write_page
 from lidarsynth.viewer.pairs import compared
+from lidarsynth.viewer.series import Stream
 from lidarsynth.viewer.server import Show, address, serve
 
 PROGRAM = find()
@@ -254,6 +257,91 @@ def test_the_screenshot_holds_view_and_strips(page: Page, alone: str):
     assert shot.shape == (view + 2 * 78, 1280, 3)
     assert colours_in(shot[view:]) > 100
     assert (shot[80:95, 16:256].max(axis=2) > 100).mean() > 0.5, "the legend"
+
+
+def test_the_screenshot_says_what_a_scan_lacks(page: Page, tmp_path: Path):
+    path, bare = tmp_path / "view.html", Scan(street().xyz)
+    write_page(path, "pair", [Entry("pair", {"after": Shown(street()), "before": Shown(bare)})])
+    page.open(path.as_uri())
+    page.run("$('words').querySelector('[data-word=confidence]').click()")
+    page.run("go(0, 1)")
+    assert page.run("$('legend').textContent") == "this scan has no confidence"
+    shot = pixels(base64.b64decode(page.run("pictureNow().toDataURL('image/png')").partition(",")[2]))
+    page.run("$('legend').replaceChildren(made('p', 'note', ''))")
+    empty = pixels(base64.b64decode(page.run("pictureNow().toDataURL('image/png')").partition(",")[2]))
+    assert (shot[80:98, 16:240] != empty[80:98, 16:240]).any(), "the words stand where the legend would"
+
+
+@contextmanager
+def on_a_server(page: Page, show: Show) -> Iterator[None]:
+    """The page open on a server of these scans; it must not have complained."""
+    with serve(show) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            page.open(address(server, show))
+            yield
+        finally:
+            server.shutdown()
+            thread.join()
+    assert page.errors == []
+
+
+def test_of_the_scan_before_nothing_stays(page: Page, tmp_path: Path):
+    """Neither what was read off it, nor, where the next one is broken, anything of it."""
+    write(tmp_path / "0.ply", street(20_000))
+    (tmp_path / "0.json").write_text(json.dumps({"boxes": [BOX]}))
+    write(tmp_path / "1.ply", street(20_000, 1))
+    (tmp_path / "2.ply").write_bytes(b"ply\nnot at all")
+    with on_a_server(page, Show("folder", compared([tmp_path], None, Reading()))):
+        page.run("pointAt(7)")
+        assert "range" in page.run("$('readout').textContent")
+        page.run("go(1)")
+        assert page.run("$('readout').textContent") == ""
+        page.run("go(0)")
+        page.run("go(2)")
+        page.settle()
+        assert page.run("$('where').textContent") == "3 / 3" and page.run("state.scan") is None
+        assert drawn(page).sum() == 0 and page.run("scene.lines.length") == 0
+        for of in ("facts", "words", "unit", "legend", "notes", "strips"):
+            assert page.run(f"$('{of}').textContent + $('{of}').childElementCount") == "0", of
+        assert page.run("$('with-boxes').hidden") is True
+        page.key("p")
+        page.run("go(0)")
+        assert drawn(page).sum() > 1000 and page.run("$('strips').childElementCount") == 3
+
+
+def test_a_first_scan_that_is_broken_is_no_fault_of_the_page(page: Page, tmp_path: Path):
+    (tmp_path / "0.ply").write_bytes(b"ply\nnot at all")
+    write(tmp_path / "1.ply", street(20_000))
+    with on_a_server(page, Show("folder", compared([tmp_path], None, Reading()))):
+        assert page.run("$('with-boxes').hidden") is True
+        for wanted in (0, 1):
+            page.run("$('rings').click()")
+            assert page.run("scene.lines.length") == wanted
+
+
+def test_nobody_goes_back_from_the_first_to_a_last_that_is_not_known(page: Page):
+    items = [StandIn(f"item {k}", Path(), street(2_000, k)) for k in range(3)]
+    stream = Stream(lambda mark, number: ((0, item) for item in items), None)
+    with on_a_server(page, Show("capture", {"capture": stream})):
+        asked = "((before) => { step(-1); return state.wanted !== before; })(state.wanted)"
+        assert page.run(asked) is False
+        page.run("go(3)")  # behind the last
+        assert page.run("source.count") == 3 and page.run("state.number") == 0 and page.run(asked) is True
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """A turn of a capture."""
+
+    name: str
+    path: Path
+    scan: Scan
+
+    def read(self) -> Loaded:
+        """The scan."""
+        return Loaded(self.scan, {}, 0)
 
 
 def test_a_folder_from_the_server(page: Page, tmp_path: Path):

@@ -13,7 +13,9 @@ def export(
     model: Positional[Source],
     out: Annotated[Positional[Path], arg(metavar="OUT.onnx", help="file to write.")],
     sensor: Annotated[SensorWord, arg(help="of the images, for a model of any sensor; default the model's.")] = None,
-    any_columns: Annotated[bool, arg(help="leave the number of columns open, in multiples of 16; of default.")] = False,
+    any_columns: Annotated[
+        bool, arg(help="leave the number of columns open, from 32 on in multiples of 16; of default.")
+    ] = False,
     seed: NoSeed = 0,
 ) -> None:
     """Write a model as ONNX: completion in one step of default, kitti, kitti-streets; of others a denoising step.

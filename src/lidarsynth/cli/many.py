@@ -151,6 +151,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
     from lidarsynth.verbs.batch_report import (
         is_mixed,
         merge_shards,
+        other_names,
         parse_shard,
         remove_report,
         report_of,
@@ -166,6 +167,8 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending, report = many.format or ("npz" if job.verb == "project" else "ply"), report_path(out, shard)
     before = rows_before(out, shard, ending) if many.skip_existing else {}
+    if (told := other_names(out, ending, before, inputs.places)) is not None:
+        warn(told)
     known = {file for file, row in before.items() if "errors" in row} if job.corrupt else None  # else no mean of all
     stream = works(inputs, out, ending, shard, many.skip_existing, skipped, job.beside, known)
     first = next(stream, None)

@@ -35,12 +35,12 @@ def is_bag(path: str | Path) -> bool:
 
 
 def _tells_of_a_bag(path: Path) -> bool:
-    """Whether a file is the metadata of a ROS 2 bag: data sets have others of that name, and a killed recording may
-    have none that tells."""
-    if not path.is_file():
-        return False
-    with suppress(OSError), path.open("rb") as file:
-        return KEY in file.read(LOOKED_AT)
+    """Whether a file is the metadata of a ROS 2 bag: data sets have others of that name, a killed recording may have
+    none that tells, and of a folder that cannot be read nobody knows."""
+    with suppress(OSError):
+        if path.is_file():
+            with path.open("rb") as file:
+                return KEY in file.read(LOOKED_AT)
     return False
 
 

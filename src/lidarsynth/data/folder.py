@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from lidarsynth.data.frames import Frame, Frames
+from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import NAMED_ONLY, READERS
 
 # Folders of published data sets, and of ours, whose .bin and .pcd hold a value a point, or a radar's points: no scans.
@@ -50,18 +53,51 @@ def scan_files(root: str | Path) -> list[Path]:
 
 
 def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
-    """The scan files under a folder as `scan_files`, and files of these further endings; there may be none.
+    """The scan files under a folder as `scan_files`, and files of these further endings; there may be none. Raises
+    FileError for a folder that cannot be read.
 
     Links to nothing, as of data that were not fetched, and pipes, of such names are among them: reading tells of them.
     """
     endings = (*(suffix for suffix in READERS if suffix not in NAMED_ONLY), *more)
-    named = (path for path in root.rglob("*") if path.name.lower().endswith(endings))
+    named = (here / name for here, _, files in walk(root) for name in files if name.lower().endswith(endings))
     return sorted(path for path in named if not _beside(path.relative_to(root)) and _is_meant(path))
 
 
+def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Each folder at and under `root` with the names of its folders and of its files, as `os.walk`, which leaves out
+    folders that are taken out of that list; through links to folders elsewhere, too.
+
+    A folder comes once, however many links lead to it, and those that lead to what holds `root`, or into it, are not
+    gone through: links in a circle end. Raises FileError for a folder that cannot be read.
+    """
+    check_readable(root)
+    home = Path(os.path.realpath(root))
+    seen: set[Path] = set()
+    for here, folders, files in os.walk(root, followlinks=True):
+        kept = []
+        for path in (Path(here, name) for name in sorted(folders)):
+            real = Path(os.path.realpath(path))
+            around = path.is_symlink() and (home == real or home in real.parents or real in home.parents)
+            if not around and real not in seen:
+                check_readable(path)
+                kept.append(path.name)
+                seen.add(real)
+        folders[:] = kept
+        yield Path(here), folders, files
+
+
+def check_readable(folder: Path) -> None:
+    """Raises FileError for a folder that nobody gave the right to list, or to look into."""
+    try:
+        os.stat(os.path.join(folder, os.curdir))
+        os.scandir(folder).close()
+    except OSError as error:
+        raise FileError(f"{folder}: expected a readable folder, found: {error.strerror}") from None
+
+
 def _is_meant(path: Path) -> bool:
-    """Whether a name is of a file, or of what stands for one."""
-    return path.is_file() or not (path.is_dir() or path.name.startswith(LOCK))
+    """Whether a name that is of no folder is of a file, or of what stands for one."""
+    return path.is_file() or not path.name.startswith(LOCK)
 
 
 def stem(path: Path) -> str:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from lidarsynth.data.dataset import INDEX, CachedImages
-from lidarsynth.data.folder import scans_below
+from lidarsynth.data.folder import check_readable, scans_below
 from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor, within
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
@@ -128,6 +128,8 @@ def image_set(source: str | Path | Numbered, intensity: str = "auto") -> ImageSe
             raise ValueError("expected at least one range image, found an empty list")
         return ImageSet(names, lambda i: _taken(source[i], names[i]), "a list of images", "")
     path = Path(source)
+    if path.is_dir():
+        check_readable(path)
     if (path / INDEX).is_file():
         cache = CachedImages(path)
         names = tuple("/".join(cache.name(i)[1:]) for i in range(len(cache)))

@@ -47,6 +47,7 @@ NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found
 
 SCALES: dict[str, float] = {"unit": 1.0, "byte": 255.0, "uint16": 65535.0}  # intensity -> the value of reflectance 1
 INTENSITIES = ("auto", *SCALES, "none")
+WITHOUT = "--intensity none takes it for 0"  # ends what is said of a scan that could be read so
 
 
 class FileError(ValueError):
@@ -83,7 +84,7 @@ def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, 
         values = np.zeros(len(x), np.float32)
     elif name is None:
         raise FileError(f"expected an intensity field ({', '.join(NAMES['reflectance'][:4])}), "
-                        f"found {_listed(fields)}; --intensity none takes it for 0")  # fmt: skip
+                        f"found {_listed(fields)}; {WITHOUT}")  # fmt: skip
     else:
         values = _numbers(fields[name], name)
     keep = _returned(x, y, z)
@@ -197,7 +198,7 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
             values, high = np.minimum(values, limit), limit
     limit = SCALES[intensity]
     if low < 0 or high > limit:
-        way = "; --intensity none takes it for 0" if low < 0 else ""  # as of decibels
+        way = f"; {WITHOUT}" if low < 0 else ""  # as of decibels
         raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}{way}")
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
 

@@ -9,11 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.verbs.batch import MEANT, Result
 from lidarsynth.verbs.earlier_results import journal_path, made_rows, read_report
+from lidarsynth.verbs.expansion import is_stream
 
 REPORT = "report.json"
 Shard = tuple[int, int]  # this part, counted from 1, and all parts
@@ -111,6 +113,28 @@ def rows_before(out: Path, shard: Shard, ending: str) -> dict[Path, dict[str, An
             file = out / f"{row['name']}.{ending}"
             rows[file] = row | {"target": str(file)}
     return rows
+
+
+def other_names(
+    out: Path, ending: str, before: Mapping[Path, Mapping[str, Any]], places: Mapping[Path, str]
+) -> str | None:
+    """What is to be said of the scans of `rows_before` that get other names now, as names of new ones repeat theirs, or
+    no longer do: their results are not found, but made anew. None where there are none.
+
+    places  of the scans, as of `Inputs`
+    """
+    now = {path.absolute(): place for path, place in places.items()}
+    found = []
+    for file, row in before.items():
+        place = now.get(source := Path(row["source"]).absolute())
+        name = f"{place}/{Path(row['name']).name}" if is_stream(source) else place
+        if place is not None and name != row["name"] and file.exists():
+            found += [(file.relative_to(out), made)] if not (out / (made := f"{name}.{ending}")).exists() else []
+    if not found:
+        return None
+    (old, new), count = found[0], plural(len(found), "scan")
+    return (f"{out}: expected results of earlier runs under the names that scans get now, found {count} under others, "
+            f"such as {old} for {new}: made anew, and the old files stay")  # fmt: skip
 
 
 def begin_journal(report: Path, rows: Iterable[Mapping[str, Any]]) -> None:

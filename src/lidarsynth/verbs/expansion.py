@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lidarsynth.data.bags import is_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import by_number, scan_files, scans_below, stem
+from lidarsynth.data.folder import by_number, scan_files, scans_below, stem, walk
 from lidarsynth.files.formats import READERS
 from lidarsynth.verbs.earlier_results import EarlierResults
 
@@ -26,12 +26,12 @@ def is_stream(path: Path) -> bool:
 
 def streams_below(folder: Path) -> list[Path]:
     """The bags and captures under a folder, at any depth, 2 before 10; a folder that is a bag is one, whatever it
-    holds."""
+    holds. Raises FileError for a folder that cannot be read."""
     found: list[Path] = []
-    for here, folders, files in os.walk(folder):
-        bags = {name for name in folders if is_bag(Path(here, name))}
+    for here, folders, files in walk(folder):
+        bags = {name for name in folders if is_bag(here / name)}
         folders[:] = [name for name in folders if name not in bags]
-        found += filter(is_stream, (Path(here, name) for name in (*bags, *files)))
+        found += filter(is_stream, (here / name for name in (*bags, *files)))
     return sorted(found, key=by_number)
 
 

@@ -22,6 +22,7 @@ from lidarsynth.systems.scan_model import ScanModel
 from lidarsynth.systems.table import graph_of
 
 OPSET = 18
+LEAST = 2  # blocks of columns, where these are open: one alone is narrower than what is put around it
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def export_onnx(model: ScanModel, path: str | Path, sensor: str | None = None, o
     """Write the model as ONNX: completion in one step of a cascade and of conditional models, else a denoising step.
 
     sensor        of the images, for a model of any sensor; None = the model's own
-    open_columns  inputs may have any number of columns, in multiples of 16, up to 4,096
+    open_columns  inputs may have any number of columns, in multiples of 16, from 32 to 4,096
 
     The file's metadata name the sensor (JSON), what inputs and outputs are, the model and its licence.
     A folder that is not there is made. Raises ValueError for other models, for a name without .onnx, and where the
@@ -85,7 +86,7 @@ def _program(graph: Graph) -> Any:
         from onnxscript import optimizer
     except ImportError:
         raise ValueError("expected the packages onnx and onnxscript; pip install 'lidarsynth[onnx]'") from None
-    columns = torch.export.Dim("blocks", min=2, max=LONGEST // graph.multiple) * graph.multiple
+    columns = torch.export.Dim("blocks", min=LEAST, max=LONGEST // graph.multiple) * graph.multiple
     shapes = {name: {3: columns} for name in graph.inputs} if graph.open_columns else None
     module = graph.module.cpu()
     with _quiet(), torch.no_grad():
@@ -136,7 +137,7 @@ def _describe(proto: Any, model: ScanModel, graph: Graph) -> None:
         **{f"about {name}": text for name, text in graph.says.items() if name in (*graph.inputs, *graph.outputs)},
     }
     if graph.open_columns:
-        facts["columns"] = f"any multiple of {graph.multiple} up to {LONGEST}"
+        facts["columns"] = f"any multiple of {graph.multiple} from {LEAST * graph.multiple} to {LONGEST}"
     proto.producer_name = "lidarsynth"
     for key, value in facts.items():
         entry = proto.metadata_props.add()

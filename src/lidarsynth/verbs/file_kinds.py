@@ -12,12 +12,12 @@ import numpy as np
 from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, metadata_from, open_bag
 from lidarsynth.data.capture import is_capture
-from lidarsynth.data.folder import scan_files
+from lidarsynth.data.folder import check_readable, scan_files, walk
 from lidarsynth.data.frames import moved
 from lidarsynth.data.index import INDEX, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
-from lidarsynth.files.fields import FileError, scan_from_fields
+from lidarsynth.files.fields import WITHOUT, FileError, scan_from_fields
 from lidarsynth.files.formats import (
     READERS,
     fields_left_out,
@@ -55,6 +55,8 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
     Raises FileError, in one line, for a file that is broken or of no kind that is known, or holds no scan to move, or
     no packets that metadata could be of.
     """
+    if path.is_dir():
+        check_readable(path)
     model = path.name in (WEIGHTS, RECORD) or (path.is_dir() and (path / RECORD).exists())
     model = model or path.suffix.lower() in MODELS
     absent = not path.exists()
@@ -115,7 +117,7 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
         told |= ({"beside": "; ".join(beside)} if beside else {}) | ({"left out": "; ".join(left)} if left else {})
         return scan_lines(*read, reading) | told
     except FileError as error:
-        if "--intensity none" not in str(error):
+        if WITHOUT not in str(error):
             raise
         return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | NO_INTENSITY
 
@@ -243,7 +245,8 @@ def _folder(path: Path, reading: Reading) -> Lines:
 def _counted(folder: Path | None, scans: list[Path]) -> str:
     """Files by ending, the most first: the scans, or what else is below `folder`."""
     beside = set(scans)
-    files = scans if folder is None else [p for p in folder.rglob("*") if p.is_file() and p not in beside]
+    below = (here / name for here, _, names in walk(folder) for name in names) if folder is not None else ()
+    files = scans if folder is None else [path for path in below if path.is_file() and path not in beside]
     kinds = Counter(sorted(ending(file.name) for file in files))
     listed = [f"{count} {kind}" for kind, count in kinds.most_common(8)]
     return ", ".join(listed) + (", ..." if len(kinds) > 8 else "")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -182,6 +182,8 @@ class Inputs:
     passed   bags and captures in a folder of scan files, which alone are read
     below    scans below the output folder that are not read, though no report there tells of them
     cut      what is to be said, a line each, of bags that end early
+    places   where the result of each file belongs below the output folder, without an ending, and in which folder there
+             those of each bag or capture
     """
 
     single: bool
@@ -191,6 +193,7 @@ class Inputs:
     passed: tuple[Path, ...] = ()
     cut: tuple[str, ...] = ()
     below: tuple[Path, ...] = ()
+    places: Mapping[Path, str] = field(default_factory=dict)
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -244,7 +247,8 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
                 yield BrokenInput(folders[path], path, str(error))  # the others go on
 
     inside = [p for folder in filter(is_folder, paths) for p in streams_below(folder) if p not in streams]
-    return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below)
+    places = {item.path: item.name for item in files} | folders
+    return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below, places)
 
 
 def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | None, bool]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lidarsynth.data.folder import stem
-from lidarsynth.files.fields import FileError, dropped_points
+from lidarsynth.files.fields import WITHOUT, FileError, dropped_points
 from lidarsynth.files.formats import left_out, read_with_report
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
@@ -22,8 +23,29 @@ def read_shown(path: Path, intensity: str = "auto", rings: tuple[int, int] | Non
 
     Labels: NAME.label beside it or in ../labels, as SemanticKITTI has them. Boxes: NAME.json beside it or in a folder
     `boxes` up to three levels up, as `lidarsynth streets` writes them. Of a file of several sensors `rings` are the
-    first and last to show. Raises FileError for the scan itself.
+    first and last to show. A scan whose intensity is missing, or none of ours, is shown without reflectance where
+    `intensity` is "auto": the page needs none. Raises FileError for the scan itself.
     """
+    try:
+        return _shown(path, intensity, rings)
+    except FileError as error:
+        if not can_do_without(error, intensity):
+            raise
+        shown = _shown(path, "none", rings)
+        return replace(shown, notes=(without_reflectance(error), *shown.notes))
+
+
+def can_do_without(error: FileError, intensity: str) -> bool:
+    """Whether nothing but its intensity keeps a scan from being read, and nobody has said what that is."""
+    return intensity == "auto" and WITHOUT in str(error)
+
+
+def without_reflectance(error: FileError) -> str:
+    """The note of a scan that is shown without."""
+    return f"reflectance left out: {error}".removesuffix(f"; {WITHOUT}")
+
+
+def _shown(path: Path, intensity: str, rings: tuple[int, int] | None) -> Shown:
     labels = next((p for p in _label_places(path) if p.is_file()), None)
     notes: list[str] = []
     try:

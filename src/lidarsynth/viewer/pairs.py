@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,21 +17,23 @@ MOST = 48  # scans in one file; every one is about a megabyte
 
 
 def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dict[str, Series]:
-    """Series by caption: the scans, and those of `other`, joined by name where all have a partner, else by number.
+    """Series by caption: the scans, and those of `other`, joined by name where all have a partner, by number where
+    none has one. Captions are names, or whole paths where these are alike.
 
-    Raises ValueError where there is nothing to show, or the two differ in number.
+    Raises ValueError where there is nothing to show, `other` is the same, some have a partner and others none, or the
+    two differ in number.
     """
     if other is None:
         return {_caption(paths): series_of(paths, reading)}
+    first, second = _captions(paths, other)
     scans = series_of(paths, _own(paths, [other], reading))
     partners = series_of([other], _own([other], paths, reading))
     if isinstance(scans, Files) and isinstance(partners, Files):
-        partners = _by_name(scans, partners)
+        partners = _by_name(scans, partners, other)
     if None not in (scans.count, partners.count) and scans.count != partners.count:
         number = plural(scans.count or 0, "scan")
         raise ValueError(f"{other}: expected {number} to compare, or one of each name, found {partners.count}")
-    first, second = _caption(paths), _caption([other])
-    return {first: scans, second if second != first else str(other): partners}
+    return {first: scans, second: partners}
 
 
 def _own(paths: Sequence[Path], others: Sequence[Path], reading: Reading) -> Reading:
@@ -41,15 +43,35 @@ def _own(paths: Sequence[Path], others: Sequence[Path], reading: Reading) -> Rea
     return replace(reading, topic=reading.topic if topic else None, metadata=reading.metadata if metadata else None)
 
 
-def _caption(paths: Sequence[Path]) -> str:
-    return paths[0].absolute().name if len(paths) == 1 else f"{len(paths)} scans"
+def _name(path: Path) -> str:
+    return path.absolute().name
 
 
-def _by_name(scans: Files, partners: Files) -> Files:
-    """The partners in the scans' order, where every scan has one of its name; else as they are."""
+def _caption(paths: Sequence[Path], word: Callable[[Path], str] = _name) -> str:
+    return word(paths[0]) if len(paths) == 1 else f"{len(paths)} scans"
+
+
+def _captions(paths: Sequence[Path], other: Path) -> tuple[str, str]:
+    """Of the scans and of `other`: their names, or paths where these are alike. Raises ValueError for the same path."""
+    if [path.absolute() for path in paths] == [other.absolute()]:
+        raise ValueError(f"{other}: expected another scan to compare, found the same")
+    words = (_name, str, lambda path: str(path.absolute()))
+    pairs = ((_caption(paths, word), _caption([other], word)) for word in words)
+    return next((first, second) for first, second in pairs if first != second)
+
+
+def _by_name(scans: Files, partners: Files, other: Path) -> Files:
+    """The partners in the scans' order, where every scan has one of its name; as they are where none has one.
+
+    Raises ValueError otherwise: by number, scans of unlike names would stand beside each other."""
     place = {name: i for i, name in enumerate(partners.names)}
-    if not all(name in place for name in scans.names):
+    alone = [name for name in scans.names if name not in place]
+    if len(alone) == len(scans.names):
         return partners
+    if alone:
+        number = f"{len(alone)} of {plural(len(scans.names), 'scan')}"
+        raise ValueError(f"{other}: expected a scan of each name, or of none, found none for {number}, the first: "
+                         f"{alone[0]}")  # fmt: skip
     order = [place[name] for name in scans.names]
     return Files(scans.names, [partners.paths[i] for i in order], partners.reading, partners.cut)
 

@@ -6,16 +6,17 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Protocol
 
 from lidarsynth.data.bags import is_bag, metadata_from, open_bag
-from lidarsynth.data.folder import scan_files
+from lidarsynth.data.folder import by_number, scan_files
 from lidarsynth.data.frames import moved
 from lidarsynth.data.whole_turns import TimedTurn
-from lidarsynth.files.fields import dropped_points
-from lidarsynth.verbs.inputs import FileInput, Input, MessageInput, Reading, inputs_of
-from lidarsynth.viewer.beside import read_shown
+from lidarsynth.files.fields import FileError, dropped_points
+from lidarsynth.verbs.inputs import FileInput, Input, Loaded, MessageInput, Reading, TurnInput, inputs_of
+from lidarsynth.viewer.beside import can_do_without, read_shown, without_reflectance
 from lidarsynth.viewer.packing import Shown
 
 SCAN_FOLDERS = ("velodyne", "LIDAR_TOP")  # of data sets that have other files of the same ending beside their scans
@@ -77,8 +78,8 @@ class Stream:
 
     def __getitem__(self, index: int) -> Shown:
         item = self._thread.submit(self._at, index).result()
-        loaded = item.read()
-        notes = (dropped_points(loaded.dropped),) if loaded.dropped else ()
+        loaded, notes = _read(item)
+        notes += (dropped_points(loaded.dropped),) if loaded.dropped else ()
         notes += (loaded.left_out,) if loaded.left_out else ()
         return Shown(loaded.scan, notes=notes, name=item.name)
 
@@ -102,16 +103,29 @@ class Stream:
         raise IndexError(index)
 
 
+def _read(item: Input) -> tuple[Loaded, tuple[str, ...]]:
+    """A scan, also one that has no intensity, as of files, and then the note of that."""
+    try:
+        return item.read(), ()
+    except FileError as error:
+        known = isinstance(item, FileInput | MessageInput | TurnInput)
+        if not (known and can_do_without(error, item.reading.intensity)):
+            raise
+        return replace(item, reading=replace(item.reading, intensity="none")).read(), (without_reflectance(error),)
+
+
 def series_of(paths: Sequence[Path], reading: Reading) -> Series:
     """The scans of files, folders, globs, bags and captures. Raises ValueError where there is nothing to show."""
     if len(paths) == 1 and is_bag(paths[0]):
         return _bag(paths[0], reading)
-    inputs = inputs_of([found for path in paths for found in _scans_only(path)], reading)
+    given = [found for path in paths for found in _scans_only(path)]
+    inputs = inputs_of(given, reading)
     files: list[FileInput] = []
     for item in inputs.stream():
         if not isinstance(item, FileInput):  # of a capture, or of one bag of several
             return Stream(lambda mark, number: ((0, item) for item in inputs.stream()), inputs.count, inputs.cut)
         files.append(item)
+    files = _in_order(files, given)
     return Files([item.name for item in files], [item.path for item in files], reading, inputs.words)
 
 
@@ -123,7 +137,21 @@ def _scans_only(path: Path) -> list[Path]:
         found = [p for p in scan_files(path) if p.parent.name in SCAN_FOLDERS]
     except ValueError:
         return [path]  # a folder of bags, or of nothing
-    return sorted(found, key=lambda p: (p.parent.parent if p.parent.name == "velodyne" else path, p.name)) or [path]
+    drives = {p: p.parent.parent if p.parent.name == "velodyne" else path for p in found}
+    return sorted(found, key=lambda p: (by_number(drives[p]), by_number(Path(p.name)))) or [path]
+
+
+def _in_order(files: Sequence[FileInput], given: Sequence[Path]) -> list[FileInput]:
+    """The files as their paths, folders and patterns were given; those of one folder or pattern 2 before 10, as bags
+    are, so that frames play in their order."""
+    place = {path: i for i, path in enumerate(given)}
+
+    def found_by(item: FileInput) -> int:
+        return next((place[path] for path in (item.path, *item.path.parents) if path in place), -1)
+
+    return [
+        item for _, those in groupby(files, found_by) for item in sorted(those, key=lambda one: by_number(one.path))
+    ]
 
 
 def _bag(path: Path, reading: Reading) -> Stream:

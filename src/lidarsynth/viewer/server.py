@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
@@ -90,6 +91,11 @@ class _Handler(BaseHTTPRequestHandler):
     def __init__(self, show: Show, text: bytes, policy: str, *connection: Any):
         self.show, self.text, self.policy = show, text, policy
         super().__init__(*connection)
+
+    def handle(self) -> None:
+        """All requests of a connection, which ends where the browser has gone away: that is no fault to print."""
+        with suppress(ConnectionError):
+            super().handle()
 
     def do_GET(self) -> None:
         """The page under /TOKEN/, a scan under /TOKEN/scan/NUMBER/VERSION."""

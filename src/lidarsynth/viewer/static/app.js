@@ -24,14 +24,15 @@ async function go(number, version = state.version) {
   try {
     const scan = await source.load(number, version);
     if (state.wanted !== wanted) return;
-    Object.assign(state, { number, version, scan, mark: null });
+    Object.assign(state, { number, version, scan });
     show("");
   } catch (error) {
     if (error instanceof End) return go(0, version);
     if (state.wanted !== wanted) return;
-    Object.assign(state, { number, version });
+    Object.assign(state, { number, version, scan: null }); // the one before is not what its name says
     show(error.message);
   }
+  pointAt(null); // which was one of the scan before
   refresh();
   if (state.number + 1 < source.reach(state.number)) source.load(state.number + 1, state.version).catch(paintBar);
 }
@@ -44,7 +45,16 @@ function refresh() {
     if (!canColour(state.scan, colourings[state.word]) && !wordsHere().includes(state.word)) state.word = "range";
     paintPanel();
     recolour(true);
-  }
+  } else clear();
+}
+
+// Nothing is left of a scan before one that cannot be read; the choice of colours stays for the next.
+function clear() {
+  scene.setPoints(Float32Array.of(), Uint8Array.of());
+  scene.setLines([]);
+  for (const id of ["facts", "words", "unit", "legend", "notes", "strips"]) $(id).replaceChildren();
+  $("with-boxes").hidden = true;
+  motion.redraw();
 }
 
 // Colours of which any scan of this pair has the fields: a switch to the one without keeps the choice.
@@ -70,7 +80,7 @@ function recolour(moved = false) {
 function relines() {
   const layers = [];
   if ($("rings").checked) layers.push(ringLines(RINGS, settings.ground));
-  if ($("boxes").checked && state.scan.boxes.length) layers.push(boxLines(state.scan.boxes));
+  if ($("boxes").checked && state.scan?.boxes.length) layers.push(boxLines(state.scan.boxes));
   scene.setLines(layers);
 }
 
@@ -139,6 +149,7 @@ function press(id, word) {
 
 function step(by) {
   const reach = source.reach(state.number);
+  if (state.number + by < 0 && source.count === null) return; // nobody knows yet which scan is the last
   go((state.number + by + reach) % reach);
 }
 

@@ -28,22 +28,24 @@ function pictureNow() {
 }
 
 function writeCaption(context) {
-  const by = colourings[state.word], caption = source.captions(state.number)[state.version];
+  const caption = source.captions(state.number)[state.version], legend = $("legend");
   context.font = "13px system-ui, sans-serif";
   context.textBaseline = "top";
   const lines = [source.name(state.number) + (source.captions(state.number).length > 1 ? `, ${caption}` : ""), $("facts").textContent];
   lines.forEach((line, k) => { context.fillStyle = k ? "#8d97a6" : "#dfe4ea"; context.fillText(line, 16, 14 + 20 * k); });
   context.fillText($("unit").textContent, 16, 62);
-  if (by.shades) {
-    context.drawImage($("legend").querySelector("canvas"), 16, 82, 240, 10);
-    for (const label of $("legend").querySelectorAll(".ticks span")) {
+  if (legend.querySelector("canvas")) {
+    context.drawImage(legend.querySelector("canvas"), 16, 82, 240, 10);
+    for (const label of legend.querySelectorAll(".ticks span")) {
       const share = parseFloat(label.style.left) / 100;
       context.textAlign = share < 0.03 ? "left" : share > 0.97 ? "right" : "center";
       context.fillText(label.textContent, 16 + 240 * share, 96);
     }
     context.textAlign = "left";
+  } else if (legend.querySelector(".note")) { // a scan without that field
+    context.fillText(legend.textContent, 16, 82);
   } else {
-    [...$("legend").querySelectorAll(".class")].forEach((row, k) => {
+    [...legend.querySelectorAll(".class")].forEach((row, k) => {
       context.fillStyle = row.querySelector("i").style.background;
       context.fillRect(16, 84 + 19 * k, 10, 10);
       context.fillStyle = "#8d97a6";
