@@ -48,6 +48,13 @@ def beneath(told: Tensor, returned: Tensor, closed: Tensor) -> Tensor:
 
 def _wide(told: Tensor) -> Tensor:
     """(B, 1, H, W) bool: pixels in, or beside the middle of, five columns of a row of which nothing is told."""
-    wide = (1, 2 * REACH + 1)
-    near = F.max_pool2d(ring(told.float(), REACH), wide, 1)
-    return F.max_pool2d(ring(1 - near, REACH), wide, 1) > 0.5
+    return _beside(~_beside(told))
+
+
+def _beside(part: Tensor) -> Tensor:
+    """(B, 1, H, W) bool: whether any pixel within REACH columns is of the part, (B, 1, H, W) bool."""
+    around, width = ring(part, REACH), part.shape[3]
+    found = part
+    for first in range(2 * REACH + 1):
+        found = found | around[..., first : first + width]
+    return found
