@@ -343,7 +343,7 @@ def test_what_is_cast_has_a_box_and_its_returns_a_number(tilt: tuple[float, floa
         assert box.points == own.sum() > 50
         assert set(image.label[own]) == {PERSON if box.kind == "person" else CAR}
         inside = in_box(box, points[own])
-        assert inside.mean() > 0.97 if tilt == (0.0, 0.0) else 0.9  # boxes stand upright in the sensor's frame
+        assert inside.mean() > (0.97 if tilt == (0.0, 0.0) else 0.9)  # boxes stand upright in the sensor's frame
         x, y, yaw = {"car": (9, 3, 0.4), "person": (-6, 5, 0), "van": (3, -12, 1.5)}[box.kind]
         assert np.linalg.norm((to_sensor @ box.centre)[:2] - (x, y)) < 0.7
         if box.kind != "person":
@@ -391,9 +391,8 @@ def test_nothing_is_cast_in_another(rough: bool) -> None:
     row = [standing("car", number, 7, y, 1.5) for number, y in ((0, -4.6), (1, 0.0), (2, 4.4))]
     image = scene(SENSOR, *row, standing("person", 1, 4, 5, 0))
     image = blob(image, CAR) if rough else image
-    boxes = [box for seed in range(4) for box in recast(image, np.random.default_rng(seed)).boxes]
-    assert len(boxes) >= 8
-    for k in range(4):
-        some = recast(image, np.random.default_rng(k)).boxes
-        stands = [np.array([*box.centre[:2], box.yaw, box.size[0] / 2, box.size[1] / 2]) for box in some]
+    each = [recast(image, np.random.default_rng(seed)).boxes for seed in range(4)]
+    assert sum(map(len, each)) >= 8
+    for boxes in each:
+        stands = [np.array([*box.centre[:2], box.yaw, box.size[0] / 2, box.size[1] / 2]) for box in boxes]
         assert not any(meet(one, other) for i, one in enumerate(stands) for other in stands[:i])

@@ -289,8 +289,8 @@ class CascadeModel(AnySensorModel):
         places, rng, sensor = grid_of(self.sensor), generators(checked_seed(seed), len(images)), self.sensor
         rays_of = partial(self._grid_rays, count=len(images))
         with one_thread():
-            grid = told_of(images, *places), places, rays_of, sensor, unevenness(sensor), rng
-            grid = detailed(self.network, *grid)
+            parts = told_of(images, *places), places, rays_of, sensor, unevenness(sensor), rng
+            grid = detailed(self.network, *parts)
         return textured(*self._whole(*grid, rng), rng)
 
     def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
