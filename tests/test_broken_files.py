@@ -216,11 +216,8 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
 
 
 def test_write_refuses_what_is_no_scan(tmp_path: Path):
-    for wrong, found in (([[1, 2, 3]], "a scan or an array of points, found a list"),
-                         (np.zeros((5, 5)), r"points of .*, found \(5, 5\) of float64"),
-                         (np.full((5, 3), np.nan), "finite points, found NaN")):  # fmt: skip
-        with pytest.raises(files.FileError, match=f"scan.bin: expected {found}"):
-            files.write(tmp_path / "scan.bin", wrong)  # type: ignore[arg-type]
+    with pytest.raises(files.FileError, match=r"scan.bin: expected a Scan or a RangeImage, found ndarray"):
+        files.write(tmp_path / "scan.bin", np.zeros((5, 4), np.float32))  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
 

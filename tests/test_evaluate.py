@@ -610,8 +610,7 @@ def test_tensors_of_other_beams_than_they_are_taken_for_are_noted(tmp_path: Path
         points,
     )
     assert notes("lidargen") == ["samples are tensors without points, taken for the rays of hdl-64e-kitti: --sensor "
-                                 "names others (R2DM's grid is hdl-64e); and their ranges for LiDARGen's code "
-                                 "log2(r + 1) / 6, no other"]  # fmt: skip
+                                 "names others (R2DM's grid is hdl-64e)"]  # fmt: skip
     assert notes("lidargen", side=1)[0].startswith("the reference are tensors without points")
     assert not [text for text in ls.evaluate(tmp_path / "r2dm", STREETS[:2]).warnings if "tensors" in text]
 

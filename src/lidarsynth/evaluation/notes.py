@@ -70,7 +70,7 @@ def _numbers(images: ImageSet) -> range:
 
 def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tuple[str, ...]:
     """Notes where a side, by some from everywhere, has tensors whose rows are other beams than the sensor's they are
-    taken for; or, unless a sensor was named for them, which rays and code of ranges those have that hold no points."""
+    taken for; or, unless a sensor was named for them, which rays those have that hold no points."""
     told = []
     for side, images in sides.items():
         tensors = [t for t in _some(images) if isinstance(t, Tensor) and t.ndim == 3] if images else []
@@ -82,7 +82,7 @@ def tensors_taken(sides: Sides, rays: Sensor, named: str | Sensor | None) -> tup
                         "from behind over the left: is x or y negated, or are they exchanged?")  # fmt: skip
         if named is None and any(len(tensor) == 2 for tensor in tensors):
             told.append(f"{side} are tensors without points, taken for the rays of {rays.name}: --sensor names others "
-                        f"({GRID}); and their ranges for LiDARGen's code log2(r + 1) / 6, no other")  # fmt: skip
+                        f"({GRID})")  # fmt: skip
     return tuple(told)
 
 

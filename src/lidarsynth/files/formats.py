@@ -26,7 +26,7 @@ from lidarsynth.files.fields import (
 )
 from lidarsynth.files.labels import label_path, read_labels, read_words, words_of
 from lidarsynth.files.whole_numbers import stray
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import whole_file
 
@@ -152,25 +152,21 @@ def sensor_in(path: str | Path) -> Sensor | None:
     return read_image(path).sensor if image else None
 
 
-def write(path: str | Path, scan: Scan | RangeImage | np.ndarray) -> None:
-    """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given; an
-    array (N, 3) x y z or (N, 4) x y z reflectance as the scan that `as_scan` makes of it.
+def write(path: str | Path, scan: Scan | RangeImage) -> None:
+    """Save a scan, or a range image, by the end of the name: .bin .npy .npz .pcd .ply, float32 exactly as given.
 
     An image keeps its range, reflectance, mask, label, measured points and sensor in `.npz`; elsewhere it becomes
     points. `.bin` and `.npy` hold x y z reflectance only, and of a labelled scan the labels where `label_path` says; of
     a filled one `new` beside them in a `.new` file, a byte a point, and `confidence` in a `.confidence` file, a float32
     a point; such marks of another scan that would be taken for this one's are removed. The others hold ring, time,
     label and every further field too. The file appears whole or not at all: it is written beside its place, then
-    renamed. Raises FileError, before anything is written, for anything else, for numbers that would not come back (a
-    ring of -1, a class of 20, text as a field), and for a `.bin` of no point: it would be a file of no byte, which
-    `read` takes for one that was cut off.
+    renamed. Raises FileError, before anything is written, for anything else, such as an array, for numbers that would
+    not come back (a ring of -1, a class of 20, text as a field), and for a `.bin` of no point: it would be a file of no
+    byte, which `read` takes for one that was cut off.
     """
     path = Path(path)
     if not isinstance(scan, Scan | RangeImage):
-        try:
-            scan = as_scan(scan)
-        except ValueError as error:
-            raise FileError(f"{path}: {error}") from None
+        raise FileError(f"{path}: expected a Scan or a RangeImage, found {type(scan).__name__}")
     if path.name.lower().endswith(".pcd.bin"):
         raise FileError(f"{path}: expected a name that ends in {', '.join(WRITERS)} to write, found .pcd.bin")
     suffix = _suffix(path, WRITERS, "write")

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarsynth.lidar.marks import confidences, marks_of
 from lidarsynth.lidar.recognition import first_row
-from lidarsynth.lidar.scan import RangeImage, Scan, as_scan
+from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
 
 PROJECTIONS = ("auto", "spherical", "unfolding")
@@ -20,15 +20,10 @@ Pixels = tuple[np.ndarray, np.ndarray]  # row and column of each point, as `pixe
 
 
 def project(
-    scan: Scan | np.ndarray,
-    sensor: Sensor | str,
-    method: str = "auto",
-    width: int | None = None,
-    pixels: Pixels | None = None,
+    scan: Scan, sensor: Sensor | str, method: str = "auto", width: int | None = None, pixels: Pixels | None = None
 ) -> RangeImage:
     """Draw a scan into the sensor's image; the nearest point of a pixel wins (R2DM, section III-A).
 
-    scan    or points (N, 3) x y z or (N, 4) x y z reflectance, as `as_scan` takes them
     method  `spherical`: row by elevation; `unfolding`: row by ring (Triess et al. 2020), from `scan.ring` or from the
             point order; `auto`: unfolding where the scan has as many rings as the sensor has beams, or rings that lie
             on its beams, wherever their numbers begin (`first_row`), else spherical; also on an even grid, whose rows
@@ -39,7 +34,8 @@ def project(
     Points outside the range limits leave their pixel empty, also where they hide a farther point, as in the published
     program. Raises ValueError for an unknown method, and for unfolding when the points do not come ring by ring.
     """
-    scan = scan if isinstance(scan, Scan) else as_scan(scan)  # a scan is taken as it is
+    if not isinstance(scan, Scan):
+        raise ValueError(f"expected a Scan, found a {type(scan).__name__}")
     sensor = get_sensor(sensor)
     sensor = sensor if width is None else sensor.resized(width=width)
     if method not in PROJECTIONS:

@@ -68,10 +68,12 @@ def _by_name(scans: Files, partners: Files, other: Path) -> Files:
     alone = [name for name in scans.names if name not in place]
     if len(alone) == len(scans.names):
         return partners
-    if alone:
+    if alone and len(scans.names) == len(partners.names):  # of unlike numbers it is said below
         number = f"{len(alone)} of {plural(len(scans.names), 'scan')}"
         raise ValueError(f"{other}: expected a scan of each name, or of none, found none for {number}, the first: "
                          f"{alone[0]}")  # fmt: skip
+    if alone:
+        return partners
     order = [place[name] for name in scans.names]
     return Files(scans.names, [partners.paths[i] for i in order], partners.reading, partners.cut)
 
