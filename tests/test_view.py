@@ -343,9 +343,7 @@ def test_partners_are_found_by_name_or_by_number(tmp_path: Path):
         distances("e")
     with pytest.raises(ValueError, match=r"a: expected 4 scans to compare, or one of each name, found 3"):
         compared([tmp_path / "b"], tmp_path / "a", Reading())
-    with pytest.raises(
-        ValueError, match=r"d: expected a scan of each name, .* 1 of 3 scans, the first: z"
-    ):
+    with pytest.raises(ValueError, match=r"d: expected a scan of each name, .* 1 of 3 scans, the first: z"):
         distances("d")
 
 
