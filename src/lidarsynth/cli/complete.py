@@ -30,6 +30,10 @@ def complete(
     scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
     out: Annotated[Path, arg(help="file to write, as in upsample; a folder where there are several scans; or a bag.")],
     corrupt: Recipe = None,
+    without: Annotated[
+        str | None,
+        arg(metavar="CLASSES", help="take these away, such as car,person or traffic, and fill what they hid, no more."),
+    ] = None,
     model: Filler = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -47,9 +51,11 @@ def complete(
     """Fill what a scan lacks: every measured point stays, bit by bit, and new ones are added.
 
     With --corrupt a part of the scan is hidden first. The file then holds what the rest was filled to, and the errors
-    of the hidden pixels are printed beside those of interpolation.
+    of the hidden pixels are printed beside those of interpolation. With --without what was measured of these classes,
+    as the file's labels or the network name them, is gone instead, and what stands behind is filled in.
     """
     from lidarsynth.lidar.corruption import check_recipe
+    from lidarsynth.lidar.removal import removable
     from lidarsynth.systems.filling import Filling
     from lidarsynth.verbs.batch import Job
     from lidarsynth.verbs.description import errors_table, mean_table
@@ -58,7 +64,10 @@ def complete(
     at_least(0, {"seed": seed})
     if corrupt is not None:
         check_recipe(corrupt)
-    how = Filling(method, steps, resamples, seed=seed, precision=precision)
+        if without is not None:
+            raise ValueError("expected --corrupt or --without, found both")
+    removed = None if without is None else removable(without)
+    how = Filling(method, steps, resamples, seed=seed, precision=precision, removed=removed)
     job = Job(
         "complete",
         model,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from operator import index
+
+OnStep = Callable[[], object] | None  # called after every network step, for progress bars
 
 
 def whole(name: str, number: int) -> int:
@@ -34,6 +37,7 @@ class Filling:
     sampler    a word of the system
     seed       of all randomness
     precision  auto, fp32 or bf16, as `ScanModel.at_precision` says; None = what the model is at
+    removed    classes that are taken away first, as `lidar.removal.removable` gives them; None = all stays
 
     A system's `resolved` says what becomes of it, and raises ValueError for what the system would have to ignore.
     """
@@ -44,6 +48,7 @@ class Filling:
     sampler: str | None = None
     seed: int = 0
     precision: str | None = None
+    removed: tuple[str, ...] | None = None
 
     def at_least_one(self) -> Filling:
         """The same. Raises ValueError for counts below 1."""

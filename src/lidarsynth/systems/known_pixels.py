@@ -10,7 +10,7 @@ from lidarsynth.lidar.columns import as_scanned
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 
 
 def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
@@ -21,6 +21,16 @@ def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
     if known.shape != image.shape or known.dtype != np.bool_:
         raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
     return known
+
+
+def of_rays(image: RangeImage, sensor: Sensor) -> RangeImage:
+    """The image. Raises ValueError for one of other rays than the sensor's."""
+    if image.shape != (sensor.height, sensor.width):
+        raise ValueError(f"expected an image of {sensor.height} x {sensor.width}, found {image.shape}")
+    if not same_rays(image.sensor, sensor):
+        raise ValueError(f"expected an image of {sensor.name}'s beams, found one of {image.sensor.name}'s; "
+                         "complete its points (`image.to_scan()`)")  # fmt: skip
+    return image
 
 
 def sensor_that_made(scan: Scan, sensor_in: Sensor | str | None) -> Sensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -17,20 +17,20 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import Pixels, occupied, pixel_of_points, project_thinned
+from lidarsynth.lidar.removal import removable
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
-from lidarsynth.lidar.sensor import Sensor, same_rays
+from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.systems.description import Description
-from lidarsynth.systems.filling import Filling, check_counts, whole
+from lidarsynth.systems.filling import Filling, OnStep, check_counts, whole
 from lidarsynth.systems.hub import push
-from lidarsynth.systems.known_pixels import known_pixels, sensor_that_made, sparse_image
+from lidarsynth.systems.known_pixels import known_pixels, of_rays, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
 from lidarsynth.systems.notes import Points, made_by, noted, stranger, taken
+from lidarsynth.systems.removal import emptied
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-OnStep = Callable[[], object] | None  # called after every network step, for progress bars
 
 
 class ScanModel(ABC):
@@ -136,6 +136,7 @@ class ScanModel(ABC):
         seed: int = 0,
         on_step: OnStep = None,
         precision: str | None = None,
+        without: str | Sequence[str] | None = None,
     ) -> RangeImage:
         """Fill what was not measured; what was comes back exactly.
 
@@ -144,11 +145,14 @@ class ScanModel(ABC):
                    those measured, and of points also rays that only have some beyond the range limits
         method, steps, resamples, sampler, precision  as `Filling` says; which words and defaults, the class of the
                    model says
+        without    classes such as ("car", "person"), or "traffic": their points go, and what they hid is filled, all
+                   else being known. Which these are, labels of the scan say, else the model
 
         Of a scan without `known`, `to_scan()` of the image gives every measured point bit by bit beside the new ones.
         Raises ValueError for what does not fit, for what this model cannot do, and where no point is in view or known.
         """
-        how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision)
+        removed = None if without is None else removable(without)
+        how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision, removed)
         scan = noted(self, scan, filling=True)
         with usual_torch():
             return self.filled(scan, how, known, on_step)
@@ -248,6 +252,8 @@ class ScanModel(ABC):
         if model is not self:
             return model.filled(scan, replace(how, precision=None), known, on_step)
         how = self.resolved(how)
+        if how.removed is not None:
+            return emptied(self, scan, how, known, on_step)
         if known is not None or isinstance(scan, RangeImage):
             image = self.image_of(scan)
             known = known_pixels(image, known)
@@ -353,12 +359,7 @@ class ScanModel(ABC):
         if isinstance(scan, Scan):
             wide = self.experiment.data.columns or self.sensor.width
             return project_thinned(scan, self.sensor, self.experiment.data.projection, wide, pixels=pixels)
-        if scan.shape != (self.sensor.height, self.sensor.width):
-            raise ValueError(f"expected an image of {self.sensor.height} x {self.sensor.width}, found {scan.shape}")
-        if not same_rays(scan.sensor, self.sensor):
-            raise ValueError(f"expected an image of {self.sensor.name}'s beams, found one of {scan.sensor.name}'s; "
-                             "complete its points (`image.to_scan()`)")  # fmt: skip
-        return scan
+        return of_rays(scan, self.sensor)
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
         """How often `generate` calls `on_step` per batch. Raises ValueError as `stream` does."""

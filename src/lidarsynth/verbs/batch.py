@@ -30,7 +30,7 @@ from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.notes import IN_PYTHON, beyond_image
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
-from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, upsample_scan
+from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, taken_away, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
@@ -84,7 +84,12 @@ class Job:
     def beside(self) -> tuple[str, ...]:
         """Endings of the files that a .bin or .npy of this job may get beside it, as far as the job tells."""
         marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample") else ()
-        return (*marks, LABEL) if self.labels or self.verb == "realise" else marks
+        return (*marks, LABEL) if self.labels or self.reads_labels else marks
+
+    @property
+    def reads_labels(self) -> bool:
+        """Whether a `.label` file of a scan's own is read, and its words go on with the points."""
+        return self.verb == "realise" or self.how.removed is not None
 
     def recipe(self, weights: str | None = None) -> dict[str, Any]:
         """What decides the results, as plain values; what was not asked for is left out.
@@ -100,6 +105,7 @@ class Job:
         kept["transform"] = None if self.transform is None else np.asarray(self.transform).tolist()
         kept |= {MEANT[name]: _digits(word) for name in ("sensor", "into") if (word := kept.get(name)) is not None}
         kept |= {MEANT["model"]: weights}
+        kept = {name: list(value) if isinstance(value, tuple) else value for name, value in kept.items()}  # as JSON's
         return {name: value for name, value in kept.items() if value is not None and value is not False}
 
 
@@ -293,7 +299,8 @@ def _made(
     if job.verb == "complete":
         sensor = None if job.sensor is None else get_sensor(job.sensor)
         filled = complete_scan(model, scan, job.corrupt, job.how, on_step, sensor, job.least)
-        return filled, _columns(filled.image.sensor, job) if model.any_sensor else ""
+        gone = taken_away(scan, filled.image, job.how, job.model)
+        return filled, gone + (_columns(filled.image.sensor, job, "; " if gone else "") if model.any_sensor else "")
     if job.verb == "realise":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         filled = realise_scan(model, scan, sensor, job.how.seed + work.number)

@@ -12,8 +12,10 @@ import numpy as np
 
 from lidarsynth.lidar.columns import as_scanned
 from lidarsynth.lidar.corruption import corrupt
+from lidarsynth.lidar.marks import were_new
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on, recognise
+from lidarsynth.lidar.removal import in_words, own_classes
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.pictures.portrait import before_and_after, portrait
@@ -83,7 +85,9 @@ def complete_scan(
     model = model.suited_to(scan, sensor)
     if recipe is None:
         filled = _sure(model.filled(scan, how, on_step=on_step), least)
-        return Filled(filled, lambda: {"measured": _measured(model, scan, filled), "completed": filled}, {}, scan)
+        done = f"completed without {in_words(how.removed)}" if how.removed else "completed"
+        whole = model.image_of(scan) if how.removed else None
+        return Filled(filled, lambda: {"measured": whole or _measured(model, scan, filled), done: filled}, {}, scan)
     truth = check_seen(model.image_of(scan), len(scan))
     known, judge = hidden_part(truth, recipe, how.seed)
     before = truth.keep(known)
@@ -114,6 +118,16 @@ def hidden_part(truth: RangeImage, recipe: str, seed: int) -> tuple[np.ndarray, 
         raise ValueError(f"expected a corruption that hides some of the measured pixels, found {recipe!r}, which hides "
                          f"{found}")  # fmt: skip
     return known, judge
+
+
+def taken_away(scan: Scan, filled: RangeImage, how: Filling, model: str) -> str:
+    """How many of the measured points of a scan were taken away, of which classes, and who said so, in words; '' where
+    nothing was to be."""
+    if how.removed is None:
+        return ""
+    gone = np.count_nonzero(were_new(scan) == 0) - np.count_nonzero(were_new(filled.to_scan()) == 0)
+    who = f"{model} names" if own_classes(scan) is None else "its labels name"
+    return f"took away {gone} of {len(scan)} points, {in_words(how.removed)} as {who} them"
 
 
 def check_confident(model: ScanModel, how: Filling, least: float | None) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarsynth.diffusion.samplers import checked_seed, generators
 from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.point_classes import class_of_points
 from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
 from lidarsynth.lidar.sensor import Sensor
@@ -49,7 +50,7 @@ from lidarsynth.systems.cascade.images import (
 )
 from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, one_thread, sampling, times, told_of
-from lidarsynth.systems.cascade.naming import GROWING, RARER, class_of_points, named, sketched
+from lidarsynth.systems.cascade.naming import GROWING, RARER, named, sketched
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast, unnamed
 from lidarsynth.systems.cascade.request import calls, resolved

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.lidar.pieces import pieces
+from lidarsynth.lidar.point_classes import class_of_points as class_of_points
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
@@ -237,24 +238,6 @@ def _logits(network: ClassUNet, told: Tensor, size: tuple[int, int]) -> Tensor:
     """(20, H, W) of an image of that size. One at a time: four at once take a quarter longer, and longer sums may round
     otherwise."""
     return network(told)[0, :, : size[0], : size[1]].float().cpu()
-
-
-def class_of_points(xyz: np.ndarray, image: RangeImage, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """(N,) int64 class of each point (N, 3) of pixels (row, column): of the one, of the nine around, that is nearest in
-    range, as a pixel holds but one of its points; 0 for points of no row, out of the sensor's limits, or around which
-    nothing returned."""
-    assert image.label is not None
-    (row, column), (height, width) = pixels, image.shape
-    depth = np.linalg.norm(xyz, axis=1)
-    nearest, found = np.full(len(xyz), np.inf), np.zeros(len(xyz), np.int64)
-    for down in (0, -1, 1):
-        for across in (0, -1, 1):
-            at = np.clip(row + down, 0, height - 1), (column + across) % width
-            off = np.where(image.mask[at], np.abs(image.range[at] - depth), np.inf)
-            closer = off < nearest
-            nearest, found = np.where(closer, off, nearest), np.where(closer, image.label[at], found)
-    seen = (row >= 0) & (depth >= image.sensor.min_range) & (depth <= image.sensor.max_range)
-    return np.where(seen, found, 0)
 
 
 def _on_true_beams(image: RangeImage) -> RangeImage:
