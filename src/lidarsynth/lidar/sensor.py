@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.lidar.angles import unit_vectors
+from lidarsynth.lidar.sector import listed_runs, runs_outside
 from lidarsynth.lidar.small_file import read_json, read_toml
 
 MOST = 4096  # beams that an image may have
@@ -222,7 +223,8 @@ EVENLY = {"beams", "top", "bottom"}  # fields that stand for elevations
 
 
 def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> Sensor:
-    """A sensor from a plain table; `elevations` in degrees, or `beams`, `top` and `bottom` for even spacing.
+    """A sensor from a plain table; `elevations` in degrees, or `beams`, `top` and `bottom` for even spacing; `view`,
+    such as [-60, 60], of one that sees a sector alone, as `sector.runs_outside` has it.
 
     source  begins every message
     name    of a table without one; None = `source`
@@ -231,6 +233,7 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected a table of a sensor's fields, found {values!r:.60}")
     values = dict(values)
+    view = values.pop("view", None)
     if "elevations" in values and (both := sorted(EVENLY & values.keys())):
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found elevations and "
                          f"{', '.join(both)}")  # fmt: skip
@@ -258,7 +261,10 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
     for key, numbers in beams.items():  # each number goes with its beam
         values[key] = tuple(numbers[i] for i in order) if len(numbers) == len(order) else tuple(numbers)
-    values |= {"tilt": tuple(_numbers(values.get("tilt", (0.0, 0.0)), source)), "blocked": _runs(values, source)}
+    values["tilt"] = tuple(_numbers(values.get("tilt", (0.0, 0.0)), source))
+    values["blocked"] = listed_runs(values.get("blocked", ()), source)
+    if view is not None:
+        values["blocked"] += runs_outside(view, len(order), values.get("width", Sensor.width), source)
     try:
         return Sensor(**{"name": name or source, **values})
     except TypeError as error:
@@ -270,16 +276,6 @@ def _numbers(values: Any, source: str) -> Sequence[float]:
         return [float(value) for value in values]
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values!r:.60}") from None
-
-
-def _runs(values: dict, source: str) -> tuple[tuple[int, ...], ...]:
-    runs = values.get("blocked", ())
-    listed = isinstance(runs, list | tuple) and all(isinstance(run, list | tuple) for run in runs)
-    if not listed or not all(type(number) is int for run in runs for number in run):
-        raise ValueError(
-            f"{source}: expected blocked as a list of [row, first column, last column], found {runs!r:.60}"
-        )
-    return tuple(map(tuple, runs))
 
 
 OUSTER = {"beam_intrinsics", "beam_altitude_angles"}  # what its metadata have, of any age
