@@ -1,11 +1,14 @@
 """Sensors that see a sector of the turn alone: which rays their files say are none of theirs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lidarsynth.lidar.sector import runs_outside, whole_turn
 from lidarsynth.lidar.sensor import Sensor, from_dict, read_sensor
+from lidarsynth.weights.load import load
 
 FRONT = {"beams": 4, "top": 5.0, "bottom": -10.0, "width": 360}
 
@@ -64,3 +67,22 @@ def test_other_views_are_refused(view: object):
 def test_a_view_between_two_columns_is_refused():
     with pytest.raises(ValueError, match="expected a view of at least one of 360 columns"):
         from_dict(FRONT | {"view": [0.1, 0.2]}, "own")
+
+
+def test_scans_of_a_sector_are_cut_from_whole_turns():
+    whole = Sensor("own", tuple(np.linspace(8, -14, 32)), 512, max_range=90.0, blocked=((31, 250, 260),))
+    sector = replace(whole, blocked=whole.blocked + runs_outside([-60, 60], 32, 512, "own"))
+    assert whole_turn(sector) == whole and whole_turn(whole) is whole
+    model = load("default").choosing(1).with_labels()
+    (all_around,), (ahead,) = (list(model.into(sensor).stream(1, seed=4)) for sensor in (whole, sector))
+    seen = ~sector.blocked_rays()
+    assert ahead.sensor == sector and ahead.mask.mean() > 0.1
+    np.testing.assert_array_equal(ahead.mask, all_around.mask & seen)
+    for name in ("range", "reflectance", "label", "instance"):
+        np.testing.assert_array_equal(getattr(ahead, name), np.where(ahead.mask, getattr(all_around, name), 0))
+    assert all(np.count_nonzero(ahead.instance == box.instance) == box.points for box in ahead.boxes)
+
+
+def test_a_sensor_of_which_nothing_is_open_stays():
+    shut = from_dict(FRONT | {"blocked": [[row, 0, 359] for row in range(4)]})
+    assert whole_turn(shut) is shut

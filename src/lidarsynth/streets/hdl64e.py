@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarsynth.lidar.sector import runs_of
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 
 NAME = "hdl-64e-kitti"
@@ -145,9 +146,7 @@ def written_out(sensor: Sensor) -> Sensor:
     """The sensor with what is known by its name in its own fields, so that its parts and denser ones keep it."""
     if not is_kittis(sensor):
         return sensor
-    edges = np.diff(np.pad(hidden(sensor), ((0, 0), (1, 1))).astype(int), axis=1)
-    first, last = np.argwhere(edges > 0), np.argwhere(edges < 0)
-    blocked = tuple((int(row), int(a), int(b) - 1) for (row, a), (_, b) in zip(first, last, strict=True))
+    blocked = runs_of(hidden(sensor))
     return replace(sensor, blocked=blocked, dimness=RING_LOSS)
 
 

@@ -16,6 +16,7 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.point_classes import class_of_points
 from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
+from lidarsynth.lidar.sector import whole_turn, within
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
@@ -145,8 +146,8 @@ class CascadeModel(AnySensorModel):
         Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """
         self._checked(n, steps, seed, sampler, batch_size, first)
-        how = sampling(self.network, steps, sampler)
-        return each_usually(self._drawn(n, how, checked_seed(seed), batch_size, first, on_step))
+        how, whole = sampling(self.network, steps, sampler), self.into(whole_turn(self.sensor))
+        return each_usually(within(whole._drawn(n, how, checked_seed(seed), batch_size, first, on_step), self.sensor))
 
     def _drawn(
         self, n: int, how: tuple[str, int], seed: int, batch_size: int, first: int, on_step: OnStep
