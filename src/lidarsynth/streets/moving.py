@@ -78,7 +78,7 @@ class MovingCaster:
 
 
 def half_turn(late: np.ndarray) -> float:
-    """Seconds that no ray, `late` (N,) s after a turn's stamp, is away from it; 0.06, of ten turns a second, at least."""
+    """Seconds that no ray, `late` (N,) s after a turn's stamp, is away from it; 0.06 at least."""
     return max(0.06, 1.2 * float(np.abs(late).max(initial=0.0)))
 
 

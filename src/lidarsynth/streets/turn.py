@@ -185,6 +185,11 @@ def sensor_pose(sensor: Sensor, pose: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def leaning(sensor: Sensor) -> float:
+    """Degrees between the sensor's axis and its vehicle's, by its tilt."""
+    return float(np.degrees(np.arccos(np.prod(np.cos(np.radians(sensor.tilt))))))
+
+
 def _pose(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and place (3,) float32 of a pose (6,), or of N from (6, N): x, y, z, yaw, pitch, roll."""
     x, y, z, yaw, pitch, roll = pose
