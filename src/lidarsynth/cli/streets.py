@@ -64,7 +64,6 @@ def streets(
     from lidarsynth.lidar.sensor import get_sensor
     from lidarsynth.streets.areas import Density
     from lidarsynth.streets.frame import LabelledStreets, Options
-    from lidarsynth.streets.turn import leaning
     from lidarsynth.streets.weather import Weather
 
     density = Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs, cyclists, heavy,
@@ -76,11 +75,17 @@ def streets(
     deque(counted((done, len(made)) for done in written), maxlen=0)
     kept = f", more than -n {count} asks for" if made.count > count else ""
     say(f"{out}/ has {plural(len(made), 'labelled scan')} of {made.sensor.name} in the layout of {format}{kept}")
-    if format != "nuscenes" and (lean := leaning(made.sensor)) >= LEANING:
-        say(f"{made.sensor.name} is tilted by {lean:.0f} degrees, and boxes stand upright in its frame: they lack points "
-            "of theirs; upright in the world, by place, heading and pose of the JSON, they have them all")  # fmt: skip
+    _tell_of_tilt(made, format)
     if picture and may_draw(out / "overview.png"):
         _picture(made, out / "overview.png")
+
+
+def _tell_of_tilt(made: LabelledStreets, format: str) -> None:
+    from lidarsynth.streets.turn import leaning
+
+    if format != "nuscenes" and (lean := leaning(made.sensor)) >= LEANING:
+        say(f"{made.sensor.name} is tilted by {lean:.0f} degrees, and boxes, upright in its frame, lack points of "
+            "theirs; upright in the world, by place, heading and pose of the JSON, they have all")  # fmt: skip
 
 
 def _picture(made: LabelledStreets, path: Path) -> None:
