@@ -10,7 +10,7 @@ from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import MARGIN, actors_of
-from lidarsynth.streets.apart import boxes_on_ground, meet, stand_apart, walls, what_stands
+from lidarsynth.streets.apart import HARD, VEHICLES, bases, boxes_on_ground, meet, stand_apart, walls, what_stands
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
@@ -283,6 +283,20 @@ def test_who_drives_or_rides_goes_through_no_thing_and_no_house():
         road = drive.world.ground.roads[0]
         ended += int((drive.reach[0] != (road.start, road.stop)).sum())
     assert seen["bicyclist"] > 500 and seen["car"] > 200 and kept > 0.9 and ended > 0
+
+
+def test_no_vehicle_stands_in_a_wall_or_a_barrier_beside_the_road():
+    met, left = [], []
+    for number in range(4):
+        drawn = build(np.random.default_rng((0, number)), Density(walls=3, barriers=2))
+        for which in (drawn, stand_apart(drawn)[0]):
+            actors = actors_of(which)
+            parked = boxes_on_ground(actors, -0.1)[np.isin(actors.kind, VEHICLES)]
+            hard = bases(which, np.flatnonzero(np.isin(which.things["kind"], HARD)))
+            met.append(int(meet(parked[:, None], hard[None]).any(axis=1).sum()))
+            left.append(len(parked))
+    assert sum(met[::2]) > 5 and not any(met[1::2])
+    assert sum(left[1::2]) > 0.8 * sum(left[::2])
 
 
 def test_nobody_of_usual_streets_without_overlap_stands_in_walls_or_in_others():
