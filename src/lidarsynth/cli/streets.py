@@ -15,8 +15,6 @@ from lidarsynth.lidar.plural import plural
 if TYPE_CHECKING:
     from lidarsynth.streets.frame import LabelledStreets
 
-LEANING = 5.0  # degrees of a sensor's tilt, at which boxes upright in its frame lack a twentieth of their points
-
 
 def streets(
     out: Annotated[Path, arg(help="folder of the data set.")],
@@ -81,11 +79,10 @@ def streets(
 
 
 def _tell_of_tilt(made: LabelledStreets, format: str) -> None:
-    from lidarsynth.streets.turn import leaning
+    from lidarsynth.streets.turn import told_of_tilt
 
-    if format != "nuscenes" and (lean := leaning(made.sensor)) >= LEANING:
-        say(f"{made.sensor.name} is tilted by {lean:.0f} degrees, and boxes, upright in its frame, lack points of "
-            "theirs; upright in the world, by place, heading and pose of the JSON, they have all")  # fmt: skip
+    if format != "nuscenes" and (told := told_of_tilt(made.sensor)):
+        say(f"{told}; upright in the world, by place, heading and pose of the JSON, they have all")
 
 
 def _picture(made: LabelledStreets, path: Path) -> None:
