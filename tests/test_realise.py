@@ -259,3 +259,11 @@ def test_boxes_of_generated_scans(place: Path):
     assert Path("boxed/000001.json").exists()
     with pytest.raises(SystemExit, match="2"):
         main([*words, "--boxes", "--out", "made"])  # begun without
+
+
+def test_a_tilt_of_which_boxes_lack_points_is_told(place: Path, capsys: pytest.CaptureFixture[str]):
+    for tilt in (3, 20):
+        Path(f"own{tilt}.toml").write_text(f"beams = 16\ntop = 15.0\nbottom = -15.0\nwidth = 128\ntilt = [0, {tilt}]\n")
+        main(["generate", "-n", "1", "--steps", "1", "--model", "model", "--no-picture", "--boxes", "--sensor",
+              f"own{tilt}.toml", "--out", f"tilted{tilt}"])  # fmt: skip
+        assert (f"own{tilt} is tilted by {tilt} degrees, and boxes" in capsys.readouterr().out) is (tilt == 20)

@@ -376,6 +376,24 @@ def test_runs_of_frames_are_of_one_world_and_leave_out_what_is_there():
     assert list(chunks(drives, [*range(1, 19), *range(20, 40)])) == [[0], [19]]
 
 
+def test_boxes_of_a_sensor_that_leans_are_told_to_fit_in_the_world_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for tilt, format, told in ((3, "pcd", False), (20, "pcd", True), (20, "nuscenes", False)):
+        own = tmp_path / f"own{tilt}.toml"
+        own.write_text(f"beams = 16\ntop = 5.0\nbottom = -20.0\nwidth = 360\ntilt = [{tilt}.0, 0.0]\n")
+        folder = tmp_path / f"{format}{tilt}"
+        main(["streets", "--out", str(folder), "--sensor", str(own), "--format", format, "-n", "1", "--workers", "1",
+              "--no-picture"])  # fmt: skip
+        assert ("own20 is tilted by 20 degrees, and boxes" in capsys.readouterr().out) is told
+    frame = LabelledStreets(0, 1, str(tmp_path / "own20.toml"))[0]
+    points = frame.scan.xyz @ frame.to_world[:3, :3].T + frame.to_world[:3, 3]
+    for box in frame.boxes:
+        c, s = np.cos(box.heading), np.sin(box.heading)
+        mine = (points[frame.raw >> 16 == box.instance] - box.place) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        assert (np.abs(mine) <= np.array(box.size) / 2 + 0.01).all()
+
+
 def test_the_verb_writes_says_and_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     sensor = tmp_path / "own.toml"
     sensor.write_text("beams = 8\ntop = 5.0\nbottom = -20.0\nwidth = 128\n")

@@ -10,12 +10,13 @@ from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.actors import MARGIN, actors_of
-from lidarsynth.streets.apart import boxes_on_ground, meet, stand_apart, walls, what_stands
+from lidarsynth.streets.apart import HARD, VEHICLES, bases, boxes_on_ground, meet, stand_apart, walls, what_stands
 from lidarsynth.streets.areas import TODAY, Density
 from lidarsynth.streets.drive import draw_drive
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
 from lidarsynth.streets.ground import Ground
 from lidarsynth.streets.layout import build
+from lidarsynth.streets.moving import Bundles
 from lidarsynth.streets.objects import USUAL, library
 from lidarsynth.streets.passing import _to_and_fro, set_apart
 from lidarsynth.streets.reader import SyntheticStreets
@@ -284,6 +285,20 @@ def test_who_drives_or_rides_goes_through_no_thing_and_no_house():
     assert seen["bicyclist"] > 500 and seen["car"] > 200 and kept > 0.9 and ended > 0
 
 
+def test_no_vehicle_stands_in_a_wall_or_a_barrier_beside_the_road():
+    met, left = [], []
+    for number in range(4):
+        drawn = build(np.random.default_rng((0, number)), Density(walls=3, barriers=2))
+        for which in (drawn, stand_apart(drawn)[0]):
+            actors = actors_of(which)
+            parked = boxes_on_ground(actors, -0.1)[np.isin(actors.kind, VEHICLES)]
+            hard = bases(which, np.flatnonzero(np.isin(which.things["kind"], HARD)))
+            met.append(int(meet(parked[:, None], hard[None]).any(axis=1).sum()))
+            left.append(len(parked))
+    assert sum(met[::2]) > 5 and not any(met[1::2])
+    assert sum(left[1::2]) > 0.8 * sum(left[::2])
+
+
 def test_nobody_of_usual_streets_without_overlap_stands_in_walls_or_in_others():
     told = {}
     for overlap in (True, False):
@@ -329,6 +344,35 @@ def test_without_traffic_and_parking_no_vehicle_is_left():
     left = little.things[~np.isin(little.things["kind"], list(kinds))]
     np.testing.assert_array_equal(none.things, left)
     np.testing.assert_array_equal(none.poses, little.poses)
+
+
+def test_what_moves_is_met_whole_however_long_a_turn_lasts(monkeypatch: pytest.MonkeyPatch):
+    asked = Options(frames=1, rate=0.5, perfect=True, density=Density(traffic=3, cyclists=2))
+    streets = LabelledStreets(0, 1, SENSORS["vlp-16"].resized(width=256), asked)
+    found = streets[0]
+    monkeypatch.setattr(Bundles, "meet", lambda self, middle, radius: np.arange(len(self.rays)))
+    np.testing.assert_array_equal(found.raw, streets[0].raw)
+
+
+def test_steep_and_tilted_sensors_see_what_is_high_and_short_ones_what_comes_near():
+    whole = build(np.random.default_rng((0, 5)), Density(walls=3))
+
+    def left(**told) -> World:
+        return visible(whole, replace(SMALL, **told))
+
+    def high(top: float, **told) -> int:
+        return len(left(elevations=(top, 0.0), **told).corners)
+
+    assert high(90.0) >= high(89.0) >= high(80.0) > high(1.0)
+    assert high(1.0, max_range=40.0, tilt=(0.0, 20.0)) == high(21.0, max_range=40.0)
+    low, lines = whole.corners[:, :, 2].min(axis=1) < whole.poses[:, 2].min() + 2, whole.corners[:, :, :2]
+    along, away = np.roll(lines, -1, axis=1) - lines, np.full(len(lines), np.inf)
+    for place in whole.poses[:, :2]:
+        part = ((place - lines) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-9)
+        nearest = lines + np.clip(part, 0, 1)[..., None] * along
+        away = np.minimum(away, np.linalg.norm(nearest - place, axis=-1).min(axis=1))
+    kept = {face.tobytes() for face in left(max_range=8.0, mount=0.4, elevations=(40.0, -40.0)).corners}
+    assert all(face.tobytes() in kept for face in whole.corners[low & (away < 8)])
 
 
 def test_rain_extinction_is_the_integral():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from lidarsynth.cli.arguments import (
     Count,
@@ -20,6 +20,9 @@ from lidarsynth.cli.arguments import (
 )
 from lidarsynth.cli.terminal import at_least, load_with_bar, say, scan_bar, step_bar, warn
 from lidarsynth.lidar.plural import plural
+
+if TYPE_CHECKING:
+    from lidarsynth.lidar.sensor import Sensor
 
 
 def generate(
@@ -64,8 +67,7 @@ def generate(
     used = loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format} | generation.steps_of(loaded, steps, sampler)
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
-    settings |= {"labels": True} if labels else {}
-    settings |= {"boxes": True} if boxes else {}
+    settings |= ({"labels": True} if labels else {}) | ({"boxes": True} if boxes else {})
     settings |= {} if layouts is None else {"layouts": layouts}
     settings |= generation.precision_of(loaded)
     with only_writer(out, "generation"):
@@ -81,4 +83,13 @@ def generate(
         else:
             with scan_bar("generate", sum(map(len, runs))) as (on_scan, _):
                 new = sum(1 for _ in make(on_step=on_scan, workers=workers, source=source))
-    say(f"{out}/ has {plural(count, 'scan')}, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}")
+    made = f"{out}/ has {plural(count, 'scan')}, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}"
+    _tell(made, loaded.sensor if boxes else None)
+
+
+def _tell(made: str, of_boxes: Sensor | None) -> None:
+    from lidarsynth.streets.turn import told_of_tilt
+
+    say(made)
+    if of_boxes is not None and (told := told_of_tilt(of_boxes)):
+        say(f"{told}; with points and boxes turned upright, by that tilt, they have all")

@@ -73,8 +73,16 @@ def streets(
     deque(counted((done, len(made)) for done in written), maxlen=0)
     kept = f", more than -n {count} asks for" if made.count > count else ""
     say(f"{out}/ has {plural(len(made), 'labelled scan')} of {made.sensor.name} in the layout of {format}{kept}")
+    _tell_of_tilt(made, format)
     if picture and may_draw(out / "overview.png"):
         _picture(made, out / "overview.png")
+
+
+def _tell_of_tilt(made: LabelledStreets, format: str) -> None:
+    from lidarsynth.streets.turn import told_of_tilt
+
+    if format != "nuscenes" and (told := told_of_tilt(made.sensor)):
+        say(f"{told}; upright in the world, by place, heading and pose of the JSON, they have all")
 
 
 def _picture(made: LabelledStreets, path: Path) -> None:

@@ -18,6 +18,7 @@ VEHICLES = ("car", "van", "truck", "bus", "lorry", "coach", "trailer")
 LEAVES = ("bush", "thicket")  # people may stand at them
 TRUNKS, TRUNK = ("tree", "young tree"), 0.3  # m, half of a trunk
 POSTS = (*TRUNKS, "lamp", "sign", "bollard", "bin", "panel")
+HARD = ("garden wall", "high wall", "railed wall", "guard rail", "concrete barrier")  # no vehicle stands in these
 WALL = 0.1  # m, half of a house's wall
 CARRIER = (2.15, 0.95)  # m, half length and half width of what carries the sensor
 FAR, ASIDE, STEP = 6.0, 1.5, 0.3  # m, how far one is moved along the street and across it, and in which steps
@@ -83,8 +84,8 @@ def stand_apart(
     kept = footprints(world.poses, world.poses[:, 3], np.zeros(2), np.array(CARRIER)) if ways is None else ways
     going = np.equal(actors.pace, TRAFFIC) if makes is None else makes
     fixed, taken = what_stands(world), np.zeros((0, 5))
-    posts = fixed[: int(np.isin(world.things["kind"], POSTS).sum())]
-    solid = np.concatenate([posts, walls(world)])  # vehicles may stand at fences and in hedges
+    hard = bases(world, np.flatnonzero(np.isin(world.things["kind"], POSTS + HARD)))
+    solid = np.concatenate([hard, walls(world)])  # vehicles may stand at fences and in hedges
     shift, left = np.zeros((len(actors), 2)), there.copy()
     for one in _order(actors):
         if not there[one]:

@@ -8,7 +8,7 @@ from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.actors import MARGIN
 from lidarsynth.streets.drive import Moment
-from lidarsynth.streets.moving import Bodies
+from lidarsynth.streets.moving import Bodies, half_turn
 from lidarsynth.streets.turn import Turn, attitudes, some_rays
 from lidarsynth.streets.world import World
 
@@ -103,7 +103,8 @@ def _hidden(
     first (H, W): the thing that each beam meets. Only beams that end before the actor or within its reach can be among
     them; the others passed it by.
     """
-    slack = 0.0 if late is None else 1.0 + 0.06 * float(np.linalg.norm(moment.velocity[actor]))
+    speed = float(np.linalg.norm(moment.velocity[actor]))
+    slack = 0.0 if late is None else 1.0 + half_turn(late) * speed
     reach = bodies.reach[actor] + slack
     tall = bodies.actors.size[actor, 2] / 2 + slack
     columns, rows = _columns(sensor, here, reach), np.flatnonzero(_rows(sensor, here, reach, tall))

@@ -190,7 +190,8 @@ class LabelledStreets:
         moment, poses = drive.moment(stamp), drive.poses(times)
         rng = np.random.default_rng((self.seed, number, k, 6))
         there = movers[moment.present[movers]]
-        near = np.linalg.norm(moment.place[there] - poses[0, :3], axis=1) < self.sensor.max_range + 10
+        gone = np.linalg.norm(poses[-1, :3] - poses[0, :3]) + period * np.linalg.norm(moment.velocity[there], axis=1)
+        near = np.linalg.norm(moment.place[there] - poses[0, :3], axis=1) < self.sensor.max_range + 10 + gone
         scene = MovingCaster(caster, bodies, there[near], moment, stamp)
         turn = shoot(drive.world, scene, self.sensor, self.options.optics, rng, poses, times)
         turn = self._weathered(turn, (self.seed, number, k, 7))

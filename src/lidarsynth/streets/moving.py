@@ -61,9 +61,10 @@ class MovingCaster:
         origins, rays = np.ascontiguousarray(origins), np.ascontiguousarray(rays)  # ray by ray from here on
         late = np.zeros(len(rays)) if times is None else times - self.stamp
         now, bundles = self.moment, Bundles(origins, rays)
+        longest = half_turn(late)
         for actor in self.movers.tolist():
             middle = now.place[actor] + [0, 0, self.bodies.actors.middle[actor, 2]]
-            slack = np.linalg.norm(now.velocity[actor]) * 0.06
+            slack = np.linalg.norm(now.velocity[actor]) * longest
             near = bundles.meet(middle, self.bodies.reach[actor] + slack)
             if not len(near):
                 continue
@@ -74,6 +75,11 @@ class MovingCaster:
             for mine, theirs in zip((face, distance, cosine), hit, strict=True):
                 mine[near[first]] = theirs[first]
         return face, distance, cosine
+
+
+def half_turn(late: np.ndarray) -> float:
+    """Seconds that no ray, `late` (N,) s after a turn's stamp, is away from it; 0.06 at least."""
+    return max(0.06, 1.2 * float(np.abs(late).max(initial=0.0)))
 
 
 def meets(origins: np.ndarray, rays: np.ndarray, middle: np.ndarray, radius: float) -> np.ndarray:

@@ -14,6 +14,8 @@ from lidarsynth.streets.raycast import AnyCaster
 from lidarsynth.streets.sensor_model import Optics, sense
 from lidarsynth.streets.world import World
 
+LEANING = 5.0  # degrees of a tilt, at which boxes upright in the sensor's frame lack a twentieth of their points
+
 
 @dataclass(frozen=True)
 class Turn:
@@ -183,6 +185,13 @@ def sensor_pose(sensor: Sensor, pose: np.ndarray) -> np.ndarray:
     matrix[:3, :3] = _turn(yaw, pitch, roll) @ tilt
     matrix[:3, 3] = np.array([x, y, z]) + matrix[:3, 2] * sensor.mount
     return matrix
+
+
+def told_of_tilt(sensor: Sensor) -> str:
+    """What is to be known of boxes of a sensor that is tilted against its vehicle by LEANING or more, else nothing."""
+    lean = float(np.degrees(np.arccos(np.prod(np.cos(np.radians(sensor.tilt))))))
+    told = f"{sensor.name} is tilted by {lean:.0f} degrees, and boxes, upright in its frame, lack points of theirs"
+    return told if lean >= LEANING else ""
 
 
 def _pose(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

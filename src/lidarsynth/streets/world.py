@@ -111,13 +111,15 @@ def visible(world: World, sensor: Sensor) -> World:
     poses = world.poses.astype(np.float32)
     spot = world.corners[:, 0].T.copy()
     high = np.flatnonzero((world.kind == THING) & (spot[2] > poses[:, 2].min() + sensor.mount + 0.8))
-    steep = np.float32(np.tan(np.radians(sensor.elevations[0]) + 0.06))  # 0.06 rad: pitch, roll and slope of the poses
+    top = np.radians(sensor.elevations[0] + np.hypot(*sensor.tilt)) + 0.06  # rad: pitch, roll and slope of the poses
+    steep = np.float32(np.tan(min(top, 1.57)))  # what looks straight up sees everything
+    reach = max(sensor.max_range + 5, 35.0)  # a long wall comes nearer than its corner
     seen = np.ones(len(world.corners), bool)
     seen[high] = False
     open_ = spot.take(high, axis=1)  # those that no pose so far has seen
     for x, y, z, *_ in poses[np.argsort(np.arange(len(poses)) % 4, kind="stable")]:  # far apart first
         away = np.hypot(open_[0] - x, open_[1] - y)
-        shown = (away < sensor.max_range + 5) & (open_[2] - z - sensor.mount - 0.8 < steep * away)
+        shown = (away < reach) & (open_[2] - z - sensor.mount - 0.8 < steep * away)
         seen[high.compress(shown)] = True
         if 8 * np.count_nonzero(shown) > len(high):
             high, open_ = high.compress(~shown), open_.compress(~shown, axis=1)
