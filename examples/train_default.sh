@@ -14,8 +14,8 @@ else
   budget+=("training.batch_size=${BATCH:-64}" --precision bf16)
 fi
 while true; do
-  # SIGTERM saves and exits 0; a run that has reached its last step ends at once
-  timeout 580 lidarsynth train default --data virtual --out "$out" "${budget[@]}" | tee "$out/last.log"
+  # SIGTERM saves and exits 0, for which timeout would say 124; a run that has reached its last step ends at once
+  timeout --preserve-status 580 lidarsynth train default --data virtual --out "$out" "${budget[@]}" | tee "$out/last.log"
   grep -q "stopped after step" "$out/last.log" || break
 done
 python "$(dirname "$0")/../benchmarks/learn_judge.py" "$out" "$out-judged"   # chooses among drawn layouts

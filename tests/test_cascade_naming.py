@@ -163,6 +163,10 @@ def test_inside_buildings_returns_may_be_of_none_and_what_is_empty_is_not_judged
     said[0][classes[0] == 0] = 13  # furniture, taken for walls
     wrong = objective(batch(torch.stack([back, said], 1), classes))["inside"]
     assert wrong[0] > wrong[1] > 0.01
+    classes[0] = 0  # of a scan that nobody has labelled
+    unsaid, _ = objective(batch(torch.stack([back, said], 1), classes))["inside"]
+    alone = objective(batch(torch.stack([back, said], 1)[1:], classes[1:]))["inside"]
+    assert unsaid < 1e-3 and alone.max() < 1e-3
 
 
 def sure(word: str) -> ClassUNet:

@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import load_file
 from torch.testing import assert_close
 
+from lidarsynth.data.dataset import CachedImages, SeveralCaches, write_cache
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.scan import RangeImage
@@ -21,7 +22,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.systems.cascade import patterns
 from lidarsynth.systems.cascade import training as cascade_training
-from lidarsynth.systems.cascade.examples import crop, mixed
+from lidarsynth.systems.cascade.examples import crop, draw, mixed
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.patterns import pattern
 from lidarsynth.systems.cascade.scores import absolute_errors, energy_score, expected_errors, misnamed
@@ -285,6 +286,17 @@ def test_classes_of_ones_own_are_learned_from_labels_and_kept_beside_a_base(tmp_
     assert any(not torch.equal(network.classes.state_dict()[name], value) for name, value in classes.items())
     judged = cascade_training.judge(tuned, network, [SyntheticStreets(3, 1).image(0)])
     assert 0 < judged["classes"] <= 1
+
+
+def test_classes_are_not_learned_from_scans_that_nobody_has_labelled(tmp_path):
+    image = SyntheticStreets(3, 1, SENSORS["hdl-64e-kitti"].resized(width=256)).image(0)
+    tuned = with_fields(preset("tuned"), {"model.own_classes": True, "training.batch_size": 1})
+    for name, label in (("bare", None), ("zero", np.zeros(image.shape, int)), ("named", image.label)):
+        list(write_cache(tmp_path / name, lambda i: replace(image, label=label), 2, image.sensor, {"name": name}))  # noqa: B023
+    for words in ("bare", "zero"):
+        with pytest.raises(ValueError, match=r"expected images with labels, as model\.own_classes .*, found none; "):
+            draw(tuned, CachedImages(tmp_path / words), [0], 0, [0])
+    draw(tuned, SeveralCaches([tmp_path / "bare", tmp_path / "named"]), [0], 0, [0])
 
 
 def test_an_arc_of_another_scan_brings_its_labels():

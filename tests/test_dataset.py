@@ -122,6 +122,8 @@ def test_several_caches_are_one_of_which_each_is_seen_equally_often(tmp_path: Pa
     torch.testing.assert_close(one.x_0([1, 2, 3]), torch.cat([two.x_0([0]), five.x_0([1]), two.x_0([1])]))
     assert (one.name(2), one.name(7)) == (five.name(1), two.name(1))
     assert one.source == {"name": "several caches (5 of five and 2 of two)", "projection": "auto"}
+    assert one.spread(20) == [*range(10)] and five.spread(20) == [*range(5)] and five.spread(2) == [0, 2]
+    assert one.spread(5) == [0, 3, 4, 7, 8], "every second number would be of the first cache alone"
     for wrong in (-1, 10):
         with pytest.raises(IndexError, match=rf"0\.\.9, got {wrong}"):
             one[wrong]

@@ -1,7 +1,10 @@
 """Examples and benchmarks as programs: a scan is of the sensor that took it, and what cannot be done is one line."""
 
 import json
+import os
 import runpy
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -96,3 +99,24 @@ def test_a_sensor_of_one_s_own_is_named_to_a_benchmark(program: Program, scans: 
     words = ("errors", scans / "forty.ply", "--sensor", scans / "forty.json", "--models", "nearest")
     code, out, error = program("benchmarks/any_sensor.py", *words)
     assert (code, error) == (0, "") and "| forty.ply 1/4 |" in out
+
+
+def test_the_recipe_of_default_goes_on_after_each_of_its_chunks(tmp_path: Path):
+    """timeout(1) says 124 where it stopped a command, whatever that ended with."""
+    real = shutil.which("timeout")
+    for name, lines in {
+        "lidarsynth": """echo "$@" >> calls
+            [ "$1" = train ] && [ $(grep -c ^train calls) = 1 ] || exit 0
+            trap 'echo stopped after step 3; exit 0' TERM
+            sleep 9 & wait""",
+        "timeout": f'exec {real} "${{@/#580/0.2}}"',
+        "python": 'echo "python $2 $3" >> calls',
+    }.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{lines}\n")
+        (tmp_path / name).chmod(0o755)
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    script = ["bash", str(ROOT / "examples" / "train_default.sh"), "out", "--cpu"]
+    subprocess.run(script, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    calls = (tmp_path / "calls").read_text().splitlines()
+    assert [call.split()[0] for call in calls] == ["train", "train", "python", "python", "info"]
+    assert calls[-1] == "info out-done"

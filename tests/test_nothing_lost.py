@@ -94,6 +94,18 @@ def test_where_all_are_damaged_the_line_says_what_to_do(damage, cache, trained, 
     assert "\n" not in str(error.value) and sorted(path.name for path in out.rglob("*")) == before
 
 
+def test_weights_without_checkpoints_are_not_written_over(cache, trained, tmp_path):
+    out = Path(shutil.copytree(trained, tmp_path / "out", symlinks=True))
+    shutil.rmtree(out / checkpoint.FOLDER)
+    weights = (out / "model.safetensors").read_bytes()
+    for begun in (None, str(out)):
+        with pytest.raises(ValueError, match=r"found model.safetensors without any.*; name another folder, and --from"):
+            list(run(tiny(4), cache, out, begun, options=QUIET))
+    assert (out / "model.safetensors").read_bytes() == weights
+    (out / "model.safetensors").unlink()
+    assert [progress.step for progress in run(tiny(1), cache, out, options=QUIET)] == [0, 1]
+
+
 def test_checkpoints_from_before_there_were_checksums_are_taken_and_empty_ones_are_not(trained, tmp_path):
     saved = Path(shutil.copytree(checkpoints(trained)[-1], tmp_path / "step-00000004"))
     (saved / checkpoint.CHECKSUMS).unlink()

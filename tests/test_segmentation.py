@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from lidarsynth.cli.main import main
 from lidarsynth.data.cache import write_cache
-from lidarsynth.data.dataset import CachedImages
+from lidarsynth.data.dataset import CachedImages, SeveralCaches
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Experiment, from_dict, with_fields
@@ -152,6 +152,7 @@ def test_rare_classes_weigh_more_and_the_mean_pixel_weighs_one(cache: Path):
     assert shares.sum() == pytest.approx(1) and set(np.flatnonzero(shares)) == set(CLASSES_THERE)
     labels = np.concatenate([scene(i).label[scene(i).mask] for i in range(24)])
     np.testing.assert_allclose(shares, np.bincount(labels, minlength=20) / len(labels))
+    np.testing.assert_array_equal(class_shares(SeveralCaches([cache, cache])), shares)
     weights = class_weights(np.array([0, 0.9, 0.1, 0.0])).double()
     assert float(weights @ torch.tensor([0, 0.9, 0.1, 0.0]).double()) == pytest.approx(1)
     assert float(weights[2] / weights[1]) == pytest.approx(np.log(1.92) / np.log(1.12))

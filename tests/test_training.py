@@ -22,6 +22,7 @@ from lidarsynth.systems.diffusion.validation import TIMES, fixed_losses
 from lidarsynth.systems.table import build_network, task_of
 from lidarsynth.training.examples import Examples, Streets, batch_indices, load_batches
 from lidarsynth.training.loop import learning_rate, start, train, update_ema
+from lidarsynth.training.machine import accelerator_of
 from lidarsynth.training.options import Options
 from lidarsynth.training.randomness import augment
 from lidarsynth.training.task import ema_decay, ema_due
@@ -305,6 +306,21 @@ def test_dropout_is_reproducible_and_leaves_global_randomness_alone():
     list(train(experiment, run, Noise()))  # type: ignore[arg-type]
     assert torch.equal(torch.get_rng_state(), expected)
     assert curve(**changes) == first != curve()
+
+
+def test_precisions_that_would_not_hold_are_refused(monkeypatch: pytest.MonkeyPatch):
+    from accelerate.state import AcceleratorState
+
+    monkeypatch.setenv("ACCELERATE_USE_CPU", "true")
+    AcceleratorState._reset_state()
+    with pytest.raises(ValueError, match="expected the precision bf16 or fp32 for training on a processor, found fp16"):
+        accelerator_of(Options(precision="fp16"))
+    assert accelerator_of(Options(precision="bf16")).mixed_precision == "bf16"
+    for precision in (None, "fp32"):  # accelerate would go on in bfloat16 where nothing is asked for
+        with pytest.raises(ValueError, match="expected the precision of this process's earlier run, found fp32"):
+            accelerator_of(Options(precision=precision))
+    AcceleratorState._reset_state()
+    assert accelerator_of(Options()).mixed_precision == "no"
 
 
 def test_batches_must_share_equally():

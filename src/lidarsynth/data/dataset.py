@@ -97,6 +97,11 @@ class CachedImages:
         """Images by their numbers."""
         return [self[i] for i in indices]
 
+    def spread(self, count: int) -> list[int]:
+        """Numbers of at most `count` images from everywhere."""
+        count = min(count, len(self))
+        return [k * len(self) // count for k in range(count)]
+
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]: range code and reflectance of the images, as `to_x_0` makes them."""
         if codec not in self._tables:
@@ -158,6 +163,11 @@ class SeveralCaches:
     def take(self, indices: list[int]) -> list[RangeImage]:
         """Images by their numbers."""
         return [self[i] for i in indices]
+
+    def spread(self, count: int) -> list[int]:
+        """Numbers of at most `count` images from everywhere, of each cache in turn."""
+        count, parts = min(count, len(self)), len(self._parts)
+        return [k * len(self) // count // parts * parts + k % parts for k in range(count)]
 
     def x_0(self, indices: list[int], codec: str = "log") -> Tensor:
         """(B, 2, H, W) float32 in [-1, 1]."""

@@ -98,7 +98,8 @@ def newest_whole(out: str | Path) -> tuple[Path | None, str]:
         told.append(f"{checkpoint} is damaged ({damage})")
     if found:
         raise ValueError(f"{out}: expected a checkpoint to go on from, found only damaged ones: {'; '.join(told)}; "
-                         f"delete {Path(out) / FOLDER} to begin again, or name another folder")  # fmt: skip
+                         f"delete {Path(out) / FOLDER} and {WEIGHTS} to begin again, or name "
+                         "another folder")  # fmt: skip
     return None, ""
 
 

@@ -21,17 +21,28 @@ if TYPE_CHECKING:
 def accelerator_of(options: Options) -> Accelerator:
     """What accelerate found: devices, processes, precision; also sets torch's number of threads, if told.
 
-    Raises ImportError naming the extra when accelerate is missing, ValueError when the device has no such precision.
+    Raises ImportError naming the extra when accelerate is missing, ValueError when the device has no such precision, or
+    an earlier run of this process had another.
     """
     try:
         from accelerate import Accelerator
+        from accelerate.utils import parse_flag_from_env
     except ImportError:
         raise ImportError("training needs accelerate: pip install 'lidarsynth[train]'") from None
-    accelerator = Accelerator(
-        mixed_precision="no" if options.precision == "fp32" else options.precision,
-        gradient_accumulation_steps=options.accumulate,
-        cpu=not torch.accelerator.is_available(),  # without this, two processes on CPUs would not know of each other
-    )
+    # None would be that of an earlier run of this process, and not the default
+    default = os.environ.get("ACCELERATE_MIXED_PRECISION", "no").lower()
+    precision = {"fp32": "no", None: default}.get(options.precision, options.precision)
+    cpu = not torch.accelerator.is_available()  # without this, two processes on CPUs would not know of each other
+    if precision == "fp16" and (cpu or parse_flag_from_env("ACCELERATE_USE_CPU")):  # which would train in fp32
+        raise ValueError("expected the precision bf16 or fp32 for training on a processor, found fp16")
+    try:
+        accelerator = Accelerator(mixed_precision=precision, gradient_accumulation_steps=options.accumulate, cpu=cpu)
+    except ValueError as error:
+        if "already been initialized" not in str(error):
+            raise
+        found = "fp32" if precision == "no" else precision
+        raise ValueError(f"expected the precision of this process's earlier run, found {found}; "
+                         "another process can have another") from None  # fmt: skip
     if options.threads:  # behind accelerate, which sets a number of its own for several processes on CPUs
         torch.set_num_threads(options.threads)
     return accelerator

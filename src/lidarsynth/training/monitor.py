@@ -52,6 +52,5 @@ def _spread(experiment: Experiment, source: str | Path) -> list[RangeImage]:
     images = open_images(source, experiment, VALIDATION_SEED)
     if isinstance(images, Streets):
         return images.take(images.indices(0, IMAGES))
-    count = min(IMAGES, len(images))
-    chosen = images.take([i * len(images) // count for i in range(count)])
+    chosen = images.take(images.spread(IMAGES))
     return [image for image in chosen if image.mask[::FEWEST].any()] or chosen

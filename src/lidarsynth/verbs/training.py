@@ -18,7 +18,7 @@ from lidarsynth.diffusion.denoiser import KINDS, LOSSES
 from lidarsynth.diffusion.schedule import SCHEDULES
 from lidarsynth.experiment.folder import read_experiment
 from lidarsynth.experiment.presets import preset
-from lidarsynth.experiment.record import Card, Experiment, with_fields
+from lidarsynth.experiment.record import WEIGHTS, Card, Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.files.lock import only_writer
 from lidarsynth.lidar.depth import CODECS
@@ -120,8 +120,8 @@ def run(
     resume      insist that there is a checkpoint
 
     SIGTERM or Ctrl-C saves after the present step and ends the iteration. Raises ValueError when experiment, images,
-    weights or folder do not fit, or the folder's run began with other images or weights; FloatingPointError, naming
-    step, scans and last checkpoint, when it is not finite.
+    weights or folder do not fit, the folder's run began with other images or weights, or weights lie there without
+    checkpoints; FloatingPointError, naming step, scans and last checkpoint, when it is not finite.
     """
     options = options or Options()
     out, accelerator = Path(out), accelerator_of(options)
@@ -187,6 +187,9 @@ def _begin(
     saved, note = newest_whole(out)
     if resume and not saved:
         raise ValueError(f"{out}: expected a run to resume, found no checkpoint")
+    if not saved and (out / WEIGHTS).exists():
+        raise ValueError(f"{out}: expected a new folder, or checkpoints to go on from, found {WEIGHTS} without any, "
+                         f"which would be lost; name another folder, and --from {out} begins with it")  # fmt: skip
     weights = begun.weights or experiment.base
     if weights and not saved:
         source, trained = load_parts(weights)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sized
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.data.dataset import CachedImages, SeveralCaches
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.corruption import every_beam
 from lidarsynth.lidar.scan import RangeImage
@@ -33,6 +35,7 @@ TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
 LOSING = 0.7  # of what learns the most likely image lack some of their returns
+COUNTED = 64  # images of caches that tell whether there are labels
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
 
@@ -78,7 +81,12 @@ class CascadeBatch(NamedTuple):
 
 
 def draw(experiment: Experiment, images: Images, indices: list[int], step: int, positions: list[int]) -> CascadeBatch:
-    """The samples at `positions` of step `step`'s global batch: functions of (seed, step, position)."""
+    """The samples at `positions` of step `step`'s global batch: functions of (seed, step, position).
+
+    Raises ValueError where the classes of the images are to be learned, and these have none.
+    """
+    if experiment.model.own_classes:
+        check_labelled(images)
     taken, seed = images.take(indices), experiment.training.seed
     samples = generation_count(experiment.training, step)
     seeds = tuple(sample_seed(seed, step, position) for position in positions)
@@ -104,6 +112,16 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
         lessons=lessons(_all_mixed(experiment, images, taken, seeds), seeds),
         seen=_all_seen(experiment, images, taken, seeds) if observed else None,
     )
+
+
+@lru_cache(maxsize=2)
+def check_labelled(images: Images) -> None:
+    """Raises ValueError where none of the images of caches, of at most `COUNTED` from everywhere, says a class."""
+    if isinstance(images, CachedImages | SeveralCaches):
+        labels = (images.take([i])[0].label for i in images.spread(COUNTED))
+        if not any(label is not None and (label > 0).any() for label in labels):
+            raise ValueError("expected images with labels, as model.own_classes learns from them, found none; "
+                             "`lidarsynth label` names scans")  # fmt: skip
 
 
 def _worse(image: RangeImage, rng: np.random.Generator) -> RangeImage:

@@ -92,7 +92,9 @@ class NamingObjective(nn.Module):
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         lessons = batch.lessons
         inputs, classes = lessons.inputs, lessons.classes[..., SEAM:-SEAM]
-        judged = inputs[:, 0, :, SEAM:-SEAM] > 0 if self.inside else classes > 0
+        judged = classes > 0
+        if self.inside:  # of cuts that somebody has labelled at all
+            judged = (inputs[:, 0, :, SEAM:-SEAM] > 0) & judged.flatten(1).any(1)[:, None, None]
         target = classes.masked_fill(~judged, NOBODY)
         logits = self.network(inputs)[..., SEAM:-SEAM].float()
         entropy = F.cross_entropy(logits, target, self.get_buffer("weights"), ignore_index=NOBODY, reduction="none")

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.data.dataset import CachedImages
+from lidarsynth.data.dataset import CachedImages, SeveralCaches
 from lidarsynth.experiment.record import Experiment, Segmentation
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASSES
@@ -112,9 +112,8 @@ def class_shares(images: Images) -> np.ndarray:
 
     The same in every process and after every resume. Raises ValueError for an image without labels, or no labels.
     """
-    if isinstance(images, CachedImages):
-        count = min(COUNTED, len(images))
-        chosen = [k * len(images) // count for k in range(count)]
+    if isinstance(images, CachedImages | SeveralCaches):
+        chosen = images.spread(COUNTED)
     else:
         chosen = [17 * k for k in range(COUNTED)]  # one place of each world of endless streets
     labels = np.concatenate([_label(images.take([i])[0]).ravel() for i in chosen])
