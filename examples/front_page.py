@@ -1,4 +1,4 @@
-"""The picture of the README's first screen: `python front_page.py OUT.png SCAN SCAN`, each scan in its own sensor."""
+"""The README's pictures of scans, each in its own sensor: `python front_page.py OUT SCAN SCAN [--without traffic]`."""
 
 import argparse
 from pathlib import Path
@@ -16,6 +16,7 @@ def main() -> None:
     parser.add_argument("target", type=Path, metavar="OUT.png")
     parser.add_argument("sources", nargs="+", type=Path, metavar="SCAN")
     parser.add_argument("--sensor", help="of all scans, a word or a .toml file")
+    parser.add_argument("--without", metavar="CLASSES", help="draw the scans, and the same without these, instead")
     args = parser.parse_args()
     model = ls.load("default")
     rows = []
@@ -23,13 +24,17 @@ def main() -> None:
         scan = ls.read(source)
         own = model.into(named_sensor(scan, source, "--sensor", args.sensor))
         truth = own.image_of(scan)
-        known = ls.corrupt(truth, "beams:4")
-        sparse = truth.keep(known)
-        dense = own.complete(sparse, known)
-        shown = {
-            f"{truth.shape[0] // 4} beams of a real {own.sensor.name}, measured": sparse,
-            f"{truth.shape[0]} beams, completed": dense,
-        }
+        if args.without:
+            empty = own.complete(scan, without=args.without)
+            shown = {f"a real {own.sensor.name}": truth, f"without {args.without}": empty}
+        else:
+            known = ls.corrupt(truth, "beams:4")
+            sparse = truth.keep(known)
+            dense = own.complete(sparse, known)
+            shown = {
+                f"{truth.shape[0] // 4} beams of a real {own.sensor.name}, measured": sparse,
+                f"{truth.shape[0]} beams, completed": dense,
+            }
         rows.append([(caption, perspective(image, size=(800, 450))) for caption, image in shown.items()])
         rows.append([("", range_strip(image)) for image in shown.values()])
     save_png(args.target, panel(rows, width=1640))
