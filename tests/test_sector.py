@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarsynth.lidar.sector import runs_outside, whole_turn
+from lidarsynth.lidar.sector import runs_outside
 from lidarsynth.lidar.sensor import Sensor, from_dict, read_sensor
+from lidarsynth.lidar.whole_turn import whole_turn
 from lidarsynth.weights.load import load
 
 FRONT = {"beams": 4, "top": 5.0, "bottom": -10.0, "width": 360}

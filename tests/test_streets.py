@@ -372,7 +372,8 @@ def test_steep_and_tilted_sensors_see_what_is_high_and_short_ones_what_comes_nea
         nearest = lines + np.clip(part, 0, 1)[..., None] * along
         away = np.minimum(away, np.linalg.norm(nearest - place, axis=-1).min(axis=1))
     kept = {face.tobytes() for face in left(max_range=8.0, mount=0.4, elevations=(40.0, -40.0)).corners}
-    assert all(face.tobytes() in kept for face in whole.corners[low & (away < 8)])
+    near = whole.corners[low & (away > 3) & (away < 8)]  # nearer, beams may pass beneath what hangs
+    assert len(near) and all(face.tobytes() in kept for face in near)
 
 
 def test_rain_extinction_is_the_integral():

@@ -30,10 +30,6 @@ def complete(
     scans: Annotated[Positional[list[Path]], arg(metavar="SCAN...", help="files, folders, globs, bags, captures.")],
     out: Annotated[Path, arg(help="file to write, as in upsample; a folder where there are several scans; or a bag.")],
     corrupt: Recipe = None,
-    without: Annotated[
-        str | None,
-        arg(metavar="CLASSES", help="take these away, such as car,person or traffic, and fill what they hid, no more."),
-    ] = None,
     model: Filler = "default",
     method: Method = "auto",
     steps: Steps = None,
@@ -46,6 +42,10 @@ def complete(
     sensor: SensorWord = None,
     labels: Labels = False,
     picture: Picture = True,
+    without: Annotated[
+        str | None,
+        arg(metavar="CLASSES", help="take these away, such as car,person or traffic, and fill what they hid, no more."),
+    ] = None,
     many: Annotated[Many, arg(name="")] = Many(),  # noqa: B008, frozen
 ) -> None:
     """Fill what a scan lacks: every measured point stays, bit by bit, and new ones are added.

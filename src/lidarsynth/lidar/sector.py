@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from lidarsynth.lidar.scan import RangeImage
-    from lidarsynth.lidar.sensor import Sensor
 
 Runs = tuple[tuple[int, int, int], ...]  # (row, first column, last column), around the seam where first > last
 
@@ -51,18 +45,3 @@ def runs_of(rays: np.ndarray) -> Runs:
     edges = np.diff(np.pad(rays, ((0, 0), (1, 1))).astype(int), axis=1)
     first, last = np.argwhere(edges > 0), np.argwhere(edges < 0)
     return tuple((int(row), int(a), int(b) - 1) for (row, a), (_, b) in zip(first, last, strict=True))
-
-
-def whole_turn(sensor: Sensor) -> Sensor:
-    """The sensor, where it sees a sector alone, if it saw all around: columns of which no ray returns are open. Layouts
-    of streets are of whole turns."""
-    rays = sensor.blocked_rays()
-    shut = rays.all(axis=0)
-    return replace(sensor, blocked=runs_of(rays & ~shut)) if shut.any() and not shut.all() else sensor
-
-
-def within(images: Iterable[RangeImage], sensor: Sensor) -> Iterator[RangeImage]:
-    """Images of the `whole_turn` of a sensor as the sensor sees them."""
-    rays = ~sensor.blocked_rays()
-    for image in images:
-        yield image if image.sensor == sensor else replace(image.keep(rays), sensor=sensor)

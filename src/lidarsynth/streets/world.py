@@ -13,6 +13,7 @@ from lidarsynth.streets.ground import Ground, Road
 GROUND, SLAB, THING, FRONT = 0, 1, 2, 3  # what a triangle belongs to
 REACH = (150.0, 90.0)  # half size of the world in metres, x and y
 POSES = 16  # scans taken in one world
+LONG = 30.0  # m, as far as which a sensor may see a part of a wall whose corner is out of its sight
 STILL, TRAFFIC, WALK = 0, 1, 2  # how a thing moves once time passes
 THINGS = np.dtype([("kind", "U16"), ("variant", "i2"), ("row", "f8", 8), ("pace", "u1")])  # row as `builder.ROW`
 
@@ -109,17 +110,19 @@ def _settled(rng: np.random.Generator, ground: Ground, x: np.ndarray, y: np.ndar
 def visible(world: World, sensor: Sensor) -> World:
     """The world without triangles that no pose can see: too far, or wholly above the highest beam. Faster to cast."""
     poses = world.poses.astype(np.float32)
-    spot = world.corners[:, 0].T.copy()
+    spot = np.vstack([world.corners[:, 0].T, np.full(len(world.corners), sensor.max_range + 5, np.float32)])
+    if sensor.max_range < LONG:  # a long wall comes nearer than its corner, and lower
+        spot[2] = world.corners[:, :, 2].min(axis=1)
+        spot[3] += np.hypot(*(world.corners[:, 1:, :2] - world.corners[:, :1, :2]).T).max(axis=0)
     high = np.flatnonzero((world.kind == THING) & (spot[2] > poses[:, 2].min() + sensor.mount + 0.8))
     top = np.radians(sensor.elevations[0] + np.hypot(*sensor.tilt)) + 0.06  # rad: pitch, roll and slope of the poses
     steep = np.float32(np.tan(min(top, 1.57)))  # what looks straight up sees everything
-    reach = max(sensor.max_range + 5, 35.0)  # a long wall comes nearer than its corner
     seen = np.ones(len(world.corners), bool)
     seen[high] = False
     open_ = spot.take(high, axis=1)  # those that no pose so far has seen
     for x, y, z, *_ in poses[np.argsort(np.arange(len(poses)) % 4, kind="stable")]:  # far apart first
         away = np.hypot(open_[0] - x, open_[1] - y)
-        shown = (away < reach) & (open_[2] - z - sensor.mount - 0.8 < steep * away)
+        shown = (away < open_[3]) & (open_[2] - z - sensor.mount - 0.8 < steep * away)
         seen[high.compress(shown)] = True
         if 8 * np.count_nonzero(shown) > len(high):
             high, open_ = high.compress(~shown), open_.compress(~shown, axis=1)

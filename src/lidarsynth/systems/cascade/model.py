@@ -16,8 +16,8 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.point_classes import class_of_points
 from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_seen
-from lidarsynth.lidar.sector import whole_turn, within
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.whole_turn import whole_turn, within
 from lidarsynth.networks.candidates import BEND
 from lidarsynth.networks.cascade import Cascade
 from lidarsynth.networks.coarse_unet import ROWS, grid_rays
