@@ -20,7 +20,7 @@ from lidarsynth.streets.raycast import Caster, FewTriangles
 from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.systems.cascade import recast as module
-from lidarsynth.systems.cascade.canvas import canvas_of, mirrored
+from lidarsynth.systems.cascade.canvas import canvas_of, mirrored, numbered
 from lidarsynth.systems.cascade.placing import View, best_place
 from lidarsynth.systems.cascade.recast import as_cast, recast
 
@@ -396,3 +396,30 @@ def test_nothing_is_cast_in_another(rough: bool) -> None:
     for boxes in each:
         stands = [np.array([*box.centre[:2], box.yaw, box.size[0] / 2, box.size[1] / 2]) for box in boxes]
         assert not any(meet(one, other) for i, one in enumerate(stands) for other in stands[:i])
+
+
+def test_returns_of_a_class_within_a_box_of_it_have_its_number():
+    sensor = Sensor("own", tuple(np.linspace(10, -20, 31)), 360, max_range=50.0)
+    metres = np.full((31, 360), 12.0, np.float32)
+    label = np.full(metres.shape, CLASS_NUMBER["car"])
+    label[:, :180] = CLASS_NUMBER["building"]
+    instance = np.zeros(metres.shape, np.int32)
+    instance[10, 200] = 1
+    points = sensor.points(metres)
+    middle = points[15, 250].astype(float) / 12 * 12.5
+    still = (0.0, 0.0, 0.0)
+    turned = Box("van", 2, tuple(middle), (4.0, 2.0, 1.5), 0.4, still, tuple(middle), 0.4, still, 0, 0.0)
+    other = Box(
+        "person", 1, tuple(points[15, 300].astype(float)), (1.0, 1.0, 2.0), 0.0, still, still, 0.0, still, 1, 0.0
+    )
+    image = RangeImage(metres, metres * 0, metres > 0, sensor, label, instance=instance, boxes=(other, turned))
+    found = numbered(image)
+    away = points.reshape(-1, 3) - middle
+    ahead, left = (
+        away[:, 0] * np.cos(0.4) + away[:, 1] * np.sin(0.4),
+        away[:, 1] * np.cos(0.4) - away[:, 0] * np.sin(0.4),
+    )
+    inside = (np.abs(ahead) <= 2) & (np.abs(left) <= 1) & (np.abs(away[:, 2]) <= 0.75)
+    expected = np.where(inside.reshape(metres.shape), 2, instance)
+    np.testing.assert_array_equal(found.instance, expected)
+    assert inside.sum() > 20 and [box.points for box in found.boxes] == [1, inside.sum()]

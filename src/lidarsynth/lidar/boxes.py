@@ -51,6 +51,12 @@ class Box:
         levels = [np.column_stack([flat, np.full(4, z)]) for z in (-height / 2, height / 2)]
         return np.concatenate(levels) + self.centre
 
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """(N,) bool: which of the points (N, 3) m, in the sensor frame, lie inside."""
+        x, y, z = (points - np.asarray(self.centre)).T
+        ahead, left = np.cos(self.yaw) * x + np.sin(self.yaw) * y, np.cos(self.yaw) * y - np.sin(self.yaw) * x
+        return np.all(np.abs([ahead, left, z]) <= np.array(self.size)[:, None] / 2, axis=0)
+
     def record(self) -> dict[str, Any]:
         """Plain numbers, as the JSON files hold them."""
         rounded = {

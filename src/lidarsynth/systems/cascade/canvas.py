@@ -207,3 +207,16 @@ def _world(mesh: Mesh, tint: float) -> World:
 def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) of the sensor's frame, of one that is not tilted."""
     return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3].T.astype(np.float32) if any(sensor.tilt) else vectors
+
+
+def numbered(image: RangeImage) -> RangeImage:
+    """The image, of whose returns of a box's class all that lie in it have its number: some are left of what had been
+    drawn there, others are named so later on."""
+    if image.label is None or image.instance is None:
+        return image
+    number, points = image.instance.copy(), image.points().reshape(-1, 3)
+    for box in image.boxes:
+        own = CLASS_NUMBER["person" if box.kind == "person" else "car"]
+        free = np.flatnonzero((image.label == own) & (number == 0) & image.mask)
+        number.flat[free[box.holds(points[free])]] = box.instance
+    return replace(image, instance=number, boxes=counted(image.boxes, number))

@@ -24,7 +24,7 @@ from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.objects import cars_and_people
 from lidarsynth.streets.sensor_model import Returns, range_noise
 from lidarsynth.streets.shapes import Mesh, moved
-from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, canvas_of, mirrored, pieces, tint_of
+from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, canvas_of, mirrored, numbered, pieces, tint_of
 from lidarsynth.systems.cascade.fences import cast_fences
 from lidarsynth.systems.cascade.hanging import beside, one_surface
 from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes, within
@@ -84,7 +84,9 @@ def as_cast(named: list[RangeImage], cast: list[RangeImage]) -> list[RangeImage]
     return [
         a
         if a.label is None or b.label is None
-        else replace(a, label=np.where(np.isin(b.label, things), b.label, a.label), instance=b.instance, boxes=b.boxes)
+        else numbered(
+            replace(a, label=np.where(np.isin(b.label, things), b.label, a.label), instance=b.instance, boxes=b.boxes)
+        )
         for a, b in zip(named, cast, strict=True)
     ]
 
@@ -105,7 +107,7 @@ def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
             rest = _thing(canvas, kind, todo.pop(0), axis, rng)
             todo += [rest] if rest is not None else []
     cast_fences(canvas, rng)
-    return canvas.on(image)
+    return numbered(canvas.on(image))
 
 
 def _suggestions(canvas: Canvas, kind: Kind) -> list[np.ndarray]:
