@@ -279,6 +279,22 @@ def test_two_requests_at_once_and_other_words_are_refused(place: Path, capsys: p
     assert not Path("a.ply").exists()
 
 
+def test_gaps_of_a_scan_are_no_matter_where_none_is_filled(
+    place: Path, capsys: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+):
+    scan = labelled()
+    half = scan[scan.xyz[:, 0] > 0]
+    write("half.ply", half)
+    main(["complete", "half.ply", "--out", "a.ply", *WORDS])
+    assert "expected points all around" in capsys.readouterr().err
+    main(["complete", "half.ply", "--out", "b.ply", "--without", "car", *WORDS])
+    assert "all around" not in capsys.readouterr().err
+    left = read("b.ply")
+    assert (left.xyz[:, 0] > -0.5).all() and len(left) < 1.05 * len(half)
+    load("model").into("own.toml").complete(half, without="car")
+    assert not [each for each in recwarn if "all around" in str(each.message)]
+
+
 def test_results_with_other_classes_are_not_taken_for_these(place: Path, capsys: pytest.CaptureFixture[str]):
     Path("in").mkdir()
     for name in "ab":

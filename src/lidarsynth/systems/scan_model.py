@@ -153,7 +153,7 @@ class ScanModel(ABC):
         """
         removed = None if without is None else removable(without)
         how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision, removed)
-        scan = noted(self, scan, filling=True)
+        scan = noted(self, scan, filling=removed is None)
         with usual_torch():
             return self.filled(scan, how, known, on_step)
 

@@ -272,7 +272,7 @@ def _caution(scan: Scan, job: Job, work: Work, alone: bool) -> str | None:
     that are looked at, what lacks, and where nothing else is said (`alone`) all that there is to say."""
     if job.verb not in ("complete", "upsample"):
         return None
-    if not work.check:
+    if not work.check or job.how.removed is not None:  # then nothing is filled where the scan has gaps of its own
         return filled_before(scan)
     return caution(scan, None if job.sensor is None else get_sensor(job.sensor), alone)
 
