@@ -94,7 +94,9 @@ def test_things_go_whole_or_not_at_all():
     expected = np.zeros(WALL_SHAPE, bool)
     expected[4:8, 10:20] = expected[10, 30:32] = True
     np.testing.assert_array_equal(whole, expected)
-    assert not in_whole_pieces(image, np.zeros(WALL_SHAPE, bool)).any()
+    none = np.zeros(WALL_SHAPE, bool)
+    assert not in_whole_pieces(image, none).any()
+    assert not in_whole_pieces(image_of(metres, np.full(WALL_SHAPE, ROAD)), none).any()  # where nothing stands
 
 
 def test_nothing_stands_before_what_was_hit():

@@ -50,6 +50,8 @@ def in_whole_pieces(image: RangeImage, gone: np.ndarray) -> np.ndarray:
     parts of things: pieces of what stands go whole where most of them does, and stay where hardly anything does."""
     assert image.label is not None
     stands = image.mask & (gone | ~np.isin(image.label, [CLASS_NUMBER[word] for word in GROUND]))
+    if not gone.any():
+        return gone
     of = pieces(image.range, stands)
     share = np.bincount(of[gone], minlength=of.max() + 1) / np.maximum(np.bincount(of[stands]), 1)
     all_of, none_of = (stands & part[of] for part in (share > MOST, share < HARDLY))

@@ -86,8 +86,7 @@ def complete_scan(
     if recipe is None:
         filled = _sure(model.filled(scan, how, on_step=on_step), least)
         done = f"completed without {in_words(how.removed)}" if how.removed else "completed"
-        whole = model.image_of(scan) if how.removed else None
-        return Filled(filled, lambda: {"measured": whole or _measured(model, scan, filled), done: filled}, {}, scan)
+        return Filled(filled, lambda: {"measured": _measured(model, scan, filled, how), done: filled}, {}, scan)
     truth = check_seen(model.image_of(scan), len(scan))
     known, judge = hidden_part(truth, recipe, how.seed)
     before = truth.keep(known)
@@ -152,9 +151,9 @@ def _sure(filled: RangeImage, least: float | None) -> RangeImage:
     return filled if least is None else filled.surer_than(least)
 
 
-def _measured(model: ScanModel, scan: Scan, filled: RangeImage) -> RangeImage:
-    """The scan's own image: the pixels of a filled one that hold measured points, where it says which."""
-    if filled.xyz is None:
+def _measured(model: ScanModel, scan: Scan, filled: RangeImage, how: Filling) -> RangeImage:
+    """The scan's own image: the pixels of a filled one that hold measured points, where it has all and says which."""
+    if filled.xyz is None or how.removed is not None:
         return model.image_of(scan)
     x, y, z = np.moveaxis(filled.xyz, -1, 0)
     return filled.keep((x != 0) | (y != 0) | (z != 0))
