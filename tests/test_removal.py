@@ -23,6 +23,7 @@ from lidarsynth.weights.load import load
 CAR, PERSON, ROAD, BUILDING = (CLASS_NUMBER[word] for word in ("car", "person", "road", "building"))
 THINGS = [CLASS_NUMBER[word] for word in TRAFFIC]
 WALL = Sensor("wall", tuple(np.linspace(4, -10, 15)), 64, max_range=100.0)  # a degree from beam to beam
+WALL_SHAPE = WALL.height, WALL.width
 
 
 def image_of(metres: np.ndarray, label: np.ndarray | None = None) -> RangeImage:
@@ -105,9 +106,6 @@ def test_nothing_stands_before_what_was_hit():
     filled = image_of(np.where(np.arange(64) % 2, 19.5, 19.0) * np.ones((15, 1)))
     nearer = in_the_way(filled, image_of(metres), gone)
     assert nearer[:, :40:2].all() and not nearer[:, 1:40:2].any() and not nearer[:, 40:].any()
-
-
-WALL_SHAPE = WALL.height, WALL.width
 
 
 @pytest.fixture(scope="module")
@@ -233,20 +231,8 @@ WORDS = ("--model", "model", "--sensor", "own.toml", "--no-picture")
 
 def test_the_verb_takes_away_and_says_how_much_and_who_said_so(place: Path, capsys: pytest.CaptureFixture[str]):
     cars = np.count_nonzero(labelled().label == CAR)
-    main(
-        [
-            "complete",
-            "scan.ply",
-            "--without",
-            "car,person",
-            "--out",
-            "a.ply",
-            "--model",
-            "model",
-            "--sensor",
-            "own.toml",
-        ]
-    )
+    words = ["--without", "car,person", "--model", "model", "--sensor", "own.toml"]
+    main(["complete", "scan.ply", "--out", "a.ply", *words])
     count = len(labelled())
     assert f"took away {cars} of {count} points, car, person as its labels name them" in capsys.readouterr().out
     after = read("a.ply")

@@ -19,7 +19,10 @@ def whole_turn(sensor: Sensor) -> Sensor:
 
 
 def within(images: Iterable[RangeImage], sensor: Sensor) -> Iterator[RangeImage]:
-    """Images of the `whole_turn` of a sensor as the sensor sees them."""
+    """Images (H, W) of the `whole_turn` of a sensor as the sensor sees them, with the boxes of which it sees a part."""
     rays = ~sensor.blocked_rays()
     for image in images:
-        yield image if image.sensor == sensor else replace(image.keep(rays), sensor=sensor)
+        if image.sensor != sensor:
+            seen = image.keep(rays)
+            image = replace(seen, sensor=sensor, boxes=tuple(box for box in seen.boxes if box.points))
+        yield image

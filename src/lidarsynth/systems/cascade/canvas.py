@@ -210,8 +210,8 @@ def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
 
 
 def numbered(image: RangeImage) -> RangeImage:
-    """The image, of whose returns of a box's class all that lie in it have its number: some are left of what had been
-    drawn there, others are named so later on."""
+    """The image (H, W), of whose returns of a box's class all that lie in it have its number: some are left of what had
+    been drawn there, others are named so later on."""
     if image.label is None or image.instance is None:
         return image
     number, points = image.instance.copy(), image.points().reshape(-1, 3)
