@@ -1,4 +1,4 @@
-"""What `complete`, `upsample`, `realise`, `label` and `project` share: options for many scans, and doing the work."""
+"""What verbs share that take many scans, as `complete` and `label` do: their options, and doing the work."""
 
 from __future__ import annotations
 
@@ -118,6 +118,8 @@ def _model(job: Job) -> ScanModel | None:
     if job.verb == "realise":
         model.check_realises()
         return model
+    if job.verb == "insert":
+        return model
     if job.verb == "label":
         return model.with_labels()
     (model.into(job.into) if job.into else model).check(job.how)
@@ -127,7 +129,7 @@ def _model(job: Job) -> ScanModel | None:
 
 def _calls(job: Job, model: ScanModel | None, workers: int = 1) -> int:
     """How many network steps a scan takes, after each of which this process is told."""
-    if model is None or workers > 1 or job.verb in ("realise", "label"):
+    if model is None or workers > 1 or job.verb in ("realise", "insert", "label"):
         return 1
     return model.calls(model.resolved(job.how))
 
@@ -312,8 +314,9 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     if many.shard or many.skip_existing or len(paths) != 1 or not is_bag(paths[0]):
         raise ValueError(f"{out}: expected one bag to make another of, without --shard and --skip-existing; a folder "
                          "takes anything")  # fmt: skip
-    if job.verb == "project" or job.corrupt:
-        word = "range images" if job.verb == "project" else f"--corrupt {job.corrupt}"
+    if job.verb in ("project", "insert") or job.corrupt:
+        words = {"project": "range images", "insert": "boxes"}
+        word = words.get(job.verb, f"--corrupt {job.corrupt}")
         raise ValueError(f"{out}: expected a file or folder for {word}, found a bag, which holds points")
     if out.is_dir():
         raise ValueError(f"{out}: expected the name of a bag to write, found a folder")

@@ -1,4 +1,4 @@
-"""What is said of the scans of `complete`, `upsample`, `realise`, `label` and `project`: one by one, and of all."""
+"""What is said of the scans of verbs that take many, such as `complete` and `label`: one by one, and of all."""
 
 from __future__ import annotations
 

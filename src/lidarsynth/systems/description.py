@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from torch import nn
+
 from lidarsynth.experiment.record import Experiment
+from lidarsynth.lidar.sensor import Sensor
 
 
 @dataclass(frozen=True)
@@ -41,3 +44,17 @@ def training_line(experiment: Experiment) -> str:
     training, done = experiment.training, experiment.card.steps
     stopped = f"stopped at {done:,} of " if 0 < done < training.steps else ""
     return f"{stopped}{training.steps:,} steps of {training.batch_size}, learning rate {training.learning_rate:g}"
+
+
+def described(kind: str, experiment: Experiment, sensor: Sensor, network: nn.Module) -> str:
+    """Three lines: what a model of that class is, its sensor, its network and where that is."""
+    parameters = list(network.parameters())
+    place = parameters[0].device if parameters else "cpu"
+    s, card = sensor, experiment.card
+    count = sum(p.numel() for p in parameters)
+    learned = f", learned from {card.data}" if card.data else ""
+    return (
+        f"{kind} {experiment.name}{learned}\n"
+        f"  sensor   {s.name}: {s.height} beams x {s.width} columns, {s.min_range:g} to {s.max_range:g} m\n"
+        f"  network  {experiment.model.network}, {count:,} parameters, on {place}"
+    )

@@ -21,9 +21,11 @@ from lidarsynth.lidar.removal import removable
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.device import check_device, usual_torch
-from lidarsynth.systems.description import Description
+from lidarsynth.streets.wanted import wanted
+from lidarsynth.systems.description import Description, described
 from lidarsynth.systems.filling import Filling, OnStep, check_counts, whole
 from lidarsynth.systems.hub import push
+from lidarsynth.systems.insertion import Inserted, inserted
 from lidarsynth.systems.known_pixels import known_pixels, of_rays, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
 from lidarsynth.systems.notes import Points, made_by, noted, stranger, taken
@@ -68,16 +70,7 @@ class ScanModel(ABC):
 
     def __repr__(self) -> str:
         """Three lines: what it is, its sensor, its network and where that is."""
-        parameters = list(self.network.parameters())
-        place = parameters[0].device if parameters else "cpu"
-        s, card = self.sensor, self.experiment.card
-        count = sum(p.numel() for p in parameters)
-        learned = f", learned from {card.data}" if card.data else ""
-        return (
-            f"{type(self).__name__} {self.experiment.name}{learned}\n"
-            f"  sensor   {s.name}: {s.height} beams x {s.width} columns, {s.min_range:g} to {s.max_range:g} m\n"
-            f"  network  {self.experiment.model.network}, {count:,} parameters, on {place}"
-        )
+        return described(type(self).__name__, self.experiment, self.sensor, self.network)
 
     def generate(
         self,
@@ -114,15 +107,14 @@ class ScanModel(ABC):
     ) -> Iterator[RangeImage]:
         """Scans `first` .. n - 1 of `generate`, one after the other, in the memory of one batch.
 
-        What does not fit is said at once, not with the first scan. Raises ValueError where the model only completes
-        scans.
+        What does not fit is said at once, not with the first scan: ValueError where the model only completes scans.
         """
         raise self._generates_nothing()
 
     def _checked(self, n: int, steps: int | None, seed: int, sampler: str | None, batch_size: int, first: int) -> None:
         """Raises ValueError for what `stream` cannot do."""
-        asked = None if steps is None else whole("steps", steps)
-        check_counts(n, self.generation_steps(asked, sampler), batch_size, first)
+        calls = self.generation_steps(None if steps is None else whole("steps", steps), sampler)
+        check_counts(n, calls, batch_size, first)
         checked_seed(seed)
 
     def complete(
@@ -238,12 +230,25 @@ class ScanModel(ABC):
         """
         raise self._lacks("classes")
 
+    def insert(
+        self, scan: Points, things: str | Sequence[str], seed: int = 0, sensor: Sensor | str | None = None
+    ) -> Inserted:
+        """The scan with road users more, `scan` and `boxes`: what they hide is gone, what hides them stays.
+
+        scan    points: a scan, or an array or tensor, as of `complete`
+        things  such as "car:2,person@8/-3": kinds, how many, or where: metres ahead, to the left, degrees of the front
+        seed    of shapes, and of places where none is named, by the ground that the labels tell, else the model
+        sensor  that made the scan; None = recognised from the points
+
+        Points that stay are as they were, new ones have `new`, `instance`, a class; who finds no room is left out.
+        Raises ValueError for other words, places that are not free, no room at all, and as `label`.
+        """
+        points, asked, rng = noted(self, scan, sensor), wanted(things), np.random.default_rng(checked_seed(seed))
+        with usual_torch():
+            return inserted(self.suited_to(points, sensor), points, asked, rng)
+
     def filled(
-        self,
-        scan: Points | RangeImage,
-        how: Filling,
-        known: np.ndarray | None = None,
-        on_step: OnStep = None,
+        self, scan: Points | RangeImage, how: Filling, known: np.ndarray | None = None, on_step: OnStep = None
     ) -> RangeImage:
         """`complete` of a record."""
         scan = scan if isinstance(scan, RangeImage) else taken(scan)
@@ -370,11 +375,7 @@ class ScanModel(ABC):
         return sampler
 
     def evaluations(
-        self,
-        method: str = "auto",
-        steps: int | None = None,
-        resamples: int | None = None,
-        sampler: str | None = None,
+        self, method: str = "auto", steps: int | None = None, resamples: int | None = None, sampler: str | None = None
     ) -> int:
         """How often `complete` calls `on_step`. Raises ValueError for what this model cannot do."""
         return self.calls(self.resolved(Filling(method, steps, resamples, sampler)))

@@ -27,11 +27,13 @@ from lidarsynth.lidar.view import placement
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
+from lidarsynth.streets.wanted import wanted
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.notes import IN_PYTHON, beyond_image
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, taken_away, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
+from lidarsynth.verbs.insertion import BOXES, check_boxes, insert_scan, told_of, write_boxes
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 from lidarsynth.verbs.viewpoint import viewpoint_note
@@ -49,9 +51,9 @@ FIELDS = {"realise": realised_fields, "label": labelled_fields}  # of a bag's me
 class Job:
     """What is done with every scan.
 
-    verb       complete, upsample, realise, label or project
+    verb       complete, upsample, realise, insert, label or project
     model      as `load` takes it; not of project
-    how        of complete and upsample; of realise its seed, scan i being drawn from seed + i
+    how        of complete and upsample; of realise and insert its seed, scan i being drawn from seed + i
     corrupt    recipe to hide a part first, of complete
     sensor     that made the scans, None = that of a range image, or recognised
     into       sensor of the result, of upsample
@@ -62,6 +64,7 @@ class Job:
     strict     refuse scans that are not in their sensor's frame
     picture    a .png beside each file
     labels     classes of the points too, of complete and upsample; of label, always
+    things     that are put into the scan, of insert, as `streets.wanted` has them
     """
 
     verb: str
@@ -79,6 +82,7 @@ class Job:
     strict: bool = False
     picture: bool = True
     labels: bool = False
+    things: str | None = None
 
     @property
     def beside(self) -> tuple[str, ...]:
@@ -89,7 +93,7 @@ class Job:
     @property
     def reads_labels(self) -> bool:
         """Whether a `.label` file of a scan's own is read, and its words go on with the points."""
-        return self.verb == "realise" or self.how.removed is not None
+        return self.verb in ("realise", "insert") or self.how.removed is not None
 
     def recipe(self, weights: str | None = None) -> dict[str, Any]:
         """What decides the results, as plain values; what was not asked for is left out.
@@ -100,7 +104,7 @@ class Job:
         """
         names = ["verb", "sensor", "projection", "width"]
         if self.verb != "project":
-            names = ["verb", "model", "sensor", "corrupt", "into", "times", "least", "labels"]
+            names = ["verb", "model", "sensor", "corrupt", "into", "times", "least", "labels", "things"]
         kept = {name: getattr(self, name) for name in names} | (vars(self.how) if self.verb != "project" else {})
         kept["transform"] = None if self.transform is None else np.asarray(self.transform).tolist()
         kept |= {MEANT[name]: _digits(word) for name in ("sensor", "into") if (word := kept.get(name)) is not None}
@@ -308,6 +312,10 @@ def _made(
         usual = sensor if job.sensor is not None else WORDS.get(sensor.name, sensor)
         note = columns_note(filled.image.sensor, usual.width)
         return filled, f"{done}; {note}" if note else done
+    if job.things is not None:
+        sensor, things = named_sensor(scan, path, "--sensor", job.sensor, model.sensor), wanted(job.things)
+        filled = insert_scan(model, scan, things, sensor, job.how.seed + work.number)
+        return filled, told_of(filled, scan, things) + _columns(sensor, job, "; ")
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         sensor = usual_at_most(sensor) if job.sensor is None else sensor
@@ -337,6 +345,8 @@ def _points(done: Filled | RangeImage, loaded: Loaded, transform: np.ndarray | N
 def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded, job: Job) -> tuple[str, ...]:
     """Write the result, the scan last: where it is, all is. Returns the endings of what is beside a .bin or .npy."""
     beside: tuple[str, ...] = ()
+    if job.things is not None:
+        check_boxes(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
@@ -355,5 +365,8 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         content = without_places(placed)
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
+    if job.things is not None and isinstance(done, Filled):
+        write_boxes(target, done.points, image.boxes, job.transform)
+        beside += (BOXES,)
     write(target, content)
     return beside

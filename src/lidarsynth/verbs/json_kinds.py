@@ -66,6 +66,10 @@ def _boxes(values: Mapping[str, Any]) -> Lines:
     return {"kind": f"boxes of one labelled street scan: {len(values['boxes'])}, of {values['points']} points"}
 
 
+def _boxes_alone(values: Mapping[str, Any]) -> Lines:
+    return {"kind": f"boxes of one scan: {len(values['boxes'])}, of {values['points']} points"}
+
+
 def _generated(values: Mapping[str, Any]) -> Lines:
     return {"kind": "settings of lidarsynth generate, with which it goes on: "
                     f"{plural(values['steps'], 'step')}, seed {values['seed']}, {values['format']}"}  # fmt: skip
@@ -76,5 +80,6 @@ OURS = {
     ("protocol", "version", "values"): _evaluation,
     ("layout", "seed", "sensor"): _streets,
     ("world", "frame", "boxes", "points"): _boxes,
+    ("boxes", "points"): _boxes_alone,
     ("weights", "format", "steps", "seed"): _generated,
 }

@@ -13,17 +13,19 @@ from lidarsynth.lidar.pieces import connected
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.streets.ground import Ground
 from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
+from lidarsynth.streets.lone import alone
 from lidarsynth.streets.materials import MATERIALS
 from lidarsynth.streets.raycast import FewTriangles
 from lidarsynth.streets.sensor_model import RESPONSE, Returns, sense
 from lidarsynth.streets.shapes import Mesh
 from lidarsynth.streets.turn import sensor_pose
-from lidarsynth.streets.world import THING, THINGS, World
 from lidarsynth.systems.cascade.hanging import beside
 
 GROUND = np.isin(np.arange(len(CLASS_NUMBER)), [CLASS_NUMBER[w] for w in ("road", "parking", "sidewalk", "terrain")])
+STANDING = np.array([CLASS_NUMBER[w] for w in ("building", "fence", "car")])
+# Columns, and metres between their returns, that tell in which direction something stands.
+ALONG, APART = 3, (0.05, 1.5)
 # Metres of a cell; returns of one thing are less than so many cells from others; and so many are enough for one.
 CELL, REACH, FEW = 0.4, 4, 20
 AROUND = 6.0  # metres around a thing where the ground is looked for
@@ -127,7 +129,7 @@ class Canvas:
         number = np.cumsum(~hidden(sensor)) - 1
         each = Lasers(*(part[number[at]] for part in lasers(sensor)))
         starts, rays = self.starts[at // sensor.width], self.rays_at(at)
-        return sense(_world(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
+        return sense(alone(mesh, tint), FewTriangles(mesh.corners), starts, rays, each, rng, sensor.max_range), at
 
     def put(
         self, at: np.ndarray, metres: np.ndarray, reflectance: np.ndarray, label: np.ndarray, instance: int = 0
@@ -136,7 +138,7 @@ class Canvas:
         for whole, values in ((self.metres, metres), (self.reflectance, reflectance), (self.label, label)):
             whole.flat[at] = np.where(metres > 0, values, 0)
         self.instance.flat[at] = np.where(metres > 0, instance, 0)
-        self.points.reshape(-1, 3)[at] = _upright(self.sensor, self.sensor.points(self.metres, at))
+        self.points.reshape(-1, 3)[at] = levelled(self.sensor, self.sensor.points(self.metres, at))
 
     def put_returns(self, at: np.ndarray, found: Returns, where: np.ndarray, instance: int = 0) -> None:
         """`put` of what `cast` found at `at` (N,), `where` (N,) bool it is seen."""
@@ -145,7 +147,7 @@ class Canvas:
 
     def to_sensor(self, upright: np.ndarray) -> np.ndarray:
         """Vectors (..., 3) of the frame that stands upright, in the sensor's."""
-        return upright @ sensor_pose(self.sensor, np.zeros(6))[:3, :3]
+        return to_sensor(self.sensor, upright)
 
 
 def canvas_of(image: RangeImage) -> Canvas:
@@ -154,11 +156,25 @@ def canvas_of(image: RangeImage) -> Canvas:
     sensor, label = image.sensor, np.where(image.mask, image.label, 0)
     rays, starts = sensor.directions(), np.zeros((sensor.height, 3), np.float32)
     starts[:, 2] = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
-    rays, starts = (_upright(sensor, part) for part in (rays, starts))
+    rays, starts = (levelled(sensor, part) for part in (rays, starts))
     metres, reflectance = image.range * image.mask, image.reflectance * image.mask
-    points = _upright(sensor, sensor.points(metres))
+    points = levelled(sensor, sensor.points(metres))
     angles = np.arctan2(rays[..., 1], rays[..., 0]), np.arcsin(rays[..., 2].clip(-1, 1))
     return Canvas(sensor, metres, reflectance, label, points, rays, starts, *angles, np.zeros(label.shape, np.int32))
+
+
+def axis_of(canvas: Canvas) -> float | None:
+    """Direction in which most of what stands does, radians, or at a right angle to it; None where too little does."""
+    stands = np.isin(canvas.label, STANDING)
+    along = np.roll(canvas.points[..., :2], -ALONG, 1) - canvas.points[..., :2]
+    length = np.hypot(along[..., 0], along[..., 1])
+    along, length = (
+        part[stands & np.roll(stands, -ALONG, 1) & (length > APART[0]) & (length < APART[1])]
+        for part in (along, length)
+    )
+    if len(length) < 10 * FEW:
+        return None
+    return float(np.angle((length * np.exp(4j * np.arctan2(along[:, 1], along[:, 0]))).sum())) / 4
 
 
 def pieces(cells: np.ndarray, steps: list[int]) -> np.ndarray:
@@ -194,17 +210,7 @@ def mirrored(gone: np.ndarray, left: np.ndarray, width: int) -> np.ndarray:
     return left[there % len(left)]
 
 
-def _world(mesh: Mesh, tint: float) -> World:
-    """A world of one thing, `tint` in spreads of its materials."""
-    count = len(mesh)
-    kinds, tints = np.full(count, THING, np.uint8), np.full(count, tint, np.float32)
-    none, thing = np.full(count, -1, np.int16), np.zeros(count, np.int32)
-    nowhere, alone = np.zeros((0, 12), np.float32), np.zeros(1, THINGS)
-    told = mesh.corners, kinds, mesh.material, mesh.label, tints, none, nowhere
-    return World(*told, ground=Ground(()), poses=np.zeros((1, 6)), thing=thing, things=alone)
-
-
-def _upright(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
+def levelled(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) of the sensor's frame, of one that is not tilted."""
     return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3].T.astype(np.float32) if any(sensor.tilt) else vectors
 
@@ -220,3 +226,8 @@ def numbered(image: RangeImage) -> RangeImage:
         free = np.flatnonzero((image.label == own) & (number == 0) & image.mask)
         number.flat[free[box.holds(points[free])]] = box.instance
     return replace(image, instance=number, boxes=counted(image.boxes, number))
+
+
+def to_sensor(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of a frame that stands upright, in the sensor's."""
+    return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3]

@@ -24,7 +24,17 @@ from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.objects import cars_and_people
 from lidarsynth.streets.sensor_model import Returns, range_noise
 from lidarsynth.streets.shapes import Mesh, moved
-from lidarsynth.systems.cascade.canvas import FEW, GROUND, Canvas, canvas_of, mirrored, numbered, pieces, tint_of
+from lidarsynth.systems.cascade.canvas import (
+    FEW,
+    GROUND,
+    Canvas,
+    axis_of,
+    canvas_of,
+    mirrored,
+    numbered,
+    pieces,
+    tint_of,
+)
 from lidarsynth.systems.cascade.fences import cast_fences
 from lidarsynth.systems.cascade.hanging import beside, one_surface
 from lidarsynth.systems.cascade.placing import LONG, Place, Shape, View, best_place, length, parts_of, two_boxes, within
@@ -55,7 +65,6 @@ KINDS = (
     Kind("person", (two_boxes("person", 0.5, 0.55, 0.8, 1.75, (-0.2, 0.2, 0.12)),),
          "cloth", 1, 0.12, 25.0, 1.8, 0.2, 0.5),
 )  # fmt: skip
-STANDING = np.array([CLASS_NUMBER[w] for w in ("building", "fence", "car")])
 ROAD = CLASS_NUMBER["road"]
 LOW = 0.2  # metres above the ground around a thing that are ground
 WIDER, TALLER = 2.5, 2.2  # metres beside and above a thing that are looked at
@@ -68,8 +77,6 @@ WALL = (0.4, 1.7)  # metres, standard deviations across and along, of returns th
 BESIDE = 3  # columns beside a heap's that are as lost as its own
 # Metres beside a thing, and above its ground, where it may have swallowed rays; beams and columns that hang together.
 DARK, DARK_TALL, DARK_STEPS = 1.5, 1.5, ((0, 1), (0, 2), *((1, side) for side in range(-2, 3)))
-# Columns, and metres between their returns, that tell in which direction something stands.
-ALONG, APART = 3, (0.05, 1.5)
 
 
 def all_recast(images: list[RangeImage], rng: list[torch.Generator]) -> list[RangeImage]:
@@ -100,7 +107,7 @@ def recast(image: RangeImage, rng: np.random.Generator) -> RangeImage:
     """The image (H, W), metres and reflectance in [0, 1], with labels (H, W), whose cars, people and fences have the
     shapes of streets'; as it is, where nothing suggests any."""
     canvas = canvas_of(image)
-    axis = _axis(canvas)
+    axis = axis_of(canvas)
     for kind in KINDS:
         todo = _suggestions(canvas, kind)
         while todo:
@@ -178,20 +185,6 @@ def _between(there: np.ndarray, axis: int) -> np.ndarray:
     """Pixels (H, W) with some that are `there` before and behind, or that are themselves."""
     before, behind = (np.logical_or.accumulate(one, axis) for one in (there, np.flip(there, axis)))
     return before & np.flip(behind, axis)
-
-
-def _axis(canvas: Canvas) -> float | None:
-    """Direction in which most of what stands does, radians, or at a right angle to it; None where too little does."""
-    stands = np.isin(canvas.label, STANDING)
-    along = np.roll(canvas.points[..., :2], -ALONG, 1) - canvas.points[..., :2]
-    length = np.hypot(along[..., 0], along[..., 1])
-    along, length = (
-        part[stands & np.roll(stands, -ALONG, 1) & (length > APART[0]) & (length < APART[1])]
-        for part in (along, length)
-    )
-    if len(length) < 10 * FEW:
-        return None
-    return float(np.angle((length * np.exp(4j * np.arctan2(along[:, 1], along[:, 0]))).sum())) / 4
 
 
 def _view(canvas: Canvas, at: np.ndarray, middle: np.ndarray, level: float, longer: float) -> View:

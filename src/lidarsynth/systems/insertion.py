@@ -1,0 +1,347 @@
+"""Recorded scans with road users more: the streets' own shapes, met by the very rays of the scan, which hide what is
+behind them and are hidden by what is before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lidarsynth.lidar.boxes import Box
+from lidarsynth.lidar.columns import usual_at_most
+from lidarsynth.lidar.lost_rays import LostRays, lost_rays
+from lidarsynth.lidar.marks import confidences, marks_of, were_new
+from lidarsynth.lidar.projection import pixel_of_points, project
+from lidarsynth.lidar.removal import own_classes
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.actors import KINDS, MARGIN
+from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
+from lidarsynth.streets.lone import alone
+from lidarsynth.streets.objects import library
+from lidarsynth.streets.raycast import FewTriangles
+from lidarsynth.streets.sensor_model import Returns, sense
+from lidarsynth.streets.shapes import Mesh
+from lidarsynth.streets.wanted import Wanted
+from lidarsynth.systems.cascade.canvas import TINT, axis_of, canvas_of, levelled, span, to_sensor
+from lidarsynth.systems.cascade.response import Response, response_of
+from lidarsynth.systems.free_places import NEAR, Spot, Surroundings
+
+SIZE = (0.97, 1.03)  # things are so much smaller or larger than the streets'
+OCCLUDED = 0.3  # metres nearer than a thing that hide it
+SHOWN, LEAST = 0.4, 8  # of the rays that would meet a thing where there is room, that nothing hides; returns
+INSIDE = 5  # measured points that may be in a thing for which somebody names a place: noise
+INSTANCE, MOST_INSTANCES = "instance", (1 << 16) - 1  # field of the numbers of boxes; the most that raw labels hold
+RINGS = ("ring", "file_ring")  # further fields that tell of a ray, whatever it meets
+
+
+class Inserted(NamedTuple):
+    """The scan, and the boxes of what was inserted, in the sensor frame, whose `instance` its points have."""
+
+    scan: Scan
+    boxes: tuple[Box, ...]
+
+
+class Names(Protocol):
+    """What is asked of a model here; see `ScanModel`."""
+
+    sensor: Sensor
+
+    def named(self, scan: Scan, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage: ...
+
+
+@dataclass
+class Rays:
+    """All rays of a scan, its N points' first, then those that are lost: starts and directions (R, 3) of a frame that
+    stands upright; azimuth, elevation (R,) radians; row (R,); where each ends (R,), metres, infinite for nowhere; and
+    of what was put there: owner (R,), its number or -1, metres, 0 for no return, reflectance, label."""
+
+    starts: np.ndarray
+    directions: np.ndarray
+    azimuth: np.ndarray
+    elevation: np.ndarray
+    row: np.ndarray
+    ends: np.ndarray
+    owner: np.ndarray
+    metres: np.ndarray
+    reflectance: np.ndarray
+    label: np.ndarray
+
+    def towards(self, mesh: Mesh) -> np.ndarray:
+        """(n,) which rays may meet a mesh."""
+        x, y, z = mesh.corners.reshape(-1, 3).T
+        ahead = float(np.arctan2(y.mean(), x.mean()))
+        low, high = span(np.arctan2(y, x) - ahead)
+        heights = np.arctan2(z, np.hypot(x, y))
+        around = (self.azimuth - ahead + np.pi) % (2 * np.pi) - np.pi
+        at = (around > low - 0.02) & (around < high + 0.02)
+        return np.flatnonzero(at & (self.elevation > heights.min() - 0.05) & (self.elevation < heights.max() + 0.05))
+
+
+class Thing(NamedTuple):
+    """What is put: a word of KINDS, its shape in its own frame, its place, and the rays (m,) that would meet it."""
+
+    kind: str
+    mesh: Mesh
+    spot: Spot
+    met: np.ndarray
+
+
+class Placed(NamedTuple):
+    """All rays of a scan of a sensor, after what was put; which of them are lost ones; how the scan reports."""
+
+    rays: Rays
+    lost: LostRays
+    put: list[Thing]
+    sensor: Sensor
+    response: Response
+
+
+def inserted(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Generator) -> Inserted:
+    """`ScanModel.insert` of a model with images of the scan's own sensor."""
+    return with_points(scan, placed(model, scan, things, rng))
+
+
+def placed(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Generator) -> Placed:
+    """Where all that finds room stands. Raises ValueError as `ScanModel.insert` does."""
+    raw = scan.extra.get("raw_label")
+    own, sensor = own_classes(scan), usual_at_most(model.sensor)
+    if own is None and raw is not None:
+        raise ValueError("expected labels of SemanticKITTI's raw ids, beside which those of what is inserted stand, "
+                         "found others")  # fmt: skip
+    if own is None:
+        named = model.named(scan, sensor).completed
+        assert named is not None and named.label is not None
+        own = named.label
+    image = check_seen(project(replace(scan, label=own.astype(np.int64)), sensor), len(scan))
+    lost = lost_rays(scan, model.sensor, pixel_of_points(scan, model.sensor, "auto")[0])
+    rays, lost = _rays(scan, model.sensor, lost)
+    around = Surroundings(levelled(sensor, scan.xyz), own, axis_of(canvas_of(image)))
+    put: list[Thing] = []
+    for thing in things:
+        if (found := _put(rays, around, thing, model.sensor, len(put), rng)) is not None:
+            put.append(found)
+    if not put:
+        kinds = ", ".join(dict.fromkeys(thing.kind for thing in things))
+        raise ValueError(f"expected a scan that shows free ground for {kinds}, found none where it has room")
+    return Placed(rays, lost, put, model.sensor, response_of(image, image.mask))
+
+
+def _rays(scan: Scan, sensor: Sensor, lost: LostRays) -> tuple[Rays, LostRays]:
+    """The rays of a scan, and the lost ones that nothing on the carrier blocks."""
+    column = ((np.pi - lost.azimuth) / (2 * np.pi) * sensor.width).astype(int) % sensor.width
+    free = ~hidden(sensor)[lost.row, column]
+    lost = LostRays(*(part[free] for part in lost))
+    row = np.concatenate([pixel_of_points(scan, sensor, "auto")[0], lost.row])
+    offset = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
+    starts = np.zeros((len(row), 3), np.float32)
+    starts[:, 2] = np.where(row < 0, 0, offset[row])
+    up = np.radians(np.asarray(sensor.elevations))[lost.row]
+    flat = np.cos(up)
+    sent = np.stack([flat * np.cos(lost.azimuth), flat * np.sin(lost.azimuth), np.sin(up)], 1).astype(np.float32)
+    ways = np.concatenate([scan.xyz - starts[: len(scan)], sent])
+    far = np.linalg.norm(ways, axis=1)
+    ways /= np.maximum(far, 1e-6)[:, None]
+    ends = np.where(np.arange(len(row)) < len(scan), far, np.inf).astype(np.float32)
+    starts, ways = levelled(sensor, starts), levelled(sensor, ways)
+    angles = np.arctan2(ways[:, 1], ways[:, 0]), np.arcsin(ways[:, 2].clip(-1, 1))
+    none = np.zeros(len(row), np.float32)
+    owner = np.full(len(row), -1)
+    return Rays(starts, ways, *angles, row, ends, owner, none, none.copy(), np.zeros(len(row), np.int64)), lost
+
+
+def _put(
+    rays: Rays, around: Surroundings, thing: Wanted, sensor: Sensor, number: int, rng: np.random.Generator
+) -> Thing | None:
+    """What is put as thing `number`; None where there is no room. Raises ValueError where a place that somebody names
+    is not free, or not seen."""
+    meshes = library()[thing.kind]
+    mesh = meshes[int(rng.integers(len(meshes)))]
+    mesh = replace(mesh, corners=mesh.corners * np.float32(rng.uniform(*SIZE)))
+    tint = float(np.clip(rng.normal(), *TINT))
+    spots = around.free(thing.kind, mesh, rng) if thing.place is None else _named(around, thing, mesh, rng)
+    for spot in spots:
+        there = spot.on_ground(mesh)
+        at = rays.towards(there)
+        found = sense(
+            alone(there, tint), FewTriangles(there.corners), rays.starts[at], rays.directions[at],
+            _lasers(sensor, rays.row[at]), rng, sensor.max_range,
+        )  # fmt: skip
+        met = np.isfinite(found.surface) & (found.face >= 0)
+        seen = met & (rays.ends[at] >= found.surface - OCCLUDED)
+        returned = np.where(found.distance >= sensor.min_range, found.distance, 0) * seen
+        if thing.place is None and (seen.sum() < SHOWN * met.sum() or np.count_nonzero(returned) < LEAST):
+            continue
+        if not returned.any():
+            break
+        _set(rays, at[seen], found, returned[seen], seen, number)
+        around.taken.append(around.footprint(spot, mesh))
+        return Thing(thing.kind, mesh, spot, at[met])
+    if thing.place is not None:
+        x, y = thing.place
+        raise ValueError(f"expected a place for {thing.kind} that the scan's rays reach, found {x:g} m ahead, {y:g} m "
+                         "to the left, of which none returns")  # fmt: skip
+    return None
+
+
+def _set(rays: Rays, at: np.ndarray, found: Returns, returned: np.ndarray, seen: np.ndarray, number: int) -> None:
+    rays.owner[at], rays.ends[at] = number, found.surface[seen]
+    rays.metres[at], rays.reflectance[at], rays.label[at] = returned, found.reflectance[seen], found.label[seen]
+
+
+def _named(around: Surroundings, thing: Wanted, mesh: Mesh, rng: np.random.Generator) -> Iterator[Spot]:
+    """The place that somebody names. Raises ValueError where nothing can be put there."""
+    assert thing.place is not None
+    x, y = thing.place
+    yaw = float(rng.uniform(-np.pi, np.pi)) if thing.yaw is None else thing.yaw
+    where = f"{x:g} m ahead, {y:g} m to the left"
+    if (spot := around.spot(x, y, yaw)) is None:
+        raise ValueError(f"expected a place for {thing.kind} on ground that the scan shows, found none {where}")
+    if around.crowded(spot, mesh):
+        raise ValueError(f"expected a free place for {thing.kind}, {NEAR:g} m and more away, found the sensor or "
+                         f"another thing {where}")  # fmt: skip
+    if (inside := int(around.in_it(spot, mesh).sum())) > INSIDE:
+        raise ValueError(f"expected a free place for {thing.kind}, found {inside} measured points in it {where}")
+    yield spot
+
+
+def _lasers(sensor: Sensor, row: np.ndarray) -> Lasers:
+    """What is known of the lasers of rays of these rows (n,), -1 for none."""
+    free = ~hidden(sensor)
+    whole, first = lasers(sensor), np.cumsum(free) - 1
+    of_row = first[np.arange(sensor.height) * sensor.width + free.argmax(1)]
+    loss, dip, shift = (part[of_row][row] * (row >= 0) for part in whole[:3])
+    return Lasers(loss, dip, shift, np.maximum(row, 0).astype(np.uint32))
+
+
+def with_points(scan: Scan, there: Placed) -> Inserted:
+    """The scan with what was put: points that it hides are gone, and its own stand where their rays stood in order."""
+    rays, lost = there.rays, there.lost
+    old, new = np.flatnonzero(rays.owner[: len(scan)] < 0), np.flatnonzero(rays.metres > 0)
+    new = new[rays.owner[new] >= 0]
+    number = _numbers(scan)
+    first = 1 + int(number.max(initial=0))
+    mine = _points(scan, there, new, first)
+    fields = {
+        name: np.concatenate([values[old], mine.extra.get(name, np.zeros(len(new), values.dtype))])
+        for name, values in _fields(scan, number).items()
+    }
+    ring, time, label = (
+        None if part is None or more is None else np.concatenate([part[old], more])
+        for part, more in ((scan.ring, mine.ring), (scan.time, mine.time), (_labels(scan), mine.label))
+    )
+    xyz, light = np.concatenate([scan.xyz[old], mine.xyz]), np.concatenate([scan.reflectance[old], mine.reflectance])
+    both = Scan(xyz, light, ring, time, label, fields)
+    order = np.concatenate([old.astype(np.float64), _order(scan, rays, lost)[new]])
+    return Inserted(both[np.argsort(order, kind="stable")], _boxes(there, first))
+
+
+def _points(scan: Scan, there: Placed, new: np.ndarray, first: int) -> Scan:
+    """The points (n,) of the rays `new`: what tells of a ray is the ray's, or of a lost one that of its neighbour; of
+    what tells of what it met, the place, reflectance, class and number are the thing's, all else is 0."""
+    (rays, lost, put, sensor, response), count = there, len(scan)
+    source = np.concatenate([np.arange(count), lost.before])[new]
+    xyz = to_sensor(sensor, rays.starts[new] + rays.directions[new] * rays.metres[new, None]).astype(np.float32)
+    dim = np.asarray(response.dimness or [0.0] * sensor.height, np.float32)[rays.row[new]]
+    light = response.reported((rays.reflectance[new] - dim).clip(0, 1)) * bool(scan.reflectance.any())
+    owner = rays.owner[new]
+    extra = {name: np.zeros(len(new), values.dtype) for name, values in scan.extra.items()}
+    extra |= {name: scan.extra[name][source] for name in RINGS if name in scan.extra}
+    extra |= {INSTANCE: first + owner, "new": np.ones(len(new), np.uint8), "confidence": np.ones(len(new), np.float32)}
+    if "raw_label" in scan.extra:
+        if first + len(put) > MOST_INSTANCES:
+            raise ValueError(f"expected instances below {MOST_INSTANCES} in labels, found {first - 1}")
+        word = np.array([KINDS[thing.kind].raw for thing in put])[owner] | (first + owner) << 16
+        extra["raw_label"] = word.astype(scan.extra["raw_label"].dtype)
+    time = None if scan.time is None else _times(scan.time, lost, new, source, count)
+    return Scan(xyz, light.astype(np.float32), _rings(scan, rays, new, source), time, rays.label[new], extra)
+
+
+def _times(time: np.ndarray, lost: LostRays, new: np.ndarray, source: np.ndarray, count: int) -> np.ndarray:
+    """(n,) when the rays `new` were sent: a lost one between its neighbours, unless the turn begins between these."""
+    own = time[source]
+    of = new[new >= count] - count
+    step = time[lost.after[of]] - time[lost.before[of]]
+    between = np.abs(step) < np.ptp(time) / 2
+    own[new >= count] += np.where(between, lost.share[of] * step, 0).astype(own.dtype)
+    return own
+
+
+def _fields(scan: Scan, number: np.ndarray) -> dict[str, np.ndarray]:
+    """Further fields of the scan, with `new`, its numbers (N,) of instances, and its confidences where it has any; what
+    it calls so and is something else under another name."""
+    marks = marks_of(scan)
+    theirs = {"new", "confidence"} - marks.keys() | ({INSTANCE} if _own_numbers(scan) is None else set())
+    kept = {f"file_{name}" if name in theirs else name: values for name, values in scan.extra.items()}
+    sure = {"confidence": confidences(scan)} if "confidence" in marks else {}
+    return kept | {INSTANCE: number, "new": were_new(scan)} | sure
+
+
+def _numbers(scan: Scan) -> np.ndarray:
+    """(N,) int32 instance of each point that the scan tells of, 0 for none."""
+    if (number := _own_numbers(scan)) is not None:
+        return number.astype(np.int32)
+    raw = scan.extra.get("raw_label")
+    return np.zeros(len(scan), np.int32) if raw is None else (raw.astype(np.int64) >> 16).astype(np.int32)
+
+
+def _own_numbers(scan: Scan) -> np.ndarray | None:
+    """Instances as whole numbers, if a scan has a field of them."""
+    number = scan.extra.get(INSTANCE)
+    return number if number is not None and number.dtype.kind in "iu" and abs(number).max(initial=0) < 1 << 31 else None
+
+
+def _labels(scan: Scan) -> np.ndarray | None:
+    """(N,) classes of the scan's points: 0 where nobody has said any; None where its raw labels do."""
+    if scan.label is not None or "raw_label" in scan.extra:
+        return scan.label
+    return np.zeros(len(scan), np.int64)
+
+
+def _order(scan: Scan, rays: Rays, lost: LostRays) -> np.ndarray:
+    """(R,) where each ray stands among the scan's points: a lost one next to the neighbour that comes first; those of
+    beams of which none returned ring by ring before all others, in the order of the scan's own."""
+    onward = bool(np.median(lost.after - lost.before) > 0) if len(lost.row) else True
+    place = lost.before + lost.share if onward else lost.after + 1 - lost.share
+    above = np.flatnonzero(lost.row != rays.row[lost.before])
+    start = np.arctan2(*scan.xyz[0, [1, 0]]) if len(above) else 0
+    around = (lost.azimuth[above] - start) * (1 if onward else -1) % (2 * np.pi) / (2 * np.pi)
+    place[above] = lost.row[above] - rays.row[lost.before[above]] - 1 + around
+    return np.concatenate([np.arange(len(scan)), place])
+
+
+def _rings(scan: Scan, rays: Rays, new: np.ndarray, source: np.ndarray) -> np.ndarray | None:
+    """(n,) rings of the rays `new`, as the scan numbers them: those of the neighbours `source`, or as many rows off."""
+    if scan.ring is None:
+        return None
+    row = rays.row[: len(scan)]
+    inside = row >= 0
+    ways = [way for way in (1, -1) if len(np.unique((scan.ring - way * row)[inside])) == 1]
+    return scan.ring[source] + (ways[0] if ways else 0) * (rays.row[new] - rays.row[source])
+
+
+def _boxes(there: Placed, first: int) -> tuple[Box, ...]:
+    """Boxes of all things that any point is of, numbered from the first on."""
+    rays, put, sensor = there.rays, there.put, there.sensor
+    points = np.bincount(rays.owner[(rays.owner >= 0) & (rays.metres > 0)], minlength=len(put))
+    boxes = [_box(thing, sensor, first + k, int(points[k]), rays.owner[thing.met] == k) for k, thing in enumerate(put)]
+    return tuple(box for box in boxes if box.points)
+
+
+def _box(thing: Thing, sensor: Sensor, number: int, points: int, shown: np.ndarray) -> Box:
+    """The box around a thing; `shown` (m,) bool, of the rays that would meet it, which do."""
+    corners = thing.mesh.corners.reshape(-1, 3).astype(np.float64)
+    low, high = corners.min(0), corners.max(0)
+    heights = thing.spot.on_ground(thing.mesh).corners[..., 2]
+    (x, y, _), (c, s) = (low + high) / 2, (np.cos(thing.spot.yaw), np.sin(thing.spot.yaw))
+    bottom, top = float(heights.min()), float(heights.max())
+    middle = np.array([thing.spot.x + c * x - s * y, thing.spot.y + s * x + c * y, (bottom + top) / 2])
+    ahead = to_sensor(sensor, np.array([c, s, 0.0]))
+    yaw, still = float(np.arctan2(ahead[1], ahead[0])), (0.0, 0.0, 0.0)
+    x, y, z = to_sensor(sensor, middle).tolist()
+    length, width = (high - low)[:2].tolist()
+    size = (length + 2 * MARGIN, width + 2 * MARGIN, top - bottom + 2 * MARGIN)
+    hidden_share = float(1 - shown.mean())
+    return Box(thing.kind, number, (x, y, z), size, yaw, still, (x, y, z), yaw, still, points, hidden_share)

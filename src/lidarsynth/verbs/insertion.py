@@ -1,0 +1,81 @@
+"""What the verb `insert` does with one scan: put road users into it, and say where they stand."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidarsynth.lidar.boxes import Box
+from lidarsynth.lidar.frame import transformed
+from lidarsynth.lidar.plural import plural
+from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
+from lidarsynth.lidar.whole_file import write_whole
+from lidarsynth.streets.wanted import Wanted
+from lidarsynth.verbs.completion import Filled
+
+if TYPE_CHECKING:
+    from lidarsynth.systems.scan_model import ScanModel
+
+BOXES = ".json"  # ending of the file of boxes, as `streets --format pcd` has it
+
+
+def insert_scan(model: ScanModel, scan: Scan, things: Sequence[Wanted], sensor: Sensor, seed: int = 0) -> Filled:
+    """A scan of `sensor` with road users more. Raises ValueError as `ScanModel.insert` does."""
+    from lidarsynth.systems.insertion import INSTANCE, inserted
+
+    found = inserted(model.suited_to(scan, sensor), scan, things, np.random.default_rng(seed))
+    image = project(found.scan, sensor)
+    number = project(replace(found.scan, label=found.scan.extra[INSTANCE]), sensor).label
+    image = replace(image, completed=found.scan, instance=number, boxes=found.boxes)
+    return Filled(image, lambda: {"measured": project(scan, sensor), "inserted": image}, {}, scan)
+
+
+def told_of(filled: Filled, scan: Scan, things: Sequence[Wanted]) -> str:
+    """What was inserted, in words, and what found no room."""
+    boxes = filled.image.boxes
+    asked, found = Counter(thing.kind for thing in things), Counter(box.kind for box in boxes)
+    points = sum(box.points for box in boxes)
+    gone = len(scan) + points - len(filled.points)
+    text = f"inserted {_listed(found)}: {plural(points, 'point')}, in place of {gone} of {len(scan)}"
+    return text + (f"; no room was found for {_listed(asked - found)}" if asked - found else "")
+
+
+def _listed(kinds: Counter[str]) -> str:
+    return ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+
+
+def check_boxes(target: Path) -> None:
+    """Raises ValueError where the boxes beside `target` would replace a file that holds none."""
+    file = target.with_suffix(BOXES)
+    if not file.exists():
+        return
+    try:
+        found = read_json(file, LARGEST_INDEX)
+    except (OSError, ValueError):
+        found = None
+    if not (isinstance(found, dict) and found.keys() == {"points", "boxes"}):
+        raise ValueError(f"{target}: expected a name beside which {file.name} may be written, found another file there")
+
+
+def write_boxes(target: Path, points: Scan, boxes: Sequence[Box], transform: np.ndarray | None) -> None:
+    """The boxes beside `target`, in the frame of its points: (4, 4) `transform` had brought these into the sensor's."""
+    placed = boxes if transform is None else [_back(box, np.linalg.inv(transform)) for box in boxes]
+    record: dict[str, Any] = {"points": len(points), "boxes": [box.record() for box in placed]}
+    write_whole(target.with_suffix(BOXES), json.dumps(record))
+
+
+def _back(box: Box, matrix: np.ndarray) -> Box:
+    """The box through a (4, 4) rigid transform or mirror that leaves what is upright so."""
+    x, y, z = transformed(np.array([box.centre]), matrix)[0].astype(float).tolist()
+    ahead = matrix[:3, :3] @ [np.cos(box.yaw), np.sin(box.yaw), 0]
+    yaw = float(np.arctan2(ahead[1], ahead[0]))
+    return replace(box, centre=(x, y, z), place=(x, y, z), yaw=yaw, heading=yaw)
