@@ -1,4 +1,4 @@
-"""The README's pictures of scans, each in its own sensor: `python front_page.py OUT SCAN SCAN [--without traffic]`."""
+"""The README's pictures of scans, each in its own sensor: `python front_page.py OUT SCAN SCAN [--without traffic | --insert car:2]`."""
 
 import argparse
 from pathlib import Path
@@ -17,6 +17,8 @@ def main() -> None:
     parser.add_argument("sources", nargs="+", type=Path, metavar="SCAN")
     parser.add_argument("--sensor", help="of all scans, a word or a .toml file")
     parser.add_argument("--without", metavar="CLASSES", help="draw the scans, and the same without these, instead")
+    parser.add_argument("--seed", type=int, default=0, help="of what is inserted")
+    parser.add_argument("--insert", metavar="THINGS", help="draw the scans, and the same with these, instead")
     args = parser.parse_args()
     model = ls.load("default")
     rows = []
@@ -27,6 +29,9 @@ def main() -> None:
         if args.without:
             empty = own.complete(scan, without=args.without)
             shown = {f"a real {own.sensor.name}": truth, f"without {args.without}": empty}
+        elif args.insert:
+            found = model.into(own.sensor).insert(scan, args.insert, seed=args.seed).scan
+            shown = {f"a real {own.sensor.name}": truth, f"with {args.insert}": own.image_of(found)}
         else:
             known = ls.corrupt(truth, "beams:4")
             sparse = truth.keep(known)

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.streets.actors import MARGIN
-from lidarsynth.streets.apart import footprints, meet
+from lidarsynth.streets.apart import CARRIER, footprints, meet
 from lidarsynth.streets.shapes import Mesh
 
 GROUND = ("road", "parking", "sidewalk", "other-ground", "terrain")
@@ -97,7 +97,7 @@ class Surroundings:
     def crowded(self, spot: Spot, mesh: Mesh) -> bool:
         """Whether a thing would stand in one that was put before, or in the sensor."""
         own = self.footprint(spot, mesh)
-        if np.hypot(spot.x, spot.y) < NEAR or meet(own, np.array([0.0, 0.0, 0.0, NEAR / 2, NEAR / 2])):
+        if np.hypot(spot.x, spot.y) < NEAR or meet(own, np.array([0.0, 0.0, 0.0, *CARRIER])):
             return True
         return bool(len(self.taken) and meet(own, np.stack(self.taken)).any())
 

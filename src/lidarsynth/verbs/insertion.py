@@ -19,6 +19,7 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
+from lidarsynth.streets.turn import told_of_tilt
 from lidarsynth.streets.wanted import Wanted
 from lidarsynth.verbs.completion import Filled
 
@@ -46,7 +47,8 @@ def told_of(filled: Filled, scan: Scan, things: Sequence[Wanted]) -> str:
     points = sum(box.points for box in boxes)
     gone = len(scan) + points - len(filled.points)
     text = f"inserted {_listed(found)}: {plural(points, 'point')}, in place of {gone} of {len(scan)}"
-    return text + (f"; no room was found for {_listed(asked - found)}" if asked - found else "")
+    room = f"no room was found for {_listed(asked - found)}" if asked - found else ""
+    return "; ".join(filter(None, (text, room, told_of_tilt(filled.image.sensor))))
 
 
 def _listed(kinds: Counter[str]) -> str:
