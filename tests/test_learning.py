@@ -138,6 +138,40 @@ def test_smeared_and_missing_beams_are_told():
     assert "in each of 32 rings, found fewer in 1, which are left out" in line
 
 
+def test_rings_that_count_from_1_or_leave_numbers_out_lack_nothing():
+    scan = turn(SENSORS["hdl-32e"])
+    for ring, last, none in ((scan.ring + 1, 32, 1), (2 * scan.ring, 62, 31)):
+        learned = learn_sensor([replace(scan, ring=ring)], "own")
+        (line,) = doubts(learned)
+        assert learned.sensor == learn_sensor([scan], "own").sensor
+        assert f"rings 0 to {last}, found none in {none}, which are left out: rightly, where rings count from 1" in line
+
+
+def test_columns_that_steps_do_not_tell_are_a_guess():
+    scan = turn(SENSORS["hdl-32e"])
+    rng = np.random.default_rng(0)
+    some = scan[np.sort(rng.permutation(len(scan))[: len(scan) // 2])]
+    noise = np.linalg.norm(scan.xyz, axis=1, keepdims=True) * np.radians(0.4) * np.float32([1, 1, 0])
+    noisy = replace(scan, xyz=(scan.xyz + rng.normal(size=(len(scan), 3)) * noise).astype(np.float32))
+    for other in (some, noisy):
+        assert any("whole columns apart, found other steps" in line for line in doubts(learn_sensor([other], "own")))
+    for whole in (scan, scan[scan.xyz[:, 0] > 0], turn(SENSORS["hdl-32e"], keep=1.0)[::2]):
+        assert not any("columns" in line for line in doubts(learn_sensor([whole], "own")))
+
+
+def test_few_rings_are_no_sensor_that_does_not_spin():
+    scan = turn(SENSORS["hdl-32e"])
+    for ring, count in ((scan.ring // 16, 2), (0 * scan.ring, 1)):
+        with pytest.raises(ValueError, match=f"expected 4 rings or more to learn from, found {count} in the ring fie"):
+            learn_sensor([replace(scan, ring=ring)], "own")
+
+
+def test_few_scans_do_not_tell_what_is_blocked():
+    scan = turn(SENSORS["vlp-16"])
+    assert "what is blocked is not known: 5 scans" in summary(learn_sensor([scan] * 4, "own"))
+    assert "nothing seen to be blocked" in summary(learn_sensor([scan] * 5, "own"))
+
+
 def test_beams_are_found_without_rings():
     scan = turn(SENSORS["hdl-32e"], rings=False)
     mixed = scan[np.random.default_rng(0).permutation(len(scan))]

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarsynth.lidar.blocked import blocked_runs
-from lidarsynth.lidar.columns import azimuth_step
+from lidarsynth.lidar.columns import step_and_whether
 from lidarsynth.lidar.cones import Ring, fit_ring
-from lidarsynth.lidar.frame import rings_of
 from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane
 from lidarsynth.lidar.motion import straighten
+from lidarsynth.lidar.origin import FEWEST_RINGS, rings_of
 from lidarsynth.lidar.recognition import EVERYWHERE, ONE_RING, layers, on_one_ring, recognise, rings_in_order
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
@@ -44,6 +44,8 @@ class LearnedSensor:
     turns     what is to be said of a scan of more than one turn, or None
     afloat    why mount and tilt are not learned but a sensor's default, in words, or None
     split     what is to be said of scans of several sensors, or of beams that many of them lack, or None
+    uneven    whether points of half of the scans or more are no whole columns apart: thinned at random, or noisy
+    unused    how many of the missing have no point at all, such as ring 0 where rings count from 1
     """
 
     sensor: Sensor
@@ -57,6 +59,8 @@ class LearnedSensor:
     turns: str | None = None
     afloat: str | None = None
     split: str | None = None
+    uneven: bool = False
+    unused: int = 0
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
@@ -81,18 +85,18 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         points, rings, row_of = _fitted(kept, guessed)
     steps, depths, grounds, above = [], [], [], 0
     for scan, ring in kept:
-        steps.append(azimuth_step(scan.xyz, ring))
+        steps.append(step_and_whether(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((depth.min(), depth.max()))
         grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
         above += is_above(scan.xyz)
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
-    merged = points - missing - len(rings)
+    merged, used = points - missing - len(rings), set().union(*(np.unique(ring).tolist() for _, ring in kept))
     _check_sharp(rings, merged, kept[0][0], guessed)
     if guessed:
         _check_guessed(rings, merged, missing)
     kept = [(scan, row_of[ring]) for scan, ring in kept]
-    width = max(round(2 * np.pi / float(np.median(steps))), 4)
+    width = max(round(2 * np.pi / float(np.median([step for step, _ in steps]))), 4)
     seen = _seen(kept, width, len(rings))
     order = np.argsort([-ring.elevation for ring in rings])
     rings, seen = [rings[i] for i in order], seen[:, order]
@@ -112,7 +116,8 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     )
     turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
     told = seen.mean(axis=0), len(kept), tuple(left), missing, thin, merged
-    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split)
+    uneven = 2 * sum(not steady for _, steady in steps) >= len(steps)
+    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split, uneven, points - len(used))
 
 
 def _standing(
@@ -194,7 +199,11 @@ def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[s
         if without and all(on_one_ring(scan.xyz) for scan in without):
             raise ValueError(f"expected scans of several beams, found {ONE_RING}")
         known = "" if not without or (name := recognise(without[0])[0]) is None else f": {_named(name)}"
-        if without and without[0].ring is not None:
+        if without and (ring := without[0].ring) is not None:
+            if layers(without[0].xyz, ring) and (count := len(np.unique(ring))) < FEWEST_RINGS:
+                raise ValueError(f"expected {FEWEST_RINGS} rings or more to learn from, found {count} in the ring "
+                                 "field: leave out one that tells nothing; of a sensor of so few beams write elevations"
+                                 " and width into a .toml")  # fmt: skip
             raise ValueError(f"expected rings that are beams, found {EVERYWHERE}")
         raise ValueError(
             "expected scans with a ring field, one ring after the other, or beams that elevations show, "

@@ -236,7 +236,8 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found elevations and "
                          f"{', '.join(both)}")  # fmt: skip
     if values.keys() >= EVENLY:
-        values["elevations"] = evenly_spaced(*(values.pop(key) for key in ("beams", "top", "bottom")), source)
+        beams, top, bottom = (values.pop(key) for key in ("beams", "top", "bottom"))
+        values["elevations"] = evenly_spaced(beams, top, bottom, source)
     known = set(Sensor.__dataclass_fields__)
     if unknown := values.keys() - known:
         raise ValueError(f"{source}: expected the fields {sorted(known | {'view'})} or beams/top/bottom, found "
@@ -244,9 +245,9 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     if "elevations" not in values:
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
     check_plain(values, source)
-    beams = {key: numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
-    order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
-    for key, told in beams.items():  # each number goes with its beam
+    lists = {key: numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
+    order = sorted(range(len(lists["elevations"])), key=lambda i: -lists["elevations"][i])
+    for key, told in lists.items():  # each number goes with its beam
         values[key] = tuple(told[i] for i in order) if len(told) == len(order) else tuple(told)
     values["tilt"] = tuple(numbers(values.get("tilt", (0.0, 0.0)), source))
     values["blocked"] = listed_runs(values.get("blocked", ()), source)
