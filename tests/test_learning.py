@@ -110,6 +110,14 @@ def test_a_sensor_below_the_ground_has_no_mount():
     assert why.startswith("expected the sensor above the ground, found it 0.12 m below")
 
 
+def test_beams_that_meet_the_ground_far_off_do_not_tell_how_far_below_it_is():
+    narrow = Sensor("narrow", tuple(np.linspace(3.0, -3.0, 24).tolist()), 900, 0.5, 200.0, mount=1.8)
+    streets = SyntheticStreets(seed=3, length=200, sensor=narrow)
+    learned = learn_sensor([streets[16 * i] for i in range(3)], "own")
+    assert (learned.sensor.mount, learned.sensor.tilt) == (1.73, (0.0, 0.0))
+    assert "of what the lowest beams met below what looks like it" in str(learned.afloat)
+
+
 def test_what_lies_as_near_as_no_sensor_is_mounted_is_no_ground():
     few = replace(SENSORS["vlp-16"], name="few", elevations=(0.8, 0.0, -0.8, -1.6))
     for scan in seen(few, 1):

@@ -10,7 +10,7 @@ import numpy as np
 from lidarsynth.lidar.blocked import blocked_runs
 from lidarsynth.lidar.columns import step_and_whether
 from lidarsynth.lidar.cones import Ring, fit_ring
-from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane
+from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane, share_below
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.origin import FEWEST_RINGS, rings_of
 from lidarsynth.lidar.recognition import EVERYWHERE, ONE_RING, layers, on_one_ring, recognise, rings_in_order
@@ -27,6 +27,7 @@ HALVED = 0.5  # of the residual: heights that explain less are bent rings of a m
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
 OTHER = 0.5  # degrees: rings of two scans of one sensor are closer, as `recognition.UNIT`
 SPLIT = 0.2  # of the scans: so many that have other rings than the others are no chance
+UNDER = 0.015  # of what the lowest beams met, below the ground: then its height is another
 ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
 
 
@@ -83,12 +84,14 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         left.append(f"{others} of other beams")
         kept = [pair for pair, is_on in zip(kept, on, strict=True) if is_on]
         points, rings, row_of = _fitted(kept, guessed)
-    steps, depths, grounds, above = [], [], [], 0
+    steps, depths, grounds, below, above = [], [], [], [], 0
     for scan, ring in kept:
         steps.append(step_and_whether(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((depth.min(), depth.max()))
-        grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
+        if (found := lowest_plane(scan.xyz)) is not None:
+            grounds.append(found)
+            below.append(share_below(scan.xyz, *found))
         above += is_above(scan.xyz)
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
     merged, used = points - missing - len(rings), set().union(*(np.unique(ring).tolist() for _, ring in kept))
@@ -101,7 +104,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     order = np.argsort([-ring.elevation for ring in rings])
     rings, seen = [rings[i] for i in order], seen[:, order]
     heights = tuple(round(ring.height, 3) for ring in rings)
-    mount, tilt, afloat = _standing(grounds, above, len(kept))
+    mount, tilt, afloat = _standing(grounds, above, len(kept), float(np.median(below or [0.0])))
     elevations = _falling([round(ring.elevation, 3) for ring in rings])
     sensor = Sensor(
         name=name,
@@ -121,10 +124,10 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
 
 
 def _standing(
-    grounds: list[tuple[float, float, float]], above: int, scans: int
+    grounds: list[tuple[float, float, float]], above: int, scans: int, below: float = 0.0
 ) -> tuple[float, tuple[float, float], str | None]:
     """Mount and tilt from (height, pitch, roll) of those scans that show the ground, or a sensor's default and why.
-    `above`: how many show it only when they are turned over."""
+    `above`: how many show it only when they are turned over; `below`: the usual `share_below` of the others."""
     if 2 * above >= scans:
         why = f"expected z up, found the ground above in {above} of {scans} scans, as of a sensor that hangs upside " \
               "down (--transform 0:0:0:180:0:0 turns them)"  # fmt: skip
@@ -144,6 +147,10 @@ def _standing(
         return Sensor.mount, Sensor.tilt, why
     if height < 0:
         why = f"expected the sensor above the ground, found it {-height:.2f} m below, as of points in another frame"
+        return Sensor.mount, Sensor.tilt, why
+    if below > UNDER:
+        why = f"expected nothing below the ground, found {below:.0%} of what the lowest beams met below what looks " \
+              "like it, as of beams that meet it too far off"  # fmt: skip
         return Sensor.mount, Sensor.tilt, why
     return round(height, 2), (round(pitch, 2), round(roll, 2)), None
 
