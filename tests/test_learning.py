@@ -192,6 +192,17 @@ def test_beams_are_found_without_rings():
         learn_sensor([Scan(cloud)], "own")
 
 
+def test_beams_that_see_nothing_far_are_missed_without_rings():
+    low = Sensor("low", tuple(np.linspace(15.0, -25.0, 32).tolist()), 600, 0.1, 40.0, mount=0.4)
+    scan = SyntheticStreets(seed=5, length=200, sensor=low)[0]
+    told = doubts(learn_sensor([scan], "own"))
+    assert not any("beyond 3 m: give scans with rings" in line for line in told)
+    mixed = replace(scan, ring=None)[np.random.default_rng(0).permutation(len(scan))]
+    learned = learn_sensor([mixed], "own")
+    assert learned.sensor.height < 32
+    assert any("above or below all" in line and "see nothing beyond 3 m" in line for line in doubts(learned))
+
+
 def looks(scans: int, moves: bool = True) -> np.ndarray:
     """(scans, 4, 1000) of scattered returns: row 0 sees only sky, rows 1 and 2 have a carrier; one that does not move
     loses nearly the same rays each time."""

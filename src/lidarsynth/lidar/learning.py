@@ -13,7 +13,15 @@ from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane, share_below
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.origin import FEWEST_RINGS, rings_of
-from lidarsynth.lidar.recognition import EVERYWHERE, ONE_RING, layers, on_one_ring, recognise, rings_in_order
+from lidarsynth.lidar.recognition import (
+    EVERYWHERE,
+    ONE_RING,
+    elevations_of,
+    layers,
+    on_one_ring,
+    recognise,
+    rings_in_order,
+)
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
@@ -27,6 +35,7 @@ HALVED = 0.5  # of the residual: heights that explain less are bent rings of a m
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
 OTHER = 0.5  # degrees: rings of two scans of one sensor are closer, as `recognition.UNIT`
 SPLIT = 0.2  # of the scans: so many that have other rings than the others are no chance
+ASTRAY = 1.5  # of the step to the next beam
 UNDER = 0.015  # of what the lowest beams met, below the ground: then its height is another
 ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
 
@@ -46,6 +55,7 @@ class LearnedSensor:
     afloat    why mount and tilt are not learned but a sensor's default, in words, or None
     split     what is to be said of scans of several sensors, or of beams that many of them lack, or None
     uneven    whether points of half of the scans or more are no whole columns apart: thinned at random, or noisy
+    beyond    share of points above or below all beams, where nothing but elevations tells these
     unused    how many of the missing have no point at all, such as ring 0 where rings count from 1
     """
 
@@ -62,6 +72,7 @@ class LearnedSensor:
     split: str | None = None
     uneven: bool = False
     unused: int = 0
+    beyond: float = 0.0
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
@@ -120,7 +131,8 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
     told = seen.mean(axis=0), len(kept), tuple(left), missing, thin, merged
     uneven = 2 * sum(not steady for _, steady in steps) >= len(steps)
-    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split, uneven, points - len(used))
+    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split, uneven, points - len(used),
+                         _beyond([scan for scan, _ in kept], sensor.elevations) if guessed else 0.0)  # fmt: skip
 
 
 def _standing(
@@ -158,6 +170,14 @@ def _standing(
 def _guessed(scan: Scan) -> bool:
     """Whether nothing but elevations tells the scan's rings."""
     return scan.ring is None and rings_in_order(scan.xyz) is None
+
+
+def _beyond(scans: list[Scan], elevations: tuple[float, ...]) -> float:
+    """The share of the points that lie ASTRAY steps or more beyond the first or last beam: beams of which nothing is
+    far enough to crowd."""
+    above, below = (abs(elevations[a] - elevations[b]) * ASTRAY for a, b in ((0, 1), (-1, -2)))
+    seen = np.concatenate([elevations_of(scan.xyz) for scan in scans])
+    return float(((seen > elevations[0] + above) | (seen < elevations[-1] - below)).mean())
 
 
 def _named(known: str) -> str:

@@ -15,6 +15,7 @@ from lidarsynth.lidar.blocked import SCANS
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.learning import FEWEST, NEAR, SMEARED, LearnedSensor, learn_sensor
 from lidarsynth.lidar.plural import plural
+from lidarsynth.lidar.recognition import FAR
 from lidarsynth.lidar.scan import Scan, with_points
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import write_whole
@@ -22,6 +23,7 @@ from lidarsynth.verbs.inputs import Input, Inputs
 
 T = TypeVar("T")
 LOOKED_AT = 3  # scans, for the frame they are in
+STRAY = 0.02  # of the points: so many beyond all beams are of others
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
@@ -143,6 +145,10 @@ def doubts(learned: LearnedSensor) -> list[str]:
             f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {few + known - learned.thin} rings, found "
             f"fewer in {few}, which are left out{kept}: give scans of wider places, or more of them"
         )
+    if learned.beyond > STRAY:
+        found.append(f"{name}: expected points on beams that elevations show, found {learned.beyond:.0%} above or "
+                     f"below all {known} of them, of beams that see nothing beyond {FAR:g} m: give scans with "
+                     "rings")  # fmt: skip
     if learned.split:
         found.append(f"{name}: {learned.split}")
     if learned.afloat:
