@@ -267,6 +267,13 @@ def test_the_file_is_read_back_as_the_sensor(tmp_path: Path):
     assert found.to_dict() == known.to_dict()
 
 
+@pytest.mark.parametrize("name", ["two\nlines", "\x1b[31mred", "del\x7f", 'q"\\', "\u00fc", "bad\udcff"])
+def test_a_file_of_any_name_is_read_back(name: str, tmp_path: Path):
+    known = replace(SENSORS["vlp-16"], name=name)
+    (tmp_path / "own.toml").write_text(sensor_toml(known, [f"{name}: 16 beams"]), encoding="utf-8")
+    assert read_sensor(tmp_path / "own.toml") == replace(known, name=name.replace("\udcff", "?"))
+
+
 def test_the_verb_writes_a_sensor_and_its_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for i in range(2):
         write(tmp_path / f"{i}.pcd", turn(SENSORS["vlp-16"]))

@@ -78,8 +78,10 @@ def write_toml(path: Path, text: str) -> None:
 
 
 def sensor_toml(sensor: Sensor, comments: Sequence[str] = ()) -> str:
-    """A sensor file as `read_sensor` reads it."""
-    lines = [f"# {comment}" for comment in comments] + [f"name = {json.dumps(sensor.name, ensure_ascii=False)}"]
+    """A sensor file as `read_sensor` reads it, whatever the name holds."""
+    said = ("".join(c if c.isprintable() else "?" for c in comment) for comment in comments)
+    name = json.dumps(sensor.name.encode("utf-8", "replace").decode(), ensure_ascii=False).replace("\x7f", "\\u007f")
+    lines = [*(f"# {comment}" for comment in said), f"name = {name}"]
     numbers = sensor.to_dict()
     for key in ("width", "min_range", "max_range", "mount"):
         lines.append(f"{key} = {numbers[key]}")
