@@ -167,6 +167,14 @@ def test_columns_that_steps_do_not_tell_are_a_guess():
         assert not any("columns" in line for line in doubts(learn_sensor([whole], "own")))
 
 
+def test_a_point_that_no_sensor_sees_makes_no_range_without_a_word():
+    scan = turn(SENSORS["hdl-32e"])
+    stray = replace(scan, xyz=np.concatenate([scan.xyz[:-1], scan.xyz[-1:] * 500]))
+    learned = learn_sensor([stray], "own")
+    (line,) = doubts(learned)
+    assert f"expected points within 1000 m, found some to {learned.sensor.max_range:g} m: stray ones" in line
+
+
 def test_few_rings_are_no_sensor_that_does_not_spin():
     scan = turn(SENSORS["hdl-32e"])
     for ring, count in ((scan.ring // 16, 2), (0 * scan.ring, 1)):

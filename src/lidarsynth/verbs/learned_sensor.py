@@ -23,6 +23,7 @@ from lidarsynth.verbs.inputs import Input, Inputs
 
 T = TypeVar("T")
 LOOKED_AT = 3  # scans, for the frame they are in
+FARTHEST = 1000.0  # metres: no spinning sensor has returns from beyond
 STRAY = 0.02  # of the points: so many beyond all beams are of others
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
@@ -156,6 +157,9 @@ def doubts(learned: LearnedSensor) -> list[str]:
     if learned.afloat:
         found.append(f"{name}: {learned.afloat}: mount and tilt are not learned, {learned.sensor.mount:g} m and level "
                      "are written: set them in the file")  # fmt: skip
+    if learned.sensor.max_range > FARTHEST:
+        found.append(f"{name}: expected points within {FARTHEST:g} m, found some to {learned.sensor.max_range:g} m: "
+                     "stray ones, or no metres: set max_range in the file, or give points in metres")  # fmt: skip
     if learned.uneven and not learned.turns:
         found.append(f"{name}: expected points whole columns apart, found other steps, as of points left out at random "
                      f"or of noise: {learned.sensor.width} columns are a guess: give whole scans, or set them in the "
