@@ -110,6 +110,14 @@ def test_a_sensor_below_the_ground_has_no_mount():
     assert why.startswith("expected the sensor above the ground, found it 0.12 m below")
 
 
+def test_beams_that_meet_the_ground_far_off_do_not_tell_how_far_below_it_is():
+    narrow = Sensor("narrow", tuple(np.linspace(3.0, -3.0, 24).tolist()), 900, 0.5, 200.0, mount=1.8)
+    streets = SyntheticStreets(seed=3, length=200, sensor=narrow)
+    learned = learn_sensor([streets[16 * i] for i in range(3)], "own")
+    assert (learned.sensor.mount, learned.sensor.tilt) == (1.73, (0.0, 0.0))
+    assert "of what the lowest beams met below what looks like it" in str(learned.afloat)
+
+
 def test_what_lies_as_near_as_no_sensor_is_mounted_is_no_ground():
     few = replace(SENSORS["vlp-16"], name="few", elevations=(0.8, 0.0, -0.8, -1.6))
     for scan in seen(few, 1):
@@ -138,6 +146,48 @@ def test_smeared_and_missing_beams_are_told():
     assert "in each of 32 rings, found fewer in 1, which are left out" in line
 
 
+def test_rings_that_count_from_1_or_leave_numbers_out_lack_nothing():
+    scan = turn(SENSORS["hdl-32e"])
+    for ring, last, none in ((scan.ring + 1, 32, 1), (2 * scan.ring, 62, 31)):
+        learned = learn_sensor([replace(scan, ring=ring)], "own")
+        (line,) = doubts(learned)
+        assert learned.sensor == learn_sensor([scan], "own").sensor
+        assert f"rings 0 to {last}, found none in {none}, which are left out: rightly, where rings count from 1" in line
+
+
+def test_columns_that_steps_do_not_tell_are_a_guess():
+    scan = turn(SENSORS["hdl-32e"])
+    rng = np.random.default_rng(0)
+    some = scan[np.sort(rng.permutation(len(scan))[: len(scan) // 2])]
+    noise = np.linalg.norm(scan.xyz, axis=1, keepdims=True) * np.radians(0.4) * np.float32([1, 1, 0])
+    noisy = replace(scan, xyz=(scan.xyz + rng.normal(size=(len(scan), 3)) * noise).astype(np.float32))
+    for other in (some, noisy):
+        assert any("whole columns apart, found other steps" in line for line in doubts(learn_sensor([other], "own")))
+    for whole in (scan, scan[scan.xyz[:, 0] > 0], turn(SENSORS["hdl-32e"], keep=1.0)[::2]):
+        assert not any("columns" in line for line in doubts(learn_sensor([whole], "own")))
+
+
+def test_a_point_that_no_sensor_sees_makes_no_range_without_a_word():
+    scan = turn(SENSORS["hdl-32e"])
+    stray = replace(scan, xyz=np.concatenate([scan.xyz[:-1], scan.xyz[-1:] * 500]))
+    learned = learn_sensor([stray], "own")
+    (line,) = doubts(learned)
+    assert f"expected points within 1000 m, found some to {learned.sensor.max_range:g} m: stray ones" in line
+
+
+def test_few_rings_are_no_sensor_that_does_not_spin():
+    scan = turn(SENSORS["hdl-32e"])
+    for ring, count in ((scan.ring // 16, 2), (0 * scan.ring, 1)):
+        with pytest.raises(ValueError, match=f"expected 4 rings or more to learn from, found {count} in the ring fie"):
+            learn_sensor([replace(scan, ring=ring)], "own")
+
+
+def test_few_scans_do_not_tell_what_is_blocked():
+    scan = turn(SENSORS["vlp-16"])
+    assert "what is blocked is not known: 5 scans" in summary(learn_sensor([scan] * 4, "own"))
+    assert "nothing seen to be blocked" in summary(learn_sensor([scan] * 5, "own"))
+
+
 def test_beams_are_found_without_rings():
     scan = turn(SENSORS["hdl-32e"], rings=False)
     mixed = scan[np.random.default_rng(0).permutation(len(scan))]
@@ -148,6 +198,17 @@ def test_beams_are_found_without_rings():
     cloud = np.random.default_rng(0).normal(0, 10, (5000, 3)).astype(np.float32)
     with pytest.raises(ValueError, match="none in 1"):
         learn_sensor([Scan(cloud)], "own")
+
+
+def test_beams_that_see_nothing_far_are_missed_without_rings():
+    low = Sensor("low", tuple(np.linspace(15.0, -25.0, 32).tolist()), 600, 0.1, 40.0, mount=0.4)
+    scan = SyntheticStreets(seed=5, length=200, sensor=low)[0]
+    told = doubts(learn_sensor([scan], "own"))
+    assert not any("beyond 3 m: give scans with rings" in line for line in told)
+    mixed = replace(scan, ring=None)[np.random.default_rng(0).permutation(len(scan))]
+    learned = learn_sensor([mixed], "own")
+    assert learned.sensor.height < 32
+    assert any("above or below all" in line and "see nothing beyond 3 m" in line for line in doubts(learned))
 
 
 def looks(scans: int, moves: bool = True) -> np.ndarray:
@@ -212,6 +273,13 @@ def test_the_file_is_read_back_as_the_sensor(tmp_path: Path):
     (tmp_path / "own.toml").write_text(sensor_toml(known, ["two", "comments"]))
     found = read_sensor(tmp_path / "own.toml")
     assert found.to_dict() == known.to_dict()
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "\x1b[31mred", "del\x7f", 'q"\\', "\u00fc", "bad\udcff"])
+def test_a_file_of_any_name_is_read_back(name: str, tmp_path: Path):
+    known = replace(SENSORS["vlp-16"], name=name)
+    (tmp_path / "own.toml").write_text(sensor_toml(known, [f"{name}: 16 beams"]), encoding="utf-8")
+    assert read_sensor(tmp_path / "own.toml") == replace(known, name=name.replace("\udcff", "?"))
 
 
 def test_the_verb_writes_a_sensor_and_its_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

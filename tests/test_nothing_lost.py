@@ -335,6 +335,8 @@ def test_refusals_are_one_short_line_without_escape_codes(capsys):
         terminal._refuse("x" * 300_000 + "\x1b[2J\nend")
     line = capsys.readouterr().err
     assert len(line) < 1300 and line.count("\n") == 1 and "\x1b" not in line and line.endswith("?[2J end\n")
+    terminal.warn("esc/e\x1b[31mred\nx.bin: two  spaces stay")
+    assert capsys.readouterr().err == "lidarsynth: esc/e?[31mred x.bin: two  spaces stay\n"
     terminal.say("a\x1b[31mb")
     assert capsys.readouterr().out == "a?[31mb\n"
 

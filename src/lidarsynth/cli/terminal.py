@@ -35,8 +35,12 @@ def say(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """A line on stderr about work that goes on."""
-    print(f"lidarsynth: {text}", file=sys.stderr, flush=True)
+    """A line on stderr about work that goes on; one line, without escape codes, whatever a file's own names hold."""
+    print(f"lidarsynth: {_printable(text)}", file=sys.stderr, flush=True)
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.splitlines()))
 
 
 def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
@@ -211,7 +215,7 @@ def _warned() -> Iterator[None]:
             return former(message, category, file, number, text)
         first = str(message) not in said  # Python itself says it once for each place in the program
         said.add(str(message))
-        return f"lidarsynth: {message}\n" if first else ""
+        return f"lidarsynth: {_printable(str(message))}\n" if first else ""
 
     warnings.formatwarning = line
     try:
@@ -262,7 +266,7 @@ def _of_system(error: OSError) -> str:
 
 def _refuse(reason: str) -> NoReturn:
     """One line of at most MOST characters, on a line of its own, whatever a file's own names hold."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(reason.split()))
+    line = _printable(" ".join(reason.split()))
     line = line if len(line) <= MOST else f"{line[: MOST // 2]} ... {line[-MOST // 3 :]}"
     start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over a progress bar that stood there
     _tell_last(line or "stopped for no known reason", start)

@@ -29,8 +29,15 @@ def azimuth_step(xyz: np.ndarray, ring: np.ndarray) -> float:
 
     xyz (N, 3), ring (N,) int from 0
     """
+    return step_and_whether(xyz, ring)[0]
+
+
+def step_and_whether(xyz: np.ndarray, ring: np.ndarray) -> tuple[float, bool]:
+    """`azimuth_step`, and whether steps are of whole columns: not those of points at random, or of noise."""
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    return _step_of(_steps(azimuth, ring), azimuth, ring)
+    step = _steps(azimuth, ring)
+    found = _step_of(step, azimuth, ring)
+    return found, _steady(step, found)
 
 
 def columns_by_steps(xyz: np.ndarray, ring: np.ndarray) -> int | None:
@@ -45,6 +52,12 @@ def _steps(azimuth: np.ndarray, ring: np.ndarray) -> np.ndarray:
     turn = np.sort(azimuth.astype(np.float64) + 10.0 * ring)  # a turn is less than 10
     step = np.diff(turn)
     return step[(step > FINEST) & (step < 3)]
+
+
+def _steady(step: np.ndarray, found: float) -> bool:
+    times = step / found
+    near = times[times < MULTIPLES + 0.5]
+    return bool((np.abs(near - np.maximum(near.round(), 1)) < OFF).mean() >= STEADY)
 
 
 def _step_of(step: np.ndarray, azimuth: np.ndarray, ring: np.ndarray) -> float:
@@ -73,9 +86,7 @@ def columns_of_turn(scan: Scan, sensor: Sensor) -> int | None:
     if len(step) < ENOUGH:
         return None
     found = _step_of(step, azimuth, ring)
-    times = step / found
-    near = times[times < MULTIPLES + 0.5]
-    if (np.abs(near - np.maximum(near.round(), 1)) < OFF).mean() < STEADY:
+    if not _steady(step, found):
         return None
     usual = full_turn(sensor)
     share = 2 * np.pi / found / usual

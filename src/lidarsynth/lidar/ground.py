@@ -32,6 +32,9 @@ SOME, DEEP, LEVEL, CLEARLY, LOST = 10_000, 3, 0.6, 1.15, 0.5
 FLIP = np.array([1, -1, -1], np.float32)  # half a turn about x
 # Times more level ground above than below, and of how many of the cells around: of Argoverse 2's second sensor, which
 # hangs upside down and meets the road from 6 m on, it is 0.59.
+# Of `share_below`: metres of points that count, of the lowest ray those that do, of points those below that ray, and
+# degrees below the horizon beyond which beams meet the ground near enough to tell it.
+BEYOND, LOW, STRAY, FLAT = 1.0, 0.75, 0.002, 8.0
 UPSIDE, GROUND = 1.5, 0.45
 LEANING = 3.5  # degrees of a tilt that is no slope of the road
 
@@ -141,6 +144,21 @@ def stance(xyz: np.ndarray, told: tuple[float, float, float] | None = None) -> t
         return None
     found, low, on = seen
     return None if told is not None and on.sum() < CLEARLY * _on(low, *told).sum() else found
+
+
+def share_below(xyz: np.ndarray, height: float, pitch: float, roll: float) -> float:
+    """0 to 1: how many of what the lowest beams met lies below the ground that `lowest_plane` tells, as where they meet
+    the true one farther off than it looks; 0 where the lowest look down by more than FLAT. Of 36 real scans, whatever
+    their beams, 0.007 at most; of 18 streets of beams that end 2 to 5 degrees below the horizon, 1.5 m and more above
+    the road, 0.027 and more."""
+    rho, above = np.hypot(xyz[:, 0], xyz[:, 1]), _above(xyz, height, pitch, roll)
+    down = np.arctan2(above - height, rho)
+    far = rho > BEYOND
+    lowest = float(np.quantile(down[far], STRAY)) if far.any() else 0.0
+    low = far & (down < LOW * lowest)
+    if not -np.radians(FLAT) < lowest < 0 or not low.any():
+        return 0.0
+    return float((above[low] < -(2 * OFF + 2 * FARTHER[0] * rho[low])).mean())
 
 
 def is_above(xyz: np.ndarray) -> bool:

@@ -8,12 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarsynth.lidar.blocked import blocked_runs
-from lidarsynth.lidar.columns import azimuth_step
+from lidarsynth.lidar.columns import step_and_whether
 from lidarsynth.lidar.cones import Ring, fit_ring
-from lidarsynth.lidar.frame import rings_of
-from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane
+from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane, share_below
 from lidarsynth.lidar.motion import straighten
-from lidarsynth.lidar.recognition import EVERYWHERE, ONE_RING, layers, on_one_ring, recognise, rings_in_order
+from lidarsynth.lidar.origin import FEWEST_RINGS, rings_of
+from lidarsynth.lidar.recognition import (
+    EVERYWHERE,
+    ONE_RING,
+    elevations_of,
+    layers,
+    on_one_ring,
+    recognise,
+    rings_in_order,
+)
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
@@ -27,6 +35,8 @@ HALVED = 0.5  # of the residual: heights that explain less are bent rings of a m
 CERTAIN = 0.01  # metres: a ring's height is believed where its error is smaller
 OTHER = 0.5  # degrees: rings of two scans of one sensor are closer, as `recognition.UNIT`
 SPLIT = 0.2  # of the scans: so many that have other rings than the others are no chance
+ASTRAY = 1.5  # of the step to the next beam
+UNDER = 0.015  # of what the lowest beams met, below the ground: then its height is another
 ALIKE = 0.2  # metres: half of the scans must see the ground as near to the usual height, for that to be the mount
 
 
@@ -44,6 +54,9 @@ class LearnedSensor:
     turns     what is to be said of a scan of more than one turn, or None
     afloat    why mount and tilt are not learned but a sensor's default, in words, or None
     split     what is to be said of scans of several sensors, or of beams that many of them lack, or None
+    uneven    whether points of half of the scans or more are no whole columns apart: thinned at random, or noisy
+    beyond    share of points above or below all beams, where nothing but elevations tells these
+    unused    how many of the missing have no point at all, such as ring 0 where rings count from 1
     """
 
     sensor: Sensor
@@ -57,6 +70,9 @@ class LearnedSensor:
     turns: str | None = None
     afloat: str | None = None
     split: str | None = None
+    uneven: bool = False
+    unused: int = 0
+    beyond: float = 0.0
 
 
 def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
@@ -79,25 +95,27 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         left.append(f"{others} of other beams")
         kept = [pair for pair, is_on in zip(kept, on, strict=True) if is_on]
         points, rings, row_of = _fitted(kept, guessed)
-    steps, depths, grounds, above = [], [], [], 0
+    steps, depths, grounds, below, above = [], [], [], [], 0
     for scan, ring in kept:
-        steps.append(azimuth_step(scan.xyz, ring))
+        steps.append(step_and_whether(scan.xyz, ring))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((depth.min(), depth.max()))
-        grounds += [found] if (found := lowest_plane(scan.xyz)) is not None else []
+        if (found := lowest_plane(scan.xyz)) is not None:
+            grounds.append(found)
+            below.append(share_below(scan.xyz, *found))
         above += is_above(scan.xyz)
     thin, missing = sum(ring.points < FEWEST for ring in rings), int((row_of < 0).sum())
-    merged = points - missing - len(rings)
+    merged, used = points - missing - len(rings), set().union(*(np.unique(ring).tolist() for _, ring in kept))
     _check_sharp(rings, merged, kept[0][0], guessed)
     if guessed:
         _check_guessed(rings, merged, missing)
     kept = [(scan, row_of[ring]) for scan, ring in kept]
-    width = max(round(2 * np.pi / float(np.median(steps))), 4)
+    width = max(round(2 * np.pi / float(np.median([step for step, _ in steps]))), 4)
     seen = _seen(kept, width, len(rings))
     order = np.argsort([-ring.elevation for ring in rings])
     rings, seen = [rings[i] for i in order], seen[:, order]
     heights = tuple(round(ring.height, 3) for ring in rings)
-    mount, tilt, afloat = _standing(grounds, above, len(kept))
+    mount, tilt, afloat = _standing(grounds, above, len(kept), float(np.median(below or [0.0])))
     elevations = _falling([round(ring.elevation, 3) for ring in rings])
     sensor = Sensor(
         name=name,
@@ -112,14 +130,16 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     )
     turns = next((text for scan, _ in kept if (text := several_turns(scan)) is not None), None)
     told = seen.mean(axis=0), len(kept), tuple(left), missing, thin, merged
-    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split)
+    uneven = 2 * sum(not steady for _, steady in steps) >= len(steps)
+    return LearnedSensor(sensor, tuple(rings), *told, turns, afloat, split, uneven, points - len(used),
+                         _beyond([scan for scan, _ in kept], sensor.elevations) if guessed else 0.0)  # fmt: skip
 
 
 def _standing(
-    grounds: list[tuple[float, float, float]], above: int, scans: int
+    grounds: list[tuple[float, float, float]], above: int, scans: int, below: float = 0.0
 ) -> tuple[float, tuple[float, float], str | None]:
     """Mount and tilt from (height, pitch, roll) of those scans that show the ground, or a sensor's default and why.
-    `above`: how many show it only when they are turned over."""
+    `above`: how many show it only when they are turned over; `below`: the usual `share_below` of the others."""
     if 2 * above >= scans:
         why = f"expected z up, found the ground above in {above} of {scans} scans, as of a sensor that hangs upside " \
               "down (--transform 0:0:0:180:0:0 turns them)"  # fmt: skip
@@ -140,12 +160,24 @@ def _standing(
     if height < 0:
         why = f"expected the sensor above the ground, found it {-height:.2f} m below, as of points in another frame"
         return Sensor.mount, Sensor.tilt, why
+    if below > UNDER:
+        why = f"expected nothing below the ground, found {below:.0%} of what the lowest beams met below what looks " \
+              "like it, as of beams that meet it too far off"  # fmt: skip
+        return Sensor.mount, Sensor.tilt, why
     return round(height, 2), (round(pitch, 2), round(roll, 2)), None
 
 
 def _guessed(scan: Scan) -> bool:
     """Whether nothing but elevations tells the scan's rings."""
     return scan.ring is None and rings_in_order(scan.xyz) is None
+
+
+def _beyond(scans: list[Scan], elevations: tuple[float, ...]) -> float:
+    """The share of the points that lie ASTRAY steps or more beyond the first or last beam: beams of which nothing is
+    far enough to crowd."""
+    above, below = (abs(elevations[a] - elevations[b]) * ASTRAY for a, b in ((0, 1), (-1, -2)))
+    seen = np.concatenate([elevations_of(scan.xyz) for scan in scans])
+    return float(((seen > elevations[0] + above) | (seen < elevations[-1] - below)).mean())
 
 
 def _named(known: str) -> str:
@@ -194,7 +226,11 @@ def _alike(scans: Iterable[Scan]) -> tuple[list[tuple[Scan, np.ndarray]], list[s
         if without and all(on_one_ring(scan.xyz) for scan in without):
             raise ValueError(f"expected scans of several beams, found {ONE_RING}")
         known = "" if not without or (name := recognise(without[0])[0]) is None else f": {_named(name)}"
-        if without and without[0].ring is not None:
+        if without and (ring := without[0].ring) is not None:
+            if layers(without[0].xyz, ring) and (count := len(np.unique(ring))) < FEWEST_RINGS:
+                raise ValueError(f"expected {FEWEST_RINGS} rings or more to learn from, found {count} in the ring "
+                                 "field: leave out one that tells nothing; of a sensor of so few beams write elevations"
+                                 " and width into a .toml")  # fmt: skip
             raise ValueError(f"expected rings that are beams, found {EVERYWHERE}")
         raise ValueError(
             "expected scans with a ring field, one ring after the other, or beams that elevations show, "

@@ -29,6 +29,7 @@ SURE = 6.0  # standard errors
 ROUNDS = 3
 BESIDE = (0.0, -1.0, 1.0)  # metres: seen from near its sensor, each ring of a shifted scan is one turn
 POINTS = 4_000  # of a scan are enough to tell a motion
+FEWEST_RINGS = 4  # fewer tell no cones
 BETTER = 0.8  # of the residual; less gain is no motion
 
 
@@ -86,7 +87,7 @@ def _in_order(xyz: np.ndarray, beside: Sequence[float]) -> np.ndarray | None:
 
 
 def _several(ring: np.ndarray | None) -> np.ndarray | None:
-    return None if ring is None or np.count_nonzero(np.bincount(ring)) < 4 else ring
+    return None if ring is None or np.count_nonzero(np.bincount(ring)) < FEWEST_RINGS else ring
 
 
 def _cones(xyz: np.ndarray, ring: np.ndarray) -> Cones | None:

@@ -25,7 +25,8 @@ def runs_outside(view: Any, rows: int, width: int, source: str) -> Runs:
 
     Raises ValueError, which begins with the source, for what is no such view, and for one between two columns.
     """
-    numbers = isinstance(view, list | tuple) and all(isinstance(angle, int | float) for angle in view)
+    numbers = isinstance(view, list | tuple) and all(type(angle) is not bool for angle in view)
+    numbers = numbers and all(isinstance(angle, int | float) for angle in view)
     if not numbers or len(view) != 2 or not 0 < view[1] - view[0] <= 360 or not np.isfinite(view).all():
         raise ValueError(f"{source}: expected a view of two azimuths in degrees to the left, such as [-60, 60], found "
                          f"{view!r:.60}")  # fmt: skip

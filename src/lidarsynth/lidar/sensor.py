@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import warnings
 from collections import ChainMap
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
 from operator import index
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lidarsynth.lidar.angles import unit_vectors
+from lidarsynth.lidar.plain_fields import METRES, check_plain, evenly_spaced, numbers
 from lidarsynth.lidar.sector import listed_runs, runs_outside
 from lidarsynth.lidar.small_file import read_json, read_toml
 
 MOST = 4096  # beams that an image may have
 CROWDED, TURNED = 0.06, np.pi / 2  # degrees from beam to beam, and at most, of numbers that look like radians
-METRES = ("min_range", "max_range", "mount")  # fields that are one number each
 
 
 class UnlikelySensorWarning(UserWarning):
@@ -238,44 +236,27 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found elevations and "
                          f"{', '.join(both)}")  # fmt: skip
     if values.keys() >= EVENLY:
-        if not (isinstance(values["beams"], int) and 1 <= values["beams"] <= 1024):
-            raise ValueError(f"{source}: expected beams of 1 to 1024, found {values['beams']!r}")
-        top, bottom = _numbers([values.pop("top"), values.pop("bottom")], source)
-        if not np.isfinite([top, bottom]).all():
-            raise ValueError(f"{source}: expected finite top and bottom, found {top} and {bottom}")
-        spaced = np.linspace(top, bottom, values.pop("beams"))
-        values["elevations"] = spaced.tolist()
+        beams, top, bottom = (values.pop(key) for key in ("beams", "top", "bottom"))
+        values["elevations"] = evenly_spaced(beams, top, bottom, source)
     known = set(Sensor.__dataclass_fields__)
     if unknown := values.keys() - known:
-        raise ValueError(f"{source}: expected the fields {sorted(known)} or beams/top/bottom, found {sorted(unknown)}")
+        raise ValueError(f"{source}: expected the fields {sorted(known | {'view'})} or beams/top/bottom, found "
+                         f"{sorted(unknown)}")  # fmt: skip
     if "elevations" not in values:
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
-    if not isinstance(values.get("width", 4), int):
-        raise ValueError(f"{source}: expected a whole number of columns as width, found {values['width']!r:.60}")
-    for key in METRES:
-        if not isinstance(value := values.get(key, 1), Real):
-            raise ValueError(f"{source}: expected numbers in the sensor's fields, found {value!r:.60} as {key}")
-        if value == np.inf or (key == "mount" and value < 0):
-            raise ValueError(f"{source}: expected finite metres, of a mount 0 or more, found {value} as {key}")
-    beams = {key: _numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
-    order = sorted(range(len(beams["elevations"])), key=lambda i: -beams["elevations"][i])
-    for key, numbers in beams.items():  # each number goes with its beam
-        values[key] = tuple(numbers[i] for i in order) if len(numbers) == len(order) else tuple(numbers)
-    values["tilt"] = tuple(_numbers(values.get("tilt", (0.0, 0.0)), source))
+    check_plain(values, source)
+    lists = {key: numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
+    order = sorted(range(len(lists["elevations"])), key=lambda i: -lists["elevations"][i])
+    for key, told in lists.items():  # each number goes with its beam
+        values[key] = tuple(told[i] for i in order) if len(told) == len(order) else tuple(told)
+    values["tilt"] = tuple(numbers(values.get("tilt", (0.0, 0.0)), source))
     values["blocked"] = listed_runs(values.get("blocked", ()), source)
-    if view is not None:
+    if view is not None and values.get("width", Sensor.width) > 0:  # else it is refused as no width
         values["blocked"] += runs_outside(view, len(order), values.get("width", Sensor.width), source)
     try:
         return Sensor(**{"name": name or source, **values})
     except TypeError as error:
         raise ValueError(f"{source}: expected numbers in the sensor's fields, found {error}") from None
-
-
-def _numbers(values: Any, source: str) -> Sequence[float]:
-    try:
-        return [float(value) for value in values]
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values!r:.60}") from None
 
 
 OUSTER = {"beam_intrinsics", "beam_altitude_angles"}  # what its metadata have, of any age

@@ -11,9 +11,11 @@ from typing import TypeVar
 import numpy as np
 
 from lidarsynth.data.ouster import is_metadata, read_metadata, sensor_of
+from lidarsynth.lidar.blocked import SCANS
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.learning import FEWEST, NEAR, SMEARED, LearnedSensor, learn_sensor
 from lidarsynth.lidar.plural import plural
+from lidarsynth.lidar.recognition import FAR
 from lidarsynth.lidar.scan import Scan, with_points
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.whole_file import write_whole
@@ -21,6 +23,8 @@ from lidarsynth.verbs.inputs import Input, Inputs
 
 T = TypeVar("T")
 LOOKED_AT = 3  # scans, for the frame they are in
+FARTHEST = 1000.0  # metres: no spinning sensor has returns from beyond
+STRAY = 0.02  # of the points: so many beyond all beams are of others
 ENOUGH = 100  # scans: more change nothing that a thousandth of a degree shows
 
 
@@ -75,8 +79,10 @@ def write_toml(path: Path, text: str) -> None:
 
 
 def sensor_toml(sensor: Sensor, comments: Sequence[str] = ()) -> str:
-    """A sensor file as `read_sensor` reads it."""
-    lines = [f"# {comment}" for comment in comments] + [f"name = {json.dumps(sensor.name, ensure_ascii=False)}"]
+    """A sensor file as `read_sensor` reads it, whatever the name holds."""
+    said = ("".join(c if c.isprintable() else "?" for c in comment) for comment in comments)
+    name = json.dumps(sensor.name.encode("utf-8", "replace").decode(), ensure_ascii=False).replace("\x7f", "\\u007f")
+    lines = [*(f"# {comment}" for comment in said), f"name = {name}"]
     numbers = sensor.to_dict()
     for key in ("width", "min_range", "max_range", "mount"):
         lines.append(f"{key} = {numbers[key]}")
@@ -109,15 +115,18 @@ def summary(learned: LearnedSensor) -> str:
         else f"  {sensor.mount:g} m above the ground, nose {nose:+.1f} and left side {left:+.1f} degrees up",
         f"  blocked by its carrier, or out of its view: {share:.1%} of the rays"
         if sensor.blocked
-        else "  nothing seen to be blocked",
+        else "  nothing seen to be blocked"
+        if learned.scans >= SCANS
+        else f"  what is blocked is not known: {SCANS} scans of several places or more tell it",
         f"  from {plural(learned.scans, 'scan')}" + (f"; left out: {', '.join(learned.left)}" if learned.left else ""),
     ]
     return "\n".join(lines)
 
 
 def doubts(learned: LearnedSensor) -> list[str]:
-    """Why beams or mount are not to be trusted, a line each: points more than SMEARED degrees off some, rings of few
-    points, scans of several sensors, beams of several rings, scans of several turns, no ground."""
+    """Why beams, columns or mount are not to be trusted, a line each: points more than SMEARED degrees off some, rings
+    of few points or none, scans of several sensors, no ground, uneven steps, scans of several turns, beams of several
+    rings."""
     name, known = learned.sensor.name, len(learned.rings)
     smeared = sum(ring.residual > SMEARED for ring in learned.rings)
     found = []
@@ -126,17 +135,35 @@ def doubts(learned: LearnedSensor) -> list[str]:
             f"{name}: expected points within {SMEARED} degrees of their beams, found {smeared} of {known} beams wider: "
             "its elevations may be off; give scans with rings, as the sensor sent them, or name the sensor"
         )
-    if few := learned.missing + learned.thin:
+    if learned.unused:
+        last = known + learned.missing + learned.merged - 1
+        found.append(
+            f"{name}: expected points in each of the rings 0 to {last}, found none in {learned.unused}, which are left "
+            "out: rightly, where rings count from 1 or leave numbers out; else give scans in which their beams meet "
+            "something"
+        )
+    if few := learned.missing - learned.unused + learned.thin:
         kept = f" of the fit, {learned.thin} with their few points as rows" if learned.thin else ""
         found.append(
             f"{name}: expected {FEWEST} points beyond {NEAR:g} m in each of {few + known - learned.thin} rings, found "
             f"fewer in {few}, which are left out{kept}: give scans of wider places, or more of them"
         )
+    if learned.beyond > STRAY:
+        found.append(f"{name}: expected points on beams that elevations show, found {learned.beyond:.0%} above or "
+                     f"below all {known} of them, of beams that see nothing beyond {FAR:g} m: give scans with "
+                     "rings")  # fmt: skip
     if learned.split:
         found.append(f"{name}: {learned.split}")
     if learned.afloat:
         found.append(f"{name}: {learned.afloat}: mount and tilt are not learned, {learned.sensor.mount:g} m and level "
                      "are written: set them in the file")  # fmt: skip
+    if learned.sensor.max_range > FARTHEST:
+        found.append(f"{name}: expected points within {FARTHEST:g} m, found some to {learned.sensor.max_range:g} m: "
+                     "stray ones, or no metres: set max_range in the file, or give points in metres")  # fmt: skip
+    if learned.uneven and not learned.turns:
+        found.append(f"{name}: expected points whole columns apart, found other steps, as of points left out at random "
+                     f"or of noise: {learned.sensor.width} columns are a guess: give whole scans, or set them in the "
+                     "file")  # fmt: skip
     took = f"{plural(learned.merged, 'ring')} {'is' if learned.merged == 1 else 'are'} taken as one beam with another"
     if learned.turns:
         found.append(f"{name}: {learned.turns} ({took if learned.merged else 'its columns may be too many'})")
