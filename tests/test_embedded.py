@@ -275,6 +275,18 @@ def test_wrong_arguments_get_one_line(model: ls.ScanModel, scan: ls.Scan, image:
         "expected fields of numbers in .ply, found name of <U1": lambda: ls.write(tmp_path / "a.ply", named),
         "expected a device of torch, .* found 'foo'": lambda: ls.load("default", device="foo"),
         "expected points within vlp-16's view, found none of 0": lambda: model.upsample(empty, "vlp-16"),
+        "expected a least confidence of 0 to 1, found 'a'": lambda: model.label(scan, least="a"),  # type: ignore[arg-type]
+        "expected a least confidence of 0 to 1, found None": lambda: image.surer_than(None),  # type: ignore[arg-type]
+        "expected classes to take away of .*, found 5": lambda: model.complete(scan, without=5),  # type: ignore[arg-type]
+        "sensor vlp-16: expected a whole number as width, found '64'": lambda: ls.project(scan, VLP, width="64"),  # type: ignore[arg-type]
+        "sensor vlp-16: width must be at least 4 columns, got 0": lambda: ls.project(scan, VLP, width=0),
+        "sensor vlp-16: height must divide its 16 beams, got 0": lambda: VLP.resized(height=0),
+        "expected a sensor or its word, found a bytes": lambda: ls.load("kitti-streets").into(b"a"),  # type: ignore[arg-type]
+        "expected weights by a word or a path, found a NoneType": lambda: ls.load(None),  # type: ignore[arg-type]
+        "^: expected shipped weights .* found no file or folder": lambda: ls.load(""),
+        "^aaa.*: expected shipped weights .* found no file or folder": lambda: ls.load(5000 * "a"),
+        "expected a tensor of plain numbers, .* torch.sparse_coo": lambda: model.complete(torch.eye(4).to_sparse()),
+        "expected a tensor of plain numbers, .* on meta": lambda: model.label(torch.zeros(4, 3, device="meta")),
     }
     for why, call in calls.items():
         with pytest.raises(ValueError, match=why):
