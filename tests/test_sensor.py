@@ -221,6 +221,13 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ),
         ("elevations = [1]\nmount = -3", r"expected finite metres, of a mount 0 or more, found -3 as mount"),
         ("elevations = [1", r"mine.toml: expected TOML, found"),
+        (
+            "elevations = [1]\nname = ['a']",
+            r"expected a name of one line and edges .*, found name \['a'\] and edges False",
+        ),
+        ("elevations = [1]\nname = 64", r"expected a name of one line and edges .*, found name 64 and"),
+        ('elevations = [1]\nname = "a\\nb"', r"expected a name of one line and edges .*, found name 'a\\nb' and"),
+        ("elevations = [1]\nedges = 'no'", r"edges that are true or false, found name 'mine' and edges 'no'"),
     ],
 )
 def test_files_that_make_no_sensor_get_one_line(tmp_path, content, message):

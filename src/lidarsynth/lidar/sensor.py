@@ -61,6 +61,9 @@ class Sensor:
     dimness: tuple[float, ...] = ()
 
     def __post_init__(self):
+        if not (isinstance(self.name, str) and self.name.isprintable() and isinstance(self.edges, bool)):
+            found = f"name {self.name!r:.60} and edges {self.edges!r:.60}"
+            raise ValueError(f"sensor: expected a name of one line and edges that are true or false, found {found}")
         self._as_plain_numbers()
         steps = np.diff(self.elevations)
         if len(self.elevations) < 1 or not np.all(steps < 0) or not np.all(np.abs(self.elevations) <= 90):
@@ -248,8 +251,7 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
             raise ValueError(f"{source}: expected finite top and bottom, found {top} and {bottom}")
         spaced = np.linspace(top, bottom, values.pop("beams"))
         values["elevations"] = spaced.tolist()
-    known = set(Sensor.__dataclass_fields__)
-    if unknown := values.keys() - known:
+    if unknown := values.keys() - (known := set(Sensor.__dataclass_fields__)):
         raise ValueError(f"{source}: expected the fields {sorted(known)} or beams/top/bottom, found {sorted(unknown)}")
     if "elevations" not in values:
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
