@@ -1,6 +1,8 @@
 """The library as a part of another program: what it is given, what it leaves as it was, and what it says at once."""
 
 import copy
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +12,11 @@ import torch
 
 import lidarsynth as ls
 from lidarsynth.diffusion.samplers import generators
+from lidarsynth.experiment.presets import preset
 from lidarsynth.lidar.sensor import same_rays
+from lidarsynth.networks.device import usual_torch
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.table import assemble, build_network
 
 VLP = ls.get_sensor("vlp-16")
 
@@ -113,6 +118,73 @@ def test_defaults_of_torch_do_not_matter_and_stay(model: ls.ScanModel, scan: ls.
         np.testing.assert_array_equal(one.range, expected.range)
 
 
+@contextmanager
+def float64() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def around() -> dict[str, AbstractContextManager]:
+    """What a program around the library may have set."""
+    half = torch.autocast("cpu", torch.bfloat16)
+    return {"half": half, "no learning": torch.inference_mode(), "meta": torch.device("meta"), "double": float64()}
+
+
+@pytest.mark.parametrize("word", around())
+def test_what_the_program_around_has_set_changes_no_scan(word: str):
+    torch.manual_seed(0)
+    made = [assemble(preset(name), build_network(preset(name))) for name in ("tiny", "tiny-gan")]
+    known = np.arange(made[1].sensor.height)[:, None] % 2 + np.zeros(made[1].sensor.width) == 0
+
+    def scans() -> list[np.ndarray]:
+        gan = made[1].generate(1)[0]  # whose completion learns
+        return [made[0].generate(1, steps=2)[0].range, gan.range, made[1].complete(gan, known, steps=2).range]
+
+    expected = scans()
+    with around()[word]:
+        found = scans()
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_default_type_stays_as_it_is_needed_until_the_last_thread_is_done():
+    one, other = usual_torch(), usual_torch()  # of two threads
+    with float64():
+        one.__enter__()
+        other.__enter__()
+        one.__exit__(None, None, None)
+        assert torch.get_default_dtype() == torch.float32, "the other is at work"
+        other.__exit__(None, None, None)
+        assert torch.get_default_dtype() == torch.float64
+
+
+@pytest.mark.parametrize("word", around())
+@pytest.mark.parametrize("protocol", ["street-2", "iln-2022"])
+def test_what_the_program_around_has_set_changes_no_judgement_nor_its_own_images(word: str, protocol: str):
+    images = [SyntheticStreets(seed, 1, ls.get_sensor("hdl-64e-kitti").resized(16, 1024)).image(0) for seed in (3, 4)]
+    expected = ls.evaluate(images, images[::-1], protocol)
+    seen = []
+
+    class Made:
+        def __len__(self) -> int:
+            return 2
+
+        def __getitem__(self, i: int) -> ls.RangeImage:
+            seen.append(state())
+            return images[i]
+
+    def state() -> list[object]:
+        own = torch.get_default_dtype(), torch.get_default_device().type
+        return [*own, torch.is_autocast_enabled("cpu"), torch.is_inference_mode_enabled()]
+
+    with around()[word]:
+        found, own = ls.evaluate(Made(), images[::-1], protocol), state()
+    assert found.values == expected.values and seen and all(told == own for told in seen)
+
+
 def test_images_that_are_no_measurements_are_refused(model: ls.ScanModel, image: ls.RangeImage):
     far, light = image.range.copy(), image.reflectance * 255
     far[image.mask] = np.nan
@@ -203,6 +275,18 @@ def test_wrong_arguments_get_one_line(model: ls.ScanModel, scan: ls.Scan, image:
         "expected fields of numbers in .ply, found name of <U1": lambda: ls.write(tmp_path / "a.ply", named),
         "expected a device of torch, .* found 'foo'": lambda: ls.load("default", device="foo"),
         "expected points within vlp-16's view, found none of 0": lambda: model.upsample(empty, "vlp-16"),
+        "expected a least confidence of 0 to 1, found 'a'": lambda: model.label(scan, least="a"),  # type: ignore[arg-type]
+        "expected a least confidence of 0 to 1, found None": lambda: image.surer_than(None),  # type: ignore[arg-type]
+        "expected classes to take away of .*, found 5": lambda: model.complete(scan, without=5),  # type: ignore[arg-type]
+        "sensor vlp-16: expected a whole number as width, found '64'": lambda: ls.project(scan, VLP, width="64"),  # type: ignore[arg-type]
+        "sensor vlp-16: width must be at least 4 columns, got 0": lambda: ls.project(scan, VLP, width=0),
+        "sensor vlp-16: height must divide its 16 beams, got 0": lambda: VLP.resized(height=0),
+        "expected a sensor or its word, found a bytes": lambda: ls.load("kitti-streets").into(b"a"),  # type: ignore[arg-type]
+        "expected weights by a word or a path, found a NoneType": lambda: ls.load(None),  # type: ignore[arg-type]
+        "^: expected shipped weights .* found no file or folder": lambda: ls.load(""),
+        "^aaa.*: expected shipped weights .* found no file or folder": lambda: ls.load(5000 * "a"),
+        "expected a tensor of plain numbers, .* torch.sparse_coo": lambda: model.complete(torch.eye(4).to_sparse()),
+        "expected a tensor of plain numbers, .* on meta": lambda: model.label(torch.zeros(4, 3, device="meta")),
     }
     for why, call in calls.items():
         with pytest.raises(ValueError, match=why):

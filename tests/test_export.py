@@ -1,6 +1,7 @@
 """Exported files: the same scans as the model's by another program; they say what they are; others are refused."""
 
 import json
+import logging
 import os
 import re
 import subprocess
@@ -94,6 +95,42 @@ def test_what_stands_in_pixels_that_are_not_known_says_nothing():
             assert torch.equal(found, expected)
 
 
+def test_a_scan_without_reflectance_is_filled_as_the_model_does():
+    model, image = cascade(), SyntheticStreets(3, 1, SENSOR).image(0)
+    known = corrupt(image, "beams:4")
+    sparse = replace(image, reflectance=np.zeros_like(image.reflectance)).keep(known)
+    arrays = [torch.from_numpy(part)[None, None] for part in (sparse.range, sparse.reflectance, known)]
+    with torch.no_grad():
+        parts = [part[0, 0].numpy() for part in graph_of(model).module(*arrays[:2], arrays[2].float())]
+    filled = model.fill(sparse, known, Filling("conditional", 1))
+    parts[0] = straight_in_gaps(replace(filled, range=parts[0], mask=parts[0] > 0), known).range
+    for values, expected in zip(parts, (filled.range, filled.reflectance, filled.confidence), strict=True):
+        np.testing.assert_allclose(values, expected, rtol=1e-4, atol=2e-4)
+    assert parts[1][known & sparse.mask].mean() > 0.1
+
+
+def test_what_the_program_around_has_set_does_not_matter_and_its_model_stays(monkeypatch, tmp_path: Path, caplog):
+    model, seen = cascade(), []
+
+    def exporter(module: torch.nn.Module, **_: object) -> None:
+        logging.getLogger("onnxscript.optimizer._constant_folding").warning("skips something")
+        own = {part.data_ptr() for part in model.network.parameters()}
+        shared = any(part.data_ptr() in own for part in module.parameters())
+        seen.append((shared, torch.get_default_dtype(), torch.get_default_device().type))
+        seen.append(torch.is_autocast_enabled("cpu"))
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(torch.onnx, "export", exporter)
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"), torch.autocast("cpu", torch.bfloat16), pytest.raises(ZeroDivisionError):
+            export_onnx(model, tmp_path / "x.onnx")
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert seen == [(False, torch.float32, "cpu"), False]  # a copy goes to the CPU, not a program's own weights
+    assert not caplog.records
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_file_says_what_it_is(exported: Exported):
@@ -145,6 +182,11 @@ def test_what_cannot_be_exported_is_said_in_a_line(tmp_path: Path):
     tilted = cascade().into(replace(SENSOR, tilt=(1.0, 0.0)))
     with pytest.raises(ValueError, match="without tilt and blocked rays"):
         graph_of(tilted, open_columns=True)
+    for width in (16, 100, 4112):  # as Pandar64's 1,800, which are no multiple of 16
+        with pytest.raises(
+            ValueError, match=f"small: expected a multiple of 16 from 32 to 4096 .*, found {width}; leave"
+        ):
+            export_onnx(cascade().into(replace(SENSOR, width=width)), tmp_path / "x.onnx", open_columns=True)
     assert list(tmp_path.iterdir()) == []
 
 

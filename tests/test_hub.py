@@ -1,5 +1,6 @@
 """Models on the Hugging Face hub, without network: a stand-in for huggingface_hub keeps repositories in a folder."""
 
+import copy
 import inspect
 import shutil
 import sys
@@ -85,6 +86,20 @@ def test_half_of_the_size_and_revisions(hub: Repositories, model: LidarModel):
     torch.testing.assert_close(halved, load("someone/street@v1").network.state_dict(), rtol=1e-3, atol=1e-4)
 
 
+def test_weights_that_half_of_the_size_cannot_hold_are_refused_and_what_was_there_stays(model: LidarModel, tmp_path):
+    large, folder = copy.deepcopy(model), model.save(tmp_path / "mine")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with torch.no_grad():
+        next(large.network.parameters()).view(-1)[0] = 1e5
+    for place in (folder, tmp_path / "new"):
+        with pytest.raises(
+            ValueError, match=r"expected weights of at most 65504 .*, found 100000 in \S+; save them whole"
+        ):
+            large.save(place, half=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before and not (tmp_path / "new").exists()
+    assert load(large.save(folder)).network.state_dict().keys() == model.network.state_dict().keys()
+
+
 def test_a_local_folder_goes_before_the_hub(hub: Repositories, model: LidarModel, tmp_path: Path, monkeypatch):
     from lidarsynth.experiment.folder import save
 
@@ -99,9 +114,9 @@ def test_every_failure_is_one_line(hub: Repositories, model: LidarModel, monkeyp
     (hub.root / "someone/else/main").mkdir(parents=True)
     with pytest.raises(ValueError, match=r"someone/else: expected model.safetensors and experiment.json, found no"):
         load("someone/else")
-    for name in ("street", "a/b/c", "a/b@main", ""):
+    for name in ("street", "a/b/c", "a/b@main", "", 5, None):
         with pytest.raises(ValueError, match="expected a repository owner/name, found"):
-            model.push_to_hub(name)
+            model.push_to_hub(name)  # type: ignore[arg-type]
 
     def offline(*_, **__):
         raise ConnectionError("Cannot reach the hub.\n  Please check\n your connection")

@@ -22,6 +22,7 @@ from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_s
 from lidarsynth.experiment.record import WEIGHTS
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.point_sets import spread
+from lidarsynth.networks.device import usual_torch
 from lidarsynth.networks.minkowski_unet import MinkowskiUNet
 from lidarsynth.networks.pointnet import read_pointnet
 from lidarsynth.networks.rangenet import RangeNet
@@ -56,6 +57,7 @@ class Loaded:
     missing: dict[str, str] = field(default_factory=dict)
 
 
+@usual_torch()
 def load_networks(protocol: EvaluationProtocol, width: int, device: str = "cpu", on_images: OnImages = None) -> Loaded:
     """A protocol's networks, shipped or downloaded once into the cache folder; of the others, why they are missing.
 

@@ -28,6 +28,7 @@ from lidarsynth.lidar.projection import project_thinned, thin
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, no_metres
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import check_regular
+from lidarsynth.networks.device import usual_torch
 from lidarsynth.networks.tensors import as_array, read_pickle, saved_shape
 
 TENSORS = (".pth", ".pt")  # (5, H, W) of R2DM, (2, H, W) of LiDARGen, or (B, ...) of either
@@ -89,7 +90,9 @@ class ImageSet:
         Raises ValueError that begins with the image's name.
         """
         try:
-            return as_image(judged(self.item(i)), sensor, projection, resize, resizing, whole)
+            item = self.item(i)  # made as the program around this wants it
+            with usual_torch():
+                return as_image(judged(item), sensor, projection, resize, resizing, whole)
         except ValueError as error:
             raise self._named(i, error) from None
 
@@ -107,7 +110,9 @@ class ImageSet:
         Raises ValueError that begins with the image's name, also for a scan without any point in range.
         """
         try:
-            return points_of(judged(self.item(i)), sensor, clouds, real)
+            item = self.item(i)
+            with usual_torch():
+                return points_of(judged(item), sensor, clouds, real)
         except ValueError as error:
             raise self._named(i, error) from None
 

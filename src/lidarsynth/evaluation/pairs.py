@@ -29,6 +29,7 @@ from lidarsynth.metrics.reconstruction import (
     voxel_errors,
     weighted_iou,
 )
+from lidarsynth.networks.device import usual_torch
 from lidarsynth.networks.rangenet import RangeNet
 
 VOXELS = ("range-mae-full", "voxel-iou", "voxel-precision", "voxel-recall", "voxel-f1")  # of ILN, of one pair each
@@ -59,6 +60,7 @@ class Pairs:
         self._lit = [0, 0]  # images with any reflectance, of results and of truths
         self._digests = [0, 0]
 
+    @usual_torch()
     def update(self, results: Sequence[RangeImage], truths: Sequence[RangeImage]) -> None:
         """Take in a batch of images and their truths, all pixels of both. Raises ValueError for different sizes."""
         for result, truth in zip(results, truths, strict=True):

@@ -15,6 +15,7 @@ from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
 from lidarsynth.lidar.beams import same_beams
 from lidarsynth.metrics.sensor_report import BeamReport, compare_beams
+from lidarsynth.networks.device import usual_torch
 
 DEFINITIONS = "## Definitions"  # every page has them
 OnRow = Callable[[str, int, int], object] | None  # (what, done, in all) of rows, or of a row's parts; for progress bars
@@ -245,6 +246,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+@usual_torch()
 def report_of(
     samples: Statistics,
     real: Statistics,

@@ -30,6 +30,7 @@ from lidarsynth.metrics.occupancy import Occupancy
 from lidarsynth.metrics.point_sets import farthest_points
 from lidarsynth.metrics.sensor_report import BeamCounts
 from lidarsynth.metrics.sharpness import Sharpness
+from lidarsynth.networks.device import usual_torch
 
 FORMAT = "lidarsynth statistics 1"
 Networks = Mapping[str, nn.Module]  # kind -> a network in evaluation mode; those a protocol names and that are there
@@ -50,6 +51,7 @@ class Statistics:
     Two sets of different images merge into what one pass over all of them gives.
     """
 
+    @usual_torch()
     def __init__(
         self,
         protocol: EvaluationProtocol,
@@ -89,6 +91,7 @@ class Statistics:
         size = self.protocol.sets.points if self.protocol.sets else 0
         return torch.cat([torch.zeros(0, size, 3), *self._sets]).numpy()
 
+    @usual_torch()
     def update_clouds(
         self, scans: Sequence[Cloud], features: Sequence[bool], counted: Sequence[bool], matched: Sequence[bool]
     ) -> None:
@@ -107,6 +110,7 @@ class Statistics:
         for scan, count, match in zip(scans, counted, matched, strict=True):
             self.occupancy.update(scan.xyz, count, match)
 
+    @usual_torch()
     def update(
         self, images: Sequence[RangeImage], features: Sequence[bool], bev: Sequence[bool], sets: Sequence[bool] = ()
     ) -> None:
@@ -184,6 +188,7 @@ class Statistics:
             chosen = xyz[farthest_points(xyz, sets.points, sets.clear)]
             self._sets.append(torch.from_numpy(chosen.astype(np.float32))[None])
 
+    @usual_torch()
     def merge(self, other: Statistics) -> None:
         """Take in all that `other` has seen. Raises ValueError for another protocol, sensor, role or weights."""
         own, its = ((s.protocol, s.sensor, s.role, s.weights, set(s.moments)) for s in (self, other))
@@ -211,6 +216,7 @@ class Statistics:
         if self.sharpness and other.sharpness:
             self.sharpness.merge(other.sharpness)
 
+    @usual_torch()
     def tensors(self) -> dict[str, Tensor]:
         """Everything counted, by name."""
         state = {"counts": torch.tensor([self.count, self.lit, self.measured])}
@@ -307,6 +313,7 @@ def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str]
     return metadata["sha256"]
 
 
+@usual_torch()
 def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> tuple[Statistics, dict[str, str]]:
     """Statistics that `save_statistics` wrote, verified, and the file's metadata.
 

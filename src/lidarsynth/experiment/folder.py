@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from safetensors.torch import save as serialized
-from torch import nn
+from torch import Tensor, nn
 
 from lidarsynth.experiment.eight_bits import packed
 from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment, from_dict
@@ -27,22 +28,32 @@ def save(
 
     Of an experiment with a `base`, the weights that are not the base's.
     bytewise  how the names begin of matrices that are stored in eight bits (`eight_bits.packed`)
-    Raises ValueError where a file has the folder's name.
+    Raises ValueError, before anything is written, where a file has the folder's name, and for weights that are too
+    large for float16, of which nothing could be loaded.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder to write to, found a file")
-    folder.mkdir(parents=True, exist_ok=True)
     dtype = torch.float16 if half else torch.float32
     # Angles and frequencies stay exact: half precision would turn the highest Fourier features into noise.
     exact = {name for name, _ in network.named_buffers()}
     own = {k: v for k, v in network.state_dict().items() if not experiment.base or k.startswith(owned(experiment))}
     weights = {k: (v if k in exact else v.to(dtype)).contiguous().cpu() for k, v in own.items()}
+    if half:
+        _check_half(str(folder), weights, own)
+    folder.mkdir(parents=True, exist_ok=True)
     weights |= packed({k: v.cpu() for k, v in own.items() if k not in exact}, bytewise)
     with whole_file(folder / RECORD) as record, whole_file(folder / WEIGHTS) as file:
         record.write_text(json.dumps(experiment.to_dict(), indent=1) + "\n", encoding="utf-8")
         file.write_bytes(serialized(weights))  # save_file would hide it from other users
     return folder
+
+
+def _check_half(folder: str, weights: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+    lost = (name for name, value in weights.items() if value.isinf().any() and own[name].isfinite().all())
+    if name := next(lost, None):
+        raise ValueError(f"{folder}: expected weights of at most 65504 for half of the size, found "
+                         f"{own[name].abs().max():g} in {name}; save them whole")  # fmt: skip
 
 
 def owned(experiment: Experiment) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -21,7 +21,9 @@ NEARER = (0.3, 0.02)  # metres, and share of the range, by which nothing was in 
 def removable(classes: str | Sequence[str]) -> tuple[str, ...]:
     """SemanticKITTI's words, as a sequence or joined by commas, `traffic` for all of TRAFFIC; each once, in order of
     their numbers. Raises ValueError for other words, and for none."""
-    words = [word.strip() for word in classes.split(",")] if isinstance(classes, str) else list(classes)
+    classes = classes.split(",") if isinstance(classes, str) else classes
+    words = [*classes] if isinstance(classes, Iterable) else [classes]
+    words = [word.strip() if isinstance(word, str) else word for word in words]
     words = [of for word in words for of in (TRAFFIC if word == "traffic" else (word,))]
     known = [word for word in CLASS_NUMBER if CLASS_NUMBER[word]]
     if not words or (unknown := [word for word in words if word not in known]):

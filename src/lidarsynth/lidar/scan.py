@@ -168,6 +168,18 @@ def scan_of(points: np.ndarray) -> Scan:
     return Scan(xyz, light)
 
 
+def least_confidence(least: float) -> float:
+    """The number as Python's own. Raises ValueError for one outside 0 to 1, and for what is no number."""
+    try:
+        number = None if isinstance(least, str | bytes) else float(least)
+    except (TypeError, ValueError, RuntimeError):
+        number = None
+    if number is None or not 0 <= number <= 1:
+        found = f"{least!r:.60}" if number is None else f"{number:g}"
+        raise ValueError(f"expected a least confidence of 0 to 1, found {found}")
+    return number
+
+
 def check_image(image: RangeImage) -> None:
     """Raises ValueError for measured ranges that are negative or not finite, and reflectances outside 0 to 1."""
     metres, light = (values[image.mask] for values in (image.range, image.reflectance))
@@ -324,8 +336,7 @@ class RangeImage:
 
         Raises ValueError for a `least` outside 0 to 1, and where the model gave no confidence.
         """
-        if not 0 <= least <= 1:
-            raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
+        least = least_confidence(least)
         if self.confidence is None:
             raise ValueError("expected a completion with confidences, such as default's, found one without")
         points = self.completed

@@ -6,7 +6,7 @@ import warnings
 from collections import ChainMap
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from numbers import Real
+from numbers import Integral, Real
 from operator import index
 from pathlib import Path
 
@@ -59,6 +59,9 @@ class Sensor:
     dimness: tuple[float, ...] = ()
 
     def __post_init__(self):
+        if not (isinstance(self.name, str) and isinstance(self.edges, bool)):
+            found = f"name {self.name!r:.60} and edges {self.edges!r:.60}"
+            raise ValueError(f"sensor: expected a word as name and edges that are true or false, found {found}")
         self._as_plain_numbers()
         steps = np.diff(self.elevations)
         if len(self.elevations) < 1 or not np.all(steps < 0) or not np.all(np.abs(self.elevations) <= 90):
@@ -152,8 +155,11 @@ class Sensor:
 
     def resized(self, height: int | None = None, width: int | None = None) -> Sensor:
         """The sensor with `width` columns and, by taking evenly spaced beams, `height` rows (a divisor of its own)."""
-        height, width = height or self.height, width or self.width
-        if self.height % height:
+        height = self.height if height is None else height
+        for name, size in (("height", height), ("width", self.width if width is None else width)):
+            if not isinstance(size, Integral):
+                raise ValueError(f"sensor {self.name}: expected a whole number as {name}, found {size!r:.60}")
+        if height < 1 or self.height % height:
             raise ValueError(f"sensor {self.name}: height must divide its {self.height} beams, got {height}")
         return self.rows(range(0, self.height, self.height // height), width=width)
 
@@ -162,7 +168,7 @@ class Sensor:
         name = self.name if len(rows) == self.height else f"{self.name}/{len(rows)}"
         pick = tuple(self.elevations[i] for i in rows)
         offsets = tuple(self.offsets[i] for i in rows) if self.offsets else ()
-        width = width or self.width
+        width = self.width if width is None else width
         place, scale = {row: i for i, row in enumerate(rows)}, width / self.width
         blocked = tuple(
             (place[row], int(first * scale), (min(int((last + 1) * scale), width) - 1) % width)

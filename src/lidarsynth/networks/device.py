@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from threading import Lock
 from typing import TypeVar
 
 import torch
@@ -11,19 +12,41 @@ import torch
 T = TypeVar("T")
 
 
+# Kinds of devices for which a program may have asked for half precision.
+KINDS = ("cpu", "cuda", "mps", "xpu")
+_LOCK = Lock()
+_THEIRS: list[torch.dtype] = []  # the program's default type, once for each `usual_torch` that is open
+
+
 @contextmanager
 def usual_torch() -> Iterator[None]:
     """While it is open, torch makes tensors as this package expects them, float32 on the CPU where nothing else is
-    said, whatever defaults the program around it has set; these are not touched where they are the same."""
-    dtype, device = torch.get_default_dtype(), torch.get_default_device()
-    if dtype == torch.float32 and device.type == "cpu":
-        yield
-        return
-    torch.set_default_dtype(torch.float32)
+    said, computes in float32 and can learn, whatever the program around it has set: default type and device, autocast,
+    inference mode. All these are as they were afterwards.
+
+    All threads of a program have one default type: it is the program's again when the last of them is done.
+    """
+    with _LOCK:
+        _THEIRS.append(_THEIRS[0] if _THEIRS else torch.get_default_dtype())
+        _set_default(torch.float32)
     try:
-        with torch.device("cpu"):
+        with ExitStack() as stack:
+            if torch.is_inference_mode_enabled():
+                stack.enter_context(torch.inference_mode(False))
+            if torch.get_default_device().type != "cpu":
+                stack.enter_context(torch.device("cpu"))
+            for kind in filter(torch.is_autocast_enabled, KINDS):
+                stack.enter_context(torch.autocast(kind, enabled=False))
             yield
     finally:
+        with _LOCK:
+            theirs = _THEIRS.pop()
+            if not _THEIRS:
+                _set_default(theirs)
+
+
+def _set_default(dtype: torch.dtype) -> None:
+    if torch.get_default_dtype() != dtype:
         torch.set_default_dtype(dtype)
 
 

@@ -62,9 +62,15 @@ def saved_shape(path: Path) -> tuple[int, ...]:
 
 
 def as_array(given: Any) -> Any:
-    """A tensor's numbers as an array, floating ones as float32, from any device; anything else as it is."""
+    """A tensor's numbers as an array, floating ones as float32, from any device; anything else as it is.
+
+    Raises ValueError for a tensor that holds no plain numbers.
+    """
     if not isinstance(given, Tensor):
         return given
+    if given.is_meta or given.is_quantized or given.is_nested or given.layout != torch.strided:
+        raise ValueError(f"expected a tensor of plain numbers, found one of {given.layout} on {given.device}, "
+                         f"{given.dtype}")  # fmt: skip
     given = given.detach().cpu()
     return (given.float() if given.is_floating_point() else given).numpy()
 

@@ -22,6 +22,14 @@ def is_repository(source: str) -> bool:
     return REPOSITORY.fullmatch(source) is not None and not source.endswith((".pth", ".safetensors"))
 
 
+def checked_repository(repo_id: str) -> str:
+    """The word. Raises ValueError for one that is no `owner/name`."""
+    match = REPOSITORY.fullmatch(repo_id) if isinstance(repo_id, str) else None
+    if match is None or match["revision"]:
+        raise ValueError(f"expected a repository owner/name, found {repo_id!r}")
+    return repo_id
+
+
 def fetch(source: str) -> Path:
     """The folder, in the hub's own cache, of the model of a repository `owner/name` or `owner/name@revision`.
 
@@ -47,10 +55,7 @@ def push(
     The repository is made where there is none. Needs a token, from `hf auth login` or HF_TOKEN. Raises ValueError in
     one line when the hub refuses or there is no network, ImportError naming the extra `hub`.
     """
-    match = REPOSITORY.fullmatch(repo_id)
-    if match is None or match["revision"]:
-        raise ValueError(f"expected a repository owner/name, found {repo_id!r}")
-    hub = _huggingface_hub()
+    repo_id, hub = checked_repository(repo_id), _huggingface_hub()
     with tempfile.TemporaryDirectory() as scratch:
         save(scratch, experiment, network, half)
         (Path(scratch) / "README.md").write_text(card, encoding="utf-8")

@@ -18,13 +18,13 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.measured import with_measured
 from lidarsynth.lidar.projection import Pixels, occupied, pixel_of_points, project_thinned
 from lidarsynth.lidar.removal import removable
-from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, least_confidence
+from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.networks.device import check_device, usual_torch
 from lidarsynth.streets.wanted import wanted
 from lidarsynth.systems.description import Description, described
 from lidarsynth.systems.filling import Filling, OnStep, check_counts, whole
-from lidarsynth.systems.hub import push
+from lidarsynth.systems.hub import checked_repository, push
 from lidarsynth.systems.insertion import Inserted, inserted
 from lidarsynth.systems.known_pixels import known_pixels, of_rays, sensor_that_made, sparse_image
 from lidarsynth.systems.model_card import card_text
@@ -213,9 +213,7 @@ class ScanModel(ABC):
         Labels that it had are replaced. Raises ValueError for a model that has learned no classes, where no point is in
         view, and for a `least` outside 0 to 1.
         """
-        if not 0 <= least <= 1:
-            raise ValueError(f"expected a least confidence of 0 to 1, found {least:g}")
-        made = made_by(noted(self, scan, sensor), sensor)
+        least, made = least_confidence(least), made_by(noted(self, scan, sensor), sensor)
         with usual_torch():
             return self.named(*made, least).to_scan()
 
@@ -331,7 +329,7 @@ class ScanModel(ABC):
 
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""
-        name = sensor if isinstance(sensor, str) else sensor.name
+        name = get_sensor(sensor).name
         raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as default, for {name}, "
                          f"found one of {self.sensor.name} only")  # fmt: skip
 
@@ -388,7 +386,7 @@ class ScanModel(ABC):
         Returns the address; `load("owner/name")` then gives the model anywhere. Needs the extra `hub` and a token.
         Raises ValueError in one line when the hub refuses or cannot be reached.
         """
-        card = card_text(self.experiment, self.description, repo_id)
+        card = card_text(self.experiment, self.description, checked_repository(repo_id))
         return push(self.experiment, self.network, repo_id, card, private, half)
 
     def _lacks(self, what: str) -> ValueError:

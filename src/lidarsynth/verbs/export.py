@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import os
@@ -16,6 +17,7 @@ import torch
 
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.whole_file import write_whole
+from lidarsynth.networks.device import usual_torch
 from lidarsynth.networks.running import LONGEST
 from lidarsynth.systems.graph import Graph
 from lidarsynth.systems.scan_model import ScanModel
@@ -49,14 +51,16 @@ def export_onnx(model: ScanModel, path: str | Path, sensor: str | None = None, o
     open_columns  inputs may have any number of columns, in multiples of 16, from 32 to 4,096
 
     The file's metadata name the sensor (JSON), what inputs and outputs are, the model and its licence.
-    A folder that is not there is made. Raises ValueError for other models, for a name without .onnx, and where the
-    extra `onnx` is missing.
+    A folder that is not there is made. The model stays as it is, on its device. Raises ValueError for other models, for
+    a name without .onnx, for open columns that the sensor's own are none of, and where the extra `onnx` is missing.
     """
     path = Path(path)
     _check_writable(path)
     model = model if sensor in (None, model.sensor.name) else model.into(get_sensor(sensor))
-    graph = graph_of(model, open_columns)
-    proto = _program(graph)
+    with usual_torch():
+        graph = graph_of(model, open_columns)
+        _check_columns(model.sensor, graph)
+        proto = _program(graph)
     shapes = _shapes(proto.graph.input), _shapes(proto.graph.output)
     _describe(proto, model, graph)
     try:
@@ -79,6 +83,15 @@ def _check_writable(path: Path) -> None:
         raise ValueError(f"{path}: expected a writable folder, found {found} at {parent}")
 
 
+def _check_columns(sensor: Sensor, graph: Graph) -> None:
+    """Raises ValueError for a sensor whose own images a file with open columns would not take."""
+    least = LEAST * graph.multiple
+    if graph.open_columns and (sensor.width % graph.multiple or not least <= sensor.width <= LONGEST):
+        raise ValueError(f"{sensor.name}: expected a multiple of {graph.multiple} from {least} to {LONGEST} as its own "
+                         f"columns for any number of them, found {sensor.width}; leave --any-columns out, or take a "
+                         "sensor of another width")  # fmt: skip
+
+
 def _program(graph: Graph) -> Any:
     """The ONNX model of a graph."""
     try:
@@ -88,7 +101,7 @@ def _program(graph: Graph) -> Any:
         raise ValueError("expected the packages onnx and onnxscript; pip install 'lidarsynth[onnx]'") from None
     columns = torch.export.Dim("blocks", min=LEAST, max=LONGEST // graph.multiple) * graph.multiple
     shapes = {name: {3: columns} for name in graph.inputs} if graph.open_columns else None
-    module = graph.module.cpu()
+    module = copy.deepcopy(graph.module).cpu()  # the model's own weights stay where they are
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             module,
@@ -110,7 +123,7 @@ def _program(graph: Graph) -> Any:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Without the exporter's warnings about itself."""
-    loggers = {logger: logger.level for logger in map(logging.getLogger, ("torch.onnx", "onnx_ir"))}
+    loggers = {logger: logger.level for logger in map(logging.getLogger, ("torch.onnx", "onnx_ir", "onnxscript"))}
     for logger in loggers:
         logger.setLevel(logging.ERROR)
     try:

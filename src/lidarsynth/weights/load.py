@@ -6,6 +6,7 @@ R2DM's format is dict(cfg, weights, ema_weights, optimizer, lr_scheduler, global
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import torch
@@ -39,6 +40,8 @@ def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = 
 
     Raises ValueError in one line that says what was expected and what was found.
     """
+    if not isinstance(source, str | os.PathLike):
+        raise ValueError(f"expected weights by a word or a path, found a {type(source).__name__}")
     word = source.removesuffix("-300k") if isinstance(source, str) else None
     if word in (own := shipped()):
         return load_folder(own[word])
@@ -49,9 +52,9 @@ def load_parts(source: str | Path, ema: bool = True, on_bytes: OnBytes | None = 
     path = Path(source)
     if path.name in (WEIGHTS, RECORD):
         path = path.parent
-    if path.is_dir():
+    if os.path.isdir(path) and source != "":  # which is no word for where one happens to be
         return load_folder(path)
-    if path.is_file():
+    if os.path.isfile(path):
         return read_official(path, ema)
     if isinstance(source, str) and is_repository(source):
         return load_folder(fetch(source))

@@ -20,7 +20,7 @@ from lidarsynth.systems.graph import Graph
 
 SAYS = {
     "range": "metres, 0 where nothing returned or nothing is known",
-    "reflectance": "0 to 1, 0 where nothing returned or nothing is known",
+    "reflectance": "0 to 1, 0 where nothing is known; 0 everywhere where there is none, and then filled in too",
     "known": "1 where the pixel is known, also to be empty; else 0",
     "confidence": "chance that the pixel's ray returns within 0.3 m + 2 %; 1 where known",
 }
@@ -52,9 +52,10 @@ class FillGraph(nn.Module):
         closed = self._buffer("closed").expand_as(range)
         told = (known > 0.5) | closed
         metres = self._padded(torch.where(returned, range, 0.0), 0)
-        light = self._padded(calmed(reflectance, range, returned), 0)
+        lit = (returned & (reflectance > 0)).flatten(1).any(1)[:, None, None, None]  # else nobody has measured it
+        light = self._padded(calmed(reflectance, range, returned & lit), 0)
         answered = metres > 0
-        seen = Known(metres, light, self._padded(told.float(), 1) > 0.5, answered, answered)
+        seen = Known(metres, light, self._padded(told.float(), 1) > 0.5, answered, answered & lit)
         rays = self._rays(seen.metres)
         noise = torch.zeros_like(seen.metres).expand(-1, NOISES, -1, -1)
         weights = self.model.experiment.confidence
@@ -63,10 +64,10 @@ class FillGraph(nn.Module):
         answers = filled.logit[:, :, : sensor.height, : range.shape[3]] > 0
         answers = answers & (metres <= sensor.max_range) & (metres >= sensor.min_range) & ~closed
         shade = AS_STREETS._replace(plain=0.0 if self.model.tuned else USUAL).mixed(filled)
-        shade = shade[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
+        shade = torch.where(lit, shade, filled.reflectance)[:, :, : sensor.height, : range.shape[3]].clamp(0.0, 1.0)
         answers = returned | (answers & ~told)
         full = onto_surfaces(torch.where(answers, torch.where(returned, range, metres), 0.0), told)
-        light = torch.where(answers, torch.where(returned, reflectance, shade), 0.0)
+        light = torch.where(answers, torch.where(returned & lit, reflectance, shade), 0.0)
         if weights is None:
             return full, light
         sure = confidence(filled, rays, weights)[:, :, : sensor.height, : range.shape[3]]
