@@ -38,6 +38,7 @@ ROOMS = {
 }
 NEAR = 3.0  # metres between the sensor and whatever is put: its carrier's own
 CELL, TRIES = 0.5, 300  # metres: places are drawn evenly from such cells of ground that was seen; so many are looked at
+SIDE = 1 << 16  # cells to each side, from the first to the last
 WIDE, FEW = (4.0, 8.0), 12  # metres around a place whose ground tells its plane, the nearer if it has so many returns
 STEEP = 0.3  # of a plane: what is steeper is no ground
 LOW, OVER = 0.3, 0.2  # metres above the ground, and above a thing, between which nothing may return
@@ -123,7 +124,7 @@ class Surroundings:
     def heading(self, x: float, y: float, words: tuple[str, ...], rng: np.random.Generator) -> float:
         """Radians: in which direction the street runs at a place, and traffic there."""
         ground = self.points[np.isin(self.label, _numbers(words)), :2] - [x, y]
-        cells = np.unique(np.round(ground[np.abs(ground).max(1) < STREET] / CELL), axis=0) * CELL
+        cells = _cells(ground[np.abs(ground).max(1) < STREET]) * CELL
         if len(cells) < FEW:
             return float(rng.uniform(-np.pi, np.pi))
         yaw = self.axis
@@ -140,7 +141,7 @@ class Surroundings:
         room = ROOMS[kind]
         ground = self.points[np.isin(self.label, _numbers(room.ground)), :2]
         away = np.hypot(*ground.T)
-        cells = np.unique(np.round(ground[(away > NEAR) & (away < room.far)] / CELL).astype(int), axis=0)
+        cells = _cells(ground[(away > NEAR) & (away < room.far)])
         for x, y in (rng.permutation(cells)[:TRIES] + rng.uniform(-0.5, 0.5, (min(len(cells), TRIES), 2))) * CELL:
             yaw = self.heading(x, y, room.ground, rng) if room.along else float(rng.uniform(-np.pi, np.pi))
             spot = self.spot(float(x), float(y), yaw)
@@ -149,6 +150,12 @@ class Surroundings:
             flat, right = self.ground_of(spot, mesh, room.ground)
             if right and flat - right <= MOST * flat:
                 yield spot
+
+
+def _cells(places: np.ndarray) -> np.ndarray:
+    """(M, 2) cells of places (N, 2), less than a kilometre away, each once and in order."""
+    x, y = np.round(places / CELL).astype(np.int64).T
+    return np.stack(np.divmod(np.unique(x * SIDE + y + SIDE // 2), SIDE), 1) - [0, SIDE // 2]
 
 
 def _numbers(words: tuple[str, ...]) -> list[int]:
