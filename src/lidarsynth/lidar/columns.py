@@ -96,6 +96,24 @@ def columns_of_turn(scan: Scan, sensor: Sensor) -> int | None:
     return PADDED * round(usual * share / PADDED) if FEWEST < share < MOST else None
 
 
+def columns_sent(scan: Scan, sensor: Sensor, row: np.ndarray) -> int | None:
+    """Columns of a turn in which a scan of the sensor has points, thinned ones too, of which every so many are left;
+    row (N,) of each point, -1 for none. None where steps are of no columns, as of points that were kept at random."""
+    if (found := columns_of_turn(scan, sensor)) is not None:
+        return found
+    usual, every = full_turn(sensor), max(1, round(len(scan) / POINTS))
+    rows = np.flatnonzero(np.bincount(row[row >= 0]))
+    part = np.isin(row, rows[min(every // 2, len(rows) - 1) :: every])
+    azimuth, ring = np.arctan2(scan.xyz[part, 1], scan.xyz[part, 0]), row[part]
+    if not len(rows) or not len(step := _steps(azimuth, ring)):
+        return usual
+    found = _step_of(step, azimuth, ring)
+    share = 2 * np.pi / found / usual
+    if not _steady(step, found):
+        return None
+    return usual if FEWEST < share < MOST else max(1, round(usual * share))
+
+
 def full_turn(sensor: Sensor) -> int:
     """Columns of a turn of the sensor at its usual 10 turns a second, of which its images may have fewer."""
     return max(FULL_TURNS.get(sensor.name.removesuffix("-inverted"), sensor.width), sensor.width)

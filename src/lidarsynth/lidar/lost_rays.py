@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsynth.lidar.columns import columns_of_turn, full_turn
+from lidarsynth.lidar.columns import columns_sent
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 
@@ -31,14 +31,14 @@ def lost_rays(scan: Scan, sensor: Sensor, row: np.ndarray) -> LostRays:
     """The rays that a scan of the sensor must have sent besides its points', by the steps of its turn; row (N,) of each
     point, -1 for none.
 
-    None where no ring has a point within a degree, in rings of less than 8 points, and of beams between others that
-    have none, as in thinned scans.
+    None where no ring has a point within a degree, in rings of less than 8 points, of beams between others that have
+    none, as in thinned scans, and of points that were kept at random.
     """
     azimuth = np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]).astype(np.float64)
     count = np.bincount(row[row >= 0], minlength=sensor.height)
-    columns = columns_of_turn(scan, sensor) or full_turn(sensor)
     at = np.flatnonzero((row >= 0) & (count[row] >= MANY))
-    if not len(at):
+    columns = columns_sent(scan, sensor, row) if len(at) else None
+    if columns is None:
         none = np.zeros(0, np.int64)
         return LostRays(none, np.zeros(0), none, none, np.zeros(0))
     order = at[np.lexsort((azimuth[at], row[at]))]
