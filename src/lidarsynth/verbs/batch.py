@@ -33,7 +33,7 @@ from lidarsynth.systems.notes import IN_PYTHON, beyond_image
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, taken_away, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
-from lidarsynth.verbs.insertion import BOXES, check_boxes, insert_scan, told_of, write_boxes
+from lidarsynth.verbs.insertion import BOXES, check_boxes, check_numbers, insert_scan, told_of, write_boxes
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 from lidarsynth.verbs.viewpoint import viewpoint_note
@@ -87,7 +87,7 @@ class Job:
     @property
     def beside(self) -> tuple[str, ...]:
         """Endings of the files that a .bin or .npy of this job may get beside it, as far as the job tells."""
-        marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample") else ()
+        marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample", "insert") else ()
         return (*marks, LABEL) if self.labels or self.reads_labels else marks
 
     @property
@@ -346,7 +346,7 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
     """Write the result, the scan last: where it is, all is. Returns the endings of what is beside a .bin or .npy."""
     beside: tuple[str, ...] = ()
     if job.things is not None:
-        check_boxes(target)
+        check_boxes(target, source, len(loaded.scan) + loaded.dropped)
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
     if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
@@ -357,6 +357,8 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
             beside = tuple(f".{name}" for name in BESIDE if name in placed.extra)
             beside += (LABEL,) if placed.label is not None or "raw_label" in placed.extra else ()
         check_companions(target, source, beside)  # again: only the points tell of labels in a .ply
+        if LABEL in beside and job.things is not None:
+            check_numbers(target, placed)
         if LABEL in beside:
             label_path(target).parent.mkdir(parents=True, exist_ok=True)  # labels/ beside velodyne/
             write_labels(label_path(target), placed)
@@ -366,7 +368,7 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
     if job.picture:
         save_png(target.with_suffix(".png"), portrait(done) if isinstance(done, RangeImage) else done.figure())
     if job.things is not None and isinstance(done, Filled):
-        write_boxes(target, done.points, image.boxes, job.transform)
+        write_boxes(target, done, job.transform)
         beside += (BOXES,)
     write(target, content)
     return beside

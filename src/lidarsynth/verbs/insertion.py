@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidarsynth.files.labels import MOST_INSTANCES
 from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.plural import plural
@@ -55,8 +56,9 @@ def _listed(kinds: Counter[str]) -> str:
     return ", ".join(f"{count} {kind}" for kind, count in kinds.items())
 
 
-def check_boxes(target: Path) -> None:
-    """Raises ValueError where the boxes beside `target` would replace a file that holds none."""
+def check_boxes(target: Path, source: Path, count: int) -> None:
+    """Raises ValueError where the boxes beside `target` would replace a file that holds none, or those of `source`, a
+    file of `count` points."""
     file = target.with_suffix(BOXES)
     if not file.exists():
         return
@@ -66,12 +68,30 @@ def check_boxes(target: Path) -> None:
         found = None
     if not (isinstance(found, dict) and found.keys() == {"points", "boxes"}):
         raise ValueError(f"{target}: expected a name beside which {file.name} may be written, found another file there")
+    own = source.with_suffix(BOXES)
+    if own.exists() and own.samefile(file) and found["points"] == count:
+        raise ValueError(f"{target}: expected a name whose {BOXES} is not that of {source}, found {file}")
 
 
-def write_boxes(target: Path, points: Scan, boxes: Sequence[Box], transform: np.ndarray | None) -> None:
-    """The boxes beside `target`, in the frame of its points: (4, 4) `transform` had brought these into the sensor's."""
-    placed = boxes if transform is None else [_back(box, np.linalg.inv(transform)) for box in boxes]
-    record: dict[str, Any] = {"points": len(points), "boxes": [box.record() for box in placed]}
+def check_numbers(target: Path, points: Scan) -> None:
+    """Raises ValueError where a `.label` beside `target` would be without the numbers of the points' boxes."""
+    number = points.extra["instance"]
+    if "raw_label" not in points.extra and (stray := number[(number < 0) | (number > MOST_INSTANCES)]).size:
+        raise ValueError(f"{target}: expected instances of 0-{MOST_INSTANCES} for a .label, found {stray[0]}; a .ply "
+                         "or .pcd holds others")  # fmt: skip
+
+
+def write_boxes(target: Path, filled: Filled, transform: np.ndarray | None) -> None:
+    """The boxes beside `target`: of a range image, in its sensor's frame and with the points that are its pixels; else
+    in the frame of the file's points, which (4, 4) `transform` had brought into the sensor's."""
+    image, count = filled.image, len(filled.points)
+    boxes: Sequence[Box] = image.boxes
+    if target.suffix.lower() == ".npz":
+        count = int(image.mask.sum())
+        boxes = [replace(box, points=int((image.instance == box.instance).sum())) for box in boxes]
+    elif transform is not None:
+        boxes = [_back(box, np.linalg.inv(transform)) for box in boxes]
+    record: dict[str, Any] = {"points": count, "boxes": [box.record() for box in boxes]}
     write_whole(target.with_suffix(BOXES), json.dumps(record))
 
 
