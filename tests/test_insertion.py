@@ -282,7 +282,7 @@ def test_files_get_labels_and_boxes(place: Path, capsys: pytest.CaptureFixture[s
     Path("a.label").write_bytes(words.tobytes())
     main(["insert", "a.bin", "--add", "car@10/3,person:2", "--out", "new/b.bin", *WORDS])
     said = capsys.readouterr().out
-    assert "inserted 1 car, 2 person: " in said and ".new, .label, .json beside it" in said
+    assert "inserted 1 car, 2 person: " in said and ".new, .confidence, .label, .json beside it" in said
     found, told = read("new/b.bin"), json.loads(Path("new/b.json").read_text())
     new = np.fromfile("new/b.new", np.uint8)
     raw = read_words("new/b.label", len(found))

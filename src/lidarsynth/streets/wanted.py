@@ -26,7 +26,10 @@ def wanted(things: str | Sequence[str]) -> list[Wanted]:
 
     Raises ValueError for other words, and for none or more than MOST.
     """
-    words = [word.strip() for text in ([things] if isinstance(things, str) else things) for word in text.split(",")]
+    texts = [things] if isinstance(things, str) else things
+    if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"expected {GRAMMAR}, as text or a list of texts, found {things!r:.80}")
+    words = [word.strip() for text in texts for word in text.split(",")]
     found = [one for word in words for one in _of_word(word)]
     if not 0 < len(found) <= MOST:
         raise ValueError(f"expected 1 to {MOST} things to insert, found {len(found)}")

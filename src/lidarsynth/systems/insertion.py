@@ -16,6 +16,7 @@ from lidarsynth.lidar.marks import confidences, marks_of, were_new
 from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.removal import own_classes
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.actors import KINDS, MARGIN
 from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
@@ -34,6 +35,7 @@ OCCLUDED = 0.3  # metres nearer than a thing that hide it
 SHOWN, LEAST = 0.4, 8  # of the rays that would meet a thing where there is room, that nothing hides; returns
 INSIDE = 5  # measured points that may be in a thing for which somebody names a place: noise
 INSTANCE, MOST_INSTANCES = "instance", (1 << 16) - 1  # field of the numbers of boxes; the most that raw labels hold
+BESIDE = np.radians(10)  # from one point of a ring to the next, if any of these is to tell how the sensor turns
 RINGS = ("ring", "file_ring")  # further fields that tell of a ray, whatever it meets
 
 
@@ -111,10 +113,13 @@ def placed(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Ge
     if own is None and raw is not None:
         raise ValueError("expected labels of SemanticKITTI's raw ids, beside which those of what is inserted stand, "
                          "found others")  # fmt: skip
-    if own is None:
+    if own is not None and (stray := own[(own < 0) | (own >= len(CLASS_NUMBER))]).size:
+        raise ValueError(f"expected labels of 0-{len(CLASS_NUMBER) - 1}, SemanticKITTI's training classes, found "
+                         f'{stray[0]}; extra["raw_label"] takes its raw ids')  # fmt: skip
+    if own is None or not own[were_new(scan) == 0].any():  # or as of a scan without labels that has been inserted into
         named = model.named(scan, sensor).completed
         assert named is not None and named.label is not None
-        own = named.label
+        own = named.label if own is None else np.where(own > 0, own, named.label)
     image = check_seen(project(replace(scan, label=own.astype(np.int64)), sensor), len(scan))
     lost = lost_rays(scan, model.sensor, pixel_of_points(scan, model.sensor, "auto")[0])
     rays, lost = _rays(scan, model.sensor, lost)
@@ -234,8 +239,10 @@ def with_points(scan: Scan, there: Placed) -> Inserted:
     )
     xyz, light = np.concatenate([scan.xyz[old], mine.xyz]), np.concatenate([scan.reflectance[old], mine.reflectance])
     both = Scan(xyz, light, ring, time, label, fields)
-    order = np.concatenate([old.astype(np.float64), _order(scan, rays, lost)[new]])
-    return Inserted(both[np.argsort(order, kind="stable")], _boxes(there, first))
+    both = both[np.argsort(np.concatenate([old, _order(scan, rays, lost)[new]]), kind="stable")]
+    if scan.time is not None and both.time is not None and (np.diff(scan.time) >= 0).all():
+        both = both[np.argsort(both.time, kind="stable")]
+    return Inserted(both, _boxes(there, first))
 
 
 def _points(scan: Scan, there: Placed, new: np.ndarray, first: int) -> Scan:
@@ -246,37 +253,52 @@ def _points(scan: Scan, there: Placed, new: np.ndarray, first: int) -> Scan:
     xyz = to_sensor(sensor, rays.starts[new] + rays.directions[new] * rays.metres[new, None]).astype(np.float32)
     dim = np.asarray(response.dimness or [0.0] * sensor.height, np.float32)[rays.row[new]]
     light = response.reported((rays.reflectance[new] - dim).clip(0, 1)) * bool(scan.reflectance.any())
-    owner = rays.owner[new]
+    owner = rays.owner[new].astype(np.int32)
     extra = {name: np.zeros(len(new), values.dtype) for name, values in scan.extra.items()}
-    extra |= {name: scan.extra[name][source] for name in RINGS if name in scan.extra}
+    extra |= {name: _rings(scan.extra[name], rays, new, source) for name in RINGS if name in scan.extra}
     extra |= {INSTANCE: first + owner, "new": np.ones(len(new), np.uint8), "confidence": np.ones(len(new), np.float32)}
     if "raw_label" in scan.extra:
-        if first + len(put) > MOST_INSTANCES:
-            raise ValueError(f"expected instances below {MOST_INSTANCES} in labels, found {first - 1}")
+        if first + len(put) - 1 > MOST_INSTANCES:
+            raise ValueError(f"expected instances of {MOST_INSTANCES - len(put)} at most in labels, beside which there "
+                             f"are numbers for {len(put)} things, found {first - 1}")  # fmt: skip
         word = np.array([KINDS[thing.kind].raw for thing in put])[owner] | (first + owner) << 16
         extra["raw_label"] = word.astype(scan.extra["raw_label"].dtype)
-    time = None if scan.time is None else _times(scan.time, lost, new, source, count)
-    return Scan(xyz, light.astype(np.float32), _rings(scan, rays, new, source), time, rays.label[new], extra)
+    time = None if scan.time is None else _times(scan.time, scan.xyz, rays.row, lost, new)
+    ring = None if scan.ring is None else _rings(scan.ring, rays, new, source)
+    return Scan(xyz, light.astype(np.float32), ring, time, rays.label[new], extra)
 
 
-def _times(time: np.ndarray, lost: LostRays, new: np.ndarray, source: np.ndarray, count: int) -> np.ndarray:
-    """(n,) when the rays `new` were sent: a lost one between its neighbours, unless the turn begins between these."""
-    own = time[source]
-    of = new[new >= count] - count
-    step = time[lost.after[of]] - time[lost.before[of]]
-    between = np.abs(step) < np.ptp(time) / 2
-    own[new >= count] += np.where(between, lost.share[of] * step, 0).astype(own.dtype)
-    return own
+def _times(time: np.ndarray, xyz: np.ndarray, row: np.ndarray, lost: LostRays, new: np.ndarray) -> np.ndarray:
+    """(n,) when the rays `new` were sent: a lost one between its neighbours, though the turn begins between these."""
+    count, azimuth = len(time), np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    of, late = new[new >= count] - count, (time - time.min()).astype(np.float64)
+    before, after, turn = lost.before[of], lost.after[of], _turn(late, azimuth, row[:count])
+    step = late[after] - late[before]
+    if turn:  # its sign is the way in which the sensor turns
+        gap = (azimuth[after] - azimuth[before]) % (2 * np.pi) / (2 * np.pi)
+        step += turn * np.round((turn * gap - step) / turn)
+    moment = late[before] + lost.share[of] * step
+    moment -= abs(turn) * ((moment > late.max()).astype(int) - (moment < 0))
+    sent = moment.clip(0, late.max()).astype(time.dtype) + time.min()
+    return np.concatenate([time[new[new < count]], sent])
+
+
+def _turn(time: np.ndarray, azimuth: np.ndarray, row: np.ndarray) -> float:
+    """Seconds of a turn to the left by the steps (N,) of the rows' points, negative of one to the right; 0 where these
+    do not tell."""
+    order = np.lexsort((azimuth, row))
+    on = np.diff(azimuth[order])
+    near = (np.diff(row[order]) == 0) & (on > 1e-4) & (on < BESIDE)
+    return 2 * np.pi * float(np.median(np.diff(time[order])[near] / on[near])) if near.any() else 0.0
 
 
 def _fields(scan: Scan, number: np.ndarray) -> dict[str, np.ndarray]:
-    """Further fields of the scan, with `new`, its numbers (N,) of instances, and its confidences where it has any; what
-    it calls so and is something else under another name."""
+    """Further fields of the scan, with its numbers (N,) of instances, `new` and confidences, without which a completion
+    would hold what was inserted for unsure; what it calls so and is something else under another name."""
     marks = marks_of(scan)
     theirs = {"new", "confidence"} - marks.keys() | ({INSTANCE} if _own_numbers(scan) is None else set())
     kept = {f"file_{name}" if name in theirs else name: values for name, values in scan.extra.items()}
-    sure = {"confidence": confidences(scan)} if "confidence" in marks else {}
-    return kept | {INSTANCE: number, "new": were_new(scan)} | sure
+    return kept | {INSTANCE: number, "new": were_new(scan), "confidence": confidences(scan)}
 
 
 def _numbers(scan: Scan) -> np.ndarray:
@@ -301,25 +323,25 @@ def _labels(scan: Scan) -> np.ndarray | None:
 
 
 def _order(scan: Scan, rays: Rays, lost: LostRays) -> np.ndarray:
-    """(R,) where each ray stands among the scan's points: a lost one next to the neighbour that comes first; those of
-    beams of which none returned ring by ring before all others, in the order of the scan's own."""
+    """(R,) where each ray stands among the scan's points: a lost one next to the neighbour that comes first; of scans
+    ring by ring, those of beams of which none returned before all others, in the order of the scan's own."""
     onward = bool(np.median(lost.after - lost.before) > 0) if len(lost.row) else True
-    place = lost.before + lost.share if onward else lost.after + 1 - lost.share
-    above = np.flatnonzero(lost.row != rays.row[lost.before])
-    start = np.arctan2(*scan.xyz[0, [1, 0]]) if len(above) else 0
-    around = (lost.azimuth[above] - start) * (1 if onward else -1) % (2 * np.pi) / (2 * np.pi)
-    place[above] = lost.row[above] - rays.row[lost.before[above]] - 1 + around
+    place, row = lost.before + lost.share if onward else lost.after + 1 - lost.share, rays.row[: len(scan)]
+    above = np.flatnonzero(lost.row != row[lost.before])
+    if len(above) and np.mean(np.diff(row) == 0) > 0.5:
+        start = np.arctan2(*scan.xyz[0, [1, 0]])
+        around = (lost.azimuth[above] - start) * (1 if onward else -1) % (2 * np.pi) / (2 * np.pi)
+        place[above] = lost.row[above] - row[lost.before[above]] - 1 + around
     return np.concatenate([np.arange(len(scan)), place])
 
 
-def _rings(scan: Scan, rays: Rays, new: np.ndarray, source: np.ndarray) -> np.ndarray | None:
-    """(n,) rings of the rays `new`, as the scan numbers them: those of the neighbours `source`, or as many rows off."""
-    if scan.ring is None:
-        return None
-    row = rays.row[: len(scan)]
-    inside = row >= 0
-    ways = [way for way in (1, -1) if len(np.unique((scan.ring - way * row)[inside])) == 1]
-    return scan.ring[source] + (ways[0] if ways else 0) * (rays.row[new] - rays.row[source])
+def _rings(ring: np.ndarray, rays: Rays, new: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """(n,) rings of the rays `new`, numbered as a scan's points are, `ring` (N,): those of the neighbours `source`, or
+    as many rows off."""
+    row = rays.row[: len(ring)]
+    inside, number = row >= 0, ring.astype(np.int64)
+    ways = [way for way in (1, -1) if len(np.unique((number - way * row)[inside])) == 1]
+    return (number[source] + (ways[0] if ways else 0) * (rays.row[new] - rays.row[source])).astype(ring.dtype)
 
 
 def _boxes(there: Placed, first: int) -> tuple[Box, ...]:

@@ -229,19 +229,20 @@ class ScanModel(ABC):
         raise self._lacks("classes")
 
     def insert(
-        self, scan: Points, things: str | Sequence[str], seed: int = 0, sensor: Sensor | str | None = None
+        self, scan: Points | RangeImage, things: str | Sequence[str], seed: int = 0, sensor: Sensor | str | None = None
     ) -> Inserted:
         """The scan with road users more, `scan` and `boxes`: what they hide is gone, what hides them stays.
 
-        scan    points: a scan, or an array or tensor, as of `complete`
+        scan    points: a scan, or an array or tensor, as of `complete`; or an image, whose points are taken
         things  such as "car:2,person@8/-3": kinds, how many, or where: metres ahead, to the left, degrees of the front
         seed    of shapes, and of places where none is named, by the ground that the labels tell, else the model
-        sensor  that made the scan; None = recognised from the points
+        sensor  that made the scan; None = an image's own, else recognised from the points
 
         Points that stay are as they were, new ones have `new`, `instance`, a class; who finds no room is left out.
         Raises ValueError for other words, places that are not free, no room at all, and as `label`.
         """
-        points, asked, rng = noted(self, scan, sensor), wanted(things), np.random.default_rng(checked_seed(seed))
+        points, sensor = made_by(noted(self, scan, sensor), sensor)
+        asked, rng = wanted(things), np.random.default_rng(checked_seed(seed))
         with usual_torch():
             return inserted(self.suited_to(points, sensor), points, asked, rng)
 
