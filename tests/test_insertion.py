@@ -207,7 +207,7 @@ def test_a_place_that_is_not_free_is_refused(model: ScanModel, things: str, expe
 
 def test_who_finds_no_room_is_left_out_and_nobody_is_refused(model: ScanModel):
     scan = flat_scan()
-    near = scan[np.hypot(*scan.xyz.T[:2]) < 9]
+    near = scan[np.hypot(*scan.xyz.T[:2]) < 7]
     found = model.insert(near, "person:100", sensor=FLAT)
     assert 0 < len(found.boxes) < 100
     grass = replace(scan, label=np.full(len(scan), CLASS_NUMBER["terrain"]))

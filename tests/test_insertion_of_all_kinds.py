@@ -120,6 +120,15 @@ def test_images_are_taken_as_their_points(model: ScanModel):
     assert one.boxes == two.boxes
 
 
+def test_nothing_that_is_put_hides_what_was_put_before(model: ScanModel):
+    scan = flat_scan()
+    with pytest.raises(ValueError, match="that leaves the others in sight, found that it hides one 9 m ahead, 0 m to"):
+        model.insert(scan, "person@14/0,truck@9/0/90", sensor=FLAT)
+    for seed in (0, 1):  # without a place they are put elsewhere
+        boxes = model.insert(scan, "person@15/0,person@15/2,bus:3,truck:4", seed=seed, sensor=FLAT).boxes
+        assert [box.kind for box in boxes[:2]] == ["person"] * 2 and all(box.points >= 8 for box in boxes)
+
+
 def boxes_of(file: str) -> tuple[int, list[Box]]:
     """How many points a file of boxes tells of, and its boxes."""
     told: dict[str, Any] = json.loads(Path(file).read_text())

@@ -32,7 +32,8 @@ from lidarsynth.systems.free_places import NEAR, Spot, Surroundings
 
 SIZE = (0.97, 1.03)  # things are so much smaller or larger than the streets'
 OCCLUDED = 0.3  # metres nearer than a thing that hide it
-SHOWN, LEAST = 0.4, 8  # of the rays that would meet a thing where there is room, that nothing hides; returns
+SHOWN, LEAST = 0.4, 8  # of the rays that would meet a thing where there is room, that nothing hides; its returns, and
+# those that it leaves of others that were put
 INSIDE = 5  # measured points that may be in a thing for which somebody names a place: noise
 INSTANCE, MOST_INSTANCES = "instance", (1 << 16) - 1  # field of the numbers of boxes; the most that raw labels hold
 BESIDE = np.radians(10)  # from one point of a ring to the next, if any of these is to tell how the sensor turns
@@ -177,18 +178,37 @@ def _put(
         met = np.isfinite(found.surface) & (found.face >= 0)
         seen = met & (rays.ends[at] >= found.surface - OCCLUDED)
         returned = np.where(found.distance >= sensor.min_range, found.distance, 0) * seen
-        if thing.place is None and (seen.sum() < SHOWN * met.sum() or np.count_nonzero(returned) < LEAST):
+        left = _left(rays, at[seen], number)
+        if thing.place is None and (
+            seen.sum() < SHOWN * met.sum() or np.count_nonzero(returned) < LEAST or (left < LEAST).any()
+        ):
             continue
         if not returned.any():
             break
+        if not left.all():
+            raise ValueError(f"expected a place for {thing.kind} that leaves the others in sight, found that it hides "
+                             f"one {_where(thing.place)}")  # fmt: skip
         _set(rays, at[seen], found, returned[seen], seen, number)
         around.taken.append(around.footprint(spot, mesh))
         return Thing(thing.kind, mesh, spot, at[met])
     if thing.place is not None:
-        x, y = thing.place
-        raise ValueError(f"expected a place for {thing.kind} that the scan's rays reach, found {x:g} m ahead, {y:g} m "
-                         "to the left, of which none returns")  # fmt: skip
+        raise ValueError(f"expected a place for {thing.kind} that the scan's rays reach, found "
+                         f"{_where(thing.place)}, of which none returns")  # fmt: skip
     return None
+
+
+def _left(rays: Rays, at: np.ndarray, number: int) -> np.ndarray:
+    """How many points are left of each thing before `number` of which rays `at` (n,) bring back any, without these."""
+    owner, returns = rays.owner[at], rays.metres[at] > 0
+    gone = np.bincount(owner[(owner >= 0) & returns], minlength=number)
+    if not gone.any():
+        return gone[:0]
+    points = np.bincount(rays.owner[(rays.owner >= 0) & (rays.metres > 0)], minlength=number)
+    return (points - gone)[gone > 0]
+
+
+def _where(place: tuple[float, float] | None) -> str:
+    return "" if place is None else f"{place[0]:g} m ahead, {place[1]:g} m to the left"
 
 
 def _set(rays: Rays, at: np.ndarray, found: Returns, returned: np.ndarray, seen: np.ndarray, number: int) -> None:
@@ -201,7 +221,7 @@ def _named(around: Surroundings, thing: Wanted, mesh: Mesh, rng: np.random.Gener
     assert thing.place is not None
     x, y = thing.place
     yaw = float(rng.uniform(-np.pi, np.pi)) if thing.yaw is None else thing.yaw
-    where = f"{x:g} m ahead, {y:g} m to the left"
+    where = _where(thing.place)
     if (spot := around.spot(x, y, yaw)) is None:
         raise ValueError(f"expected a place for {thing.kind} on ground that the scan shows, found none {where}")
     if around.crowded(spot, mesh):
