@@ -1,4 +1,5 @@
-"""The README's pictures of scans, each in its own sensor: `python front_page.py OUT SCAN SCAN [--without traffic | --insert car:2]`."""
+"""The README's pictures of scans, each in its own sensor:
+`python front_page.py OUT SCAN SCAN [--without traffic | --insert car:2]`."""
 
 import argparse
 from pathlib import Path
