@@ -22,7 +22,7 @@ from lidarsynth.evaluation import evaluate as evaluation
 from lidarsynth.evaluation.features import gated
 from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.pairs import Pairs
-from lidarsynth.evaluation.protocol import Sets
+from lidarsynth.evaluation.protocol import EvaluationProtocol, Sets
 from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING, STREET_1
 from lidarsynth.evaluation.report import Result
 from lidarsynth.evaluation.statistics import Statistics, load_statistics
@@ -375,6 +375,19 @@ def test_a_reference_without_the_protocols_sequences_is_told():
     assert report.values["FRD"] is None and report.values["JSD x1e2"] is not None
 
 
+def test_a_reference_with_some_of_the_protocols_sequences_is_told(tmp_path: Path):
+    """Of LiDARGen's, drive 0002 is for histograms alone; the FRD was with it, without a word."""
+    for drive, told in (
+        (0, ""),
+        (1, "lidargen-2022 v2 compares bird's eye views with the sequences 0000_sync, 0002_sync; the reference has"),
+        (2, "lidargen-2022 v2 compares features with the sequences 0000_sync, 0001_sync; the reference has none, all"),
+        (3, "lidargen-2022 v2 compares with the sequences 0000_sync, 0001_sync, 0002_sync; the reference has none"),
+    ):
+        real = saved(tmp_path / f"2013_05_28_drive_{drive:04d}_sync", REAL[:2])
+        found = [w for w in ls.evaluate(STREETS[:2], real, "lidargen-2022").warnings if "sequences" in w]
+        assert bool(found) == bool(told) and all(warning.startswith(told) for warning in found), found
+
+
 def test_upsampling_compares_images_one_by_one():
     report = ls.evaluate(STREETS[:2], REAL[:2], protocol="r2dm-upsampling-2024")
     errors = [np.abs(a.range - b.range).mean() for a, b in zip(STREETS, REAL[:2], strict=False)]
@@ -653,6 +666,23 @@ def test_a_whole_and_its_parts_do_not_merge(tmp_path: Path, real: Path, run: Run
     other = tmp_path / "other.safetensors"
     evaluation.gather_part(saved(tmp_path / "more", REAL[:3]), "1/1", other)
     assert ls.evaluate([files["1/1"], other], real).counts["samples"] == 9, "two whole sets are one"
+
+
+@pytest.mark.parametrize("protocol", [STREET_1, replace(STREET_1, samples=2, real=0)])
+def test_parts_of_which_some_count_for_no_feature_merge(tmp_path: Path, protocol: EvaluationProtocol):
+    """More machines than images, or all but the first images for the bird's eye view alone, as of LiDARGen: a part
+    without any features was refused, whatever the order, as one of other networks."""
+    wide = SENSORS["hdl-64e-kitti"].resized(width=1024)
+    images = [street(i, wide) for i in range(3)]
+    files = [tmp_path / f"{i}.safetensors" for i in range(5)]
+    for i, file in enumerate(files):
+        evaluation.gather_part(images, f"{i + 1}/5", file, protocol)
+    empty = [load_statistics(file, protocol)[0].count == 0 for file in files]
+    assert empty[0] and True in empty[1:] and False in empty
+    real = [street(i, wide) for i in range(100, 104)]
+    merged, whole = (evaluation.evaluate(samples, real, protocol) for samples in (files[::-1], images))
+    assert merged.values == pytest.approx(whole.values, rel=1e-5) and None not in whole.values.values()
+    assert merged.hashes["samples"] == whole.hashes["samples"] and merged.counts == whole.counts
 
 
 def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, real: Path, run: Run):

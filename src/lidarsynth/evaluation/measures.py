@@ -150,17 +150,27 @@ def _set_distances(samples: Statistics, real: Statistics, on_pair: OnPair) -> Se
 
 
 def _cloud_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    _check_square(samples, real)
     return jensen_shannon_distance(*(_occupancy(side).pooled for side in (samples, real)))
 
 
 def _cloud_tv(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    _check_square(samples, real)
     return total_variation(*(_occupancy(side).pooled for side in (samples, real)))
 
 
 def _cloud_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    _check_square(samples, real)
     counts = _occupancy(real)
     reference, fake = ([scan for scan in _occupancy(side).scans if len(scan)] for side in (real, samples))
     return minimum_matching(reference, fake, cells_along(counts.matching, counts.extent))
+
+
+def _check_square(samples: Statistics, real: Statistics) -> None:
+    """Raises ValueError where a side has no point in the square of the cells."""
+    for side, name in ((samples, "samples"), (real, "reference")):
+        if not _occupancy(side).pooled.any():
+            raise ValueError(f"no point of the {name} lies within +-{_occupancy(side).extent:g} m")
 
 
 def _occupancy(statistics: Statistics) -> Occupancy:

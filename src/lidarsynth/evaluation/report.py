@@ -131,6 +131,10 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
         empty = len(statistics.bev.scans) - len(filled_scans(statistics)) if statistics.bev else 0
         if empty:
             told.append(f"{empty} of the {name} have no point within the bird's eye gate, and no part in the MMD")
+    for statistics, name in ((samples, "samples"), (real, "reference")):
+        cells = statistics.occupancy
+        if cells and (empty := sum(not len(scan) for scan in cells.scans)):
+            told.append(f"{empty} of the {name} have no point within +-{cells.extent:g} m, and no part in the MMD")
     if protocol.measured and real.measured < real.count:
         told.append(f"{real.count - real.measured:,} of the reference hold no measured points (a cache keeps none): x, "
                     "y, z are those of the pixels' rays, in the official program the points' own")  # fmt: skip
