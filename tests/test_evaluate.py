@@ -685,6 +685,29 @@ def test_parts_of_which_some_count_for_no_feature_merge(tmp_path: Path, protocol
     assert merged.hashes["samples"] == whole.hashes["samples"] and merged.counts == whole.counts
 
 
+def test_where_a_part_cannot_be_written_is_told_before_it_is_gathered(tmp_path: Path):
+    """What was gathered of samples, for hours, was lost."""
+    taken, read = tmp_path / "a.safetensors", []
+    taken.mkdir()
+    (tmp_path / "file").touch()
+
+    class Samples:
+        def __len__(self) -> int:
+            return 1
+
+        def __getitem__(self, i: int) -> RangeImage:
+            read.append(i)
+            return STREETS[i]
+
+    with pytest.raises(ValueError, match=r"a.safetensors: expected the name of a file, found a folder"):
+        evaluation.gather_part(Samples(), "1/1", taken)
+    with pytest.raises(OSError, match="file"):
+        evaluation.gather_part(Samples(), "1/1", tmp_path / "file" / "a.safetensors")
+    assert not read
+    evaluation.gather_part(Samples(), "1/1", tmp_path / "new" / "a.safetensors")
+    assert read and (tmp_path / "new" / "a.safetensors").is_file()
+
+
 def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, real: Path, run: Run):
     out, part = tmp_path / "r.json", tmp_path / "part.safetensors"
     for device in ("cuda:99", "tpu-9"):

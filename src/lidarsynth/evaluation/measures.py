@@ -24,6 +24,12 @@ from lidarsynth.metrics.sensor_report import BeamCounts, compare_beams, drop_rat
 from lidarsynth.metrics.sharpness import KINDS
 
 LARGEST_SEED = 2**32 - 1  # of the generator that `_kernel` draws from
+SHARP = {  # kind of returns of which rows of sharpness are, in words
+    "along": "neighbours along a ring",
+    "down": "neighbours from beam to beam",
+    "ground": "on the ground, within 1 m of both beside them on the ring",
+    "walls": "on walls, within 1 m of both beside them on the ring",
+}
 OnPair = Callable[[int, int], object] | None  # (done, in all), for progress bars
 SetDistances = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -90,6 +96,15 @@ def _sharpness(row: Row, samples: Statistics, real: Statistics, seed: int) -> fl
     kind = row.measure.removeprefix("sharp-")
     counts = samples.sharpness.counts[kind], real.sharpness.counts[kind]
     return jensen_shannon_distance(*counts) ** 2 if all(c.any() for c in counts) else math.nan
+
+
+def lacking_returns(row: Row, samples: Statistics, real: Statistics) -> str:
+    """Why a row is not a number: which side has no returns, or none that it is of."""
+    kind = row.measure.removeprefix("sharp-")
+    for side, name in ((samples, "samples"), (real, "reference")):
+        if kind in SHARP and side.sharpness and not side.sharpness.counts[kind].any():
+            return f"no returns of the {name} are {SHARP[kind]}"
+    return "no returns to compare"
 
 
 def _sets_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
-from lidarsynth.evaluation.measures import MEASURES, SHARED, filled_scans, kept_distances
+from lidarsynth.evaluation.measures import MEASURES, SHARED, filled_scans, kept_distances, lacking_returns
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
 from lidarsynth.lidar.beams import same_beams
@@ -83,7 +83,7 @@ def _result(
         except ValueError as error:
             reason = str(error)
         if value is not None and not math.isfinite(value):
-            value, reason = None, "no returns to compare"
+            value, reason = None, lacking_returns(row, samples, real)
     return Result(row.name, value, row.unit, row.digits, reason)
 
 
