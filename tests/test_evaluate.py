@@ -371,6 +371,8 @@ def test_scans_are_drawn_as_the_program_of_the_samples_draws_them(word: str, pro
 def test_a_reference_without_the_protocols_sequences_is_told():
     report = evaluation.evaluate(STREETS, REAL, LIDARGEN)
     assert report.counts["reference"] == 6, "as many as samples"
+    apart = "6 samples against 8 of the reference in bird's eye view: scores of small sets are larger"
+    assert any(warning.startswith(apart) for warning in report.warnings), "MMD and JSD are against all of them"
     assert any("the reference has none, all were taken" in warning for warning in report.warnings)
     assert report.values["FRD"] is None and report.values["JSD x1e2"] is not None
 

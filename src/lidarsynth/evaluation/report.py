@@ -121,6 +121,9 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     if samples.count != real.count:
         told.append(f"{samples.count:,} samples against {real.count:,} of the reference: "
                     "scores of small sets are larger, compare only with the same counts")  # fmt: skip
+    if samples.bev and real.bev and samples.count == real.count and samples.bev.count != real.bev.count:
+        told.append(f"{samples.bev.count:,} samples against {real.bev.count:,} of the reference in bird's eye view: "
+                    "scores of small sets are larger, compare only with the same counts")  # fmt: skip
     for kind in sorted(samples.moments.keys() & real.moments.keys()):
         size = len(samples.moments[kind].mean)
         for statistics, name in ((samples, "samples"), (real, "reference")):
