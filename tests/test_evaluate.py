@@ -777,6 +777,17 @@ def test_more_machines_than_scans_merge(tmp_path: Path, real: Path):
         ls.evaluate([parts[0], *parts], real)
 
 
+def test_parts_of_one_scan_again_and_again_merge(tmp_path: Path):
+    """Of a generator that has collapsed, whose parts are alike, or of noise from one seed: they were refused."""
+    parts = [tmp_path / f"{i}.safetensors" for i in (1, 2)]
+    for i, part in enumerate(parts, 1):
+        evaluation.gather_part([STREETS[0]] * 4, f"{i}/2", part)
+    report, whole = ls.evaluate(parts, REAL), ls.evaluate([STREETS[0]] * 4, REAL)
+    assert report.values == pytest.approx(whole.values, rel=1e-6) and report.hashes == whole.hashes
+    with pytest.raises(ValueError, match="expected a part of its own"):
+        ls.evaluate([parts[0], parts[0]], REAL)
+
+
 def test_a_zero_has_no_sign():
     assert [str(Result("FRD", value, "m")) for value in (-0.0004, 0.0004, -0.0006)] == [
         "0.000 m",
