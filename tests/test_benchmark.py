@@ -645,6 +645,8 @@ GOOD = 'data = "street"\n' + METHODS
         (GOOD + '[[method]]\nname="x"\nmodel="x"\nsteps=[1, 0]\n', r"steps: expected .* at least 1, found \(1, 0\)"),
         (GOOD + '[[method]]\nname="x"\nmodel="x"\nsteps="4"\n', "method 2.steps: expected .*, found '4'"),
         (GOOD.replace("street", "nowhere"), "nowhere: expected a cache, or samples"),
+        ("protocol = []\n" + GOOD, r"b.toml.protocol: expected one or several protocols, each once, found \[\]"),
+        ('protocol = ["iln-2022", "iln-2022"]\n' + GOOD, r"each once, found \['iln-2022', 'iln-2022'\]"),
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_used_are_refused_in_one_line(text: str, message: str, tmp_path: Path):

@@ -365,6 +365,29 @@ def test_a_scan_that_is_gone_from_the_middle_is_named(tmp_path: Path):
         list(write_cache(tmp_path, image, 9, SENSOR, WHAT, lambda i: (".", f"{i + (i > 4)}.pcd")))
 
 
+def test_a_cache_of_scans_of_which_the_last_are_gone_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Of 70 the last ten: the cache had the first 60, and six of those that are gone."""
+    scans(tmp_path, 70)
+    velodyne, folder = tmp_path / "sequences" / "00" / "velodyne", tmp_path / "cache"
+    words = ["data", "files", str(velodyne), str(folder), "--sensor", "hdl-64e-kitti", "--width", "64"]
+    main(words)
+    before, kept = state(folder), tmp_path / "kept"
+    kept.mkdir()
+    for i in range(60, 70):
+        (velodyne / f"{i:06d}.bin").rename(kept / f"{i:06d}.bin")
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert "expected the scan 000064.bin, as in this cache, found none in its place; name another folder" in (
+        capsys.readouterr().err
+    )
+    assert state(folder) == before
+    for path in sorted(kept.iterdir())[:5]:
+        path.rename(velodyne / path.name)
+    main(words)  # 65: the last of a shard are made anew without what is gone
+    images = CachedImages(folder)
+    assert [images.name(i).frame for i in (0, 63, len(images) - 1)] == ["000000.bin", "000063.bin", "000064.bin"]
+
+
 def test_the_command_line_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for words, expected in (
         (["kitti", str(tmp_path)], "expected data kitti ROOT CACHE, found no CACHE"),

@@ -22,7 +22,7 @@ from lidarsynth.evaluation import evaluate as evaluation
 from lidarsynth.evaluation.features import gated
 from lidarsynth.evaluation.image_sets import as_image, image_set
 from lidarsynth.evaluation.pairs import Pairs
-from lidarsynth.evaluation.protocol import Sets
+from lidarsynth.evaluation.protocol import EvaluationProtocol, Sets
 from lidarsynth.evaluation.protocols import BEV_1, DUSTY, LIDARGEN, R2DM, R2DM_UPSAMPLING, STREET_1
 from lidarsynth.evaluation.report import Result
 from lidarsynth.evaluation.statistics import Statistics, load_statistics
@@ -371,8 +371,23 @@ def test_scans_are_drawn_as_the_program_of_the_samples_draws_them(word: str, pro
 def test_a_reference_without_the_protocols_sequences_is_told():
     report = evaluation.evaluate(STREETS, REAL, LIDARGEN)
     assert report.counts["reference"] == 6, "as many as samples"
+    apart = "6 samples against 8 of the reference in bird's eye view: scores of small sets are larger"
+    assert any(warning.startswith(apart) for warning in report.warnings), "MMD and JSD are against all of them"
     assert any("the reference has none, all were taken" in warning for warning in report.warnings)
     assert report.values["FRD"] is None and report.values["JSD x1e2"] is not None
+
+
+def test_a_reference_with_some_of_the_protocols_sequences_is_told(tmp_path: Path):
+    """Of LiDARGen's, drive 0002 is for histograms alone; the FRD was with it, without a word."""
+    for drive, told in (
+        (0, ""),
+        (1, "lidargen-2022 v2 compares bird's eye views with the sequences 0000_sync, 0002_sync; the reference has"),
+        (2, "lidargen-2022 v2 compares features with the sequences 0000_sync, 0001_sync; the reference has none, all"),
+        (3, "lidargen-2022 v2 compares with the sequences 0000_sync, 0001_sync, 0002_sync; the reference has none"),
+    ):
+        real = saved(tmp_path / f"2013_05_28_drive_{drive:04d}_sync", REAL[:2])
+        found = [w for w in ls.evaluate(STREETS[:2], real, "lidargen-2022").warnings if "sequences" in w]
+        assert bool(found) == bool(told) and all(warning.startswith(told) for warning in found), found
 
 
 def test_upsampling_compares_images_one_by_one():
@@ -655,6 +670,46 @@ def test_a_whole_and_its_parts_do_not_merge(tmp_path: Path, real: Path, run: Run
     assert ls.evaluate([files["1/1"], other], real).counts["samples"] == 9, "two whole sets are one"
 
 
+@pytest.mark.parametrize("protocol", [STREET_1, replace(STREET_1, samples=2, real=0)])
+def test_parts_of_which_some_count_for_no_feature_merge(tmp_path: Path, protocol: EvaluationProtocol):
+    """More machines than images, or all but the first images for the bird's eye view alone, as of LiDARGen: a part
+    without any features was refused, whatever the order, as one of other networks."""
+    wide = SENSORS["hdl-64e-kitti"].resized(width=1024)
+    images = [street(i, wide) for i in range(3)]
+    files = [tmp_path / f"{i}.safetensors" for i in range(5)]
+    for i, file in enumerate(files):
+        evaluation.gather_part(images, f"{i + 1}/5", file, protocol)
+    empty = [load_statistics(file, protocol)[0].count == 0 for file in files]
+    assert empty[0] and True in empty[1:] and False in empty
+    real = [street(i, wide) for i in range(100, 104)]
+    merged, whole = (evaluation.evaluate(samples, real, protocol) for samples in (files[::-1], images))
+    assert merged.values == pytest.approx(whole.values, rel=1e-5) and None not in whole.values.values()
+    assert merged.hashes["samples"] == whole.hashes["samples"] and merged.counts == whole.counts
+
+
+def test_where_a_part_cannot_be_written_is_told_before_it_is_gathered(tmp_path: Path):
+    """What was gathered of samples, for hours, was lost."""
+    taken, read = tmp_path / "a.safetensors", []
+    taken.mkdir()
+    (tmp_path / "file").touch()
+
+    class Samples:
+        def __len__(self) -> int:
+            return 1
+
+        def __getitem__(self, i: int) -> RangeImage:
+            read.append(i)
+            return STREETS[i]
+
+    with pytest.raises(ValueError, match=r"a.safetensors: expected the name of a file, found a folder"):
+        evaluation.gather_part(Samples(), "1/1", taken)
+    with pytest.raises(OSError, match="file"):
+        evaluation.gather_part(Samples(), "1/1", tmp_path / "file" / "a.safetensors")
+    assert not read
+    evaluation.gather_part(Samples(), "1/1", tmp_path / "new" / "a.safetensors")
+    assert read and (tmp_path / "new" / "a.safetensors").is_file()
+
+
 def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, real: Path, run: Run):
     out, part = tmp_path / "r.json", tmp_path / "part.safetensors"
     for device in ("cuda:99", "tpu-9"):
@@ -662,6 +717,8 @@ def test_devices_numbers_and_sensors_that_cannot_be_are_refused(tmp_path: Path, 
             ls.evaluate(STREETS, REAL, "street-1", device=device)
         code, _, error = run("evaluate", real, "--reference", real, "--out", out, "--device", device)
         assert code == 2 and error.count("\n") == 1 and "expected a device" in error
+    with pytest.raises(ValueError, match="expected an intensity of auto, unit, byte, uint16, none, found 'bytes'"):
+        ls.evaluate(STREETS, REAL, intensity="bytes")
     with pytest.raises(ValueError, match="expected a batch_size of at least 1, found 0"):
         ls.evaluate(STREETS, REAL, batch_size=0)
     with pytest.raises(ValueError, match="expected a seed of at least 0, found -1"):
@@ -718,6 +775,17 @@ def test_more_machines_than_scans_merge(tmp_path: Path, real: Path):
     assert report.values == pytest.approx(ls.evaluate(STREETS, real).values, rel=1e-6)
     with pytest.raises(ValueError, match="expected a part of its own"):
         ls.evaluate([parts[0], *parts], real)
+
+
+def test_parts_of_one_scan_again_and_again_merge(tmp_path: Path):
+    """Of a generator that has collapsed, whose parts are alike, or of noise from one seed: they were refused."""
+    parts = [tmp_path / f"{i}.safetensors" for i in (1, 2)]
+    for i, part in enumerate(parts, 1):
+        evaluation.gather_part([STREETS[0]] * 4, f"{i}/2", part)
+    report, whole = ls.evaluate(parts, REAL), ls.evaluate([STREETS[0]] * 4, REAL)
+    assert report.values == pytest.approx(whole.values, rel=1e-6) and report.hashes == whole.hashes
+    with pytest.raises(ValueError, match="expected a part of its own"):
+        ls.evaluate([parts[0], parts[0]], REAL)
 
 
 def test_a_zero_has_no_sign():

@@ -342,6 +342,7 @@ def test_a_perfect_reconstruction_has_no_distance(tmp_path: Path):
         np.concatenate([xyz, np.zeros((len(xyz), 1), np.float32)], 1).tofile(samples / path.name)
     report = evaluate.evaluate(samples, real, "lidm-reconstruction-2024")
     assert report.values["CD"] == pytest.approx(0, abs=1e-9)
+    assert report.values["EMD"] is None and "auction" in str(report), "why it is not there was not told"
 
 
 def test_scans_without_points_in_range_are_named(tmp_path: Path, published: Path):
@@ -350,6 +351,26 @@ def test_scans_without_points_in_range_are_named(tmp_path: Path, published: Path
     np.full((10, 4), 200, np.float32).tofile(far / "000009.bin")
     with pytest.raises(ValueError, match=r"000009.bin: expected points between 1 and 56 m, found none of 10"):
         evaluate.evaluate(far, real, "lidm-2024")
+
+
+def test_scans_without_points_in_the_square_are_told(tmp_path: Path):
+    """In range and outside +-50 m: they had no part in the MMD without a word, and where all were so, the JSD had a
+    reason of arrays."""
+    real, far = folder_of_scans(tmp_path / "real", 2, 0), tmp_path / "far"
+    far.mkdir()
+    np.tile(np.array([52, 0.5, -1, 0.5], np.float32), (10, 1)).tofile(far / "000000.bin")
+    report = evaluate.evaluate(far, real, "r3dpa-2026")
+    assert [report.values[name] for name in ("JSD x1e2", "MMD x1e5", "TV")] == [None] * 3
+    assert {r.reason for r in report.results if r.name in ("JSD x1e2", "MMD x1e5", "TV")} == {
+        "no point of the samples lies within +-50 m"
+    }
+    folder = folder_of_scans(tmp_path / "both", 1, 0)
+    alone = evaluate.evaluate(folder, real, "lidm-2024")
+    (folder / "000009.bin").write_bytes((far / "000000.bin").read_bytes())
+    both = evaluate.evaluate(folder, real, "lidm-2024")
+    told = "1 of the samples have no point within +-50 m, and no part in the MMD"
+    assert told in both.warnings and told not in alone.warnings
+    assert both.values["MMD x1e4"] == alone.values["MMD x1e4"] is not None
 
 
 def test_quantisation_keeps_the_first_point_of_a_voxel_and_refuses_nothing_at_all():

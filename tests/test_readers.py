@@ -174,6 +174,36 @@ def test_nuscenes_says_which_tables_it_wants(tmp_path: Path):
         nuscenes(tmp_path, "test")
 
 
+@pytest.mark.parametrize(
+    ("table", "change", "told"),
+    [
+        ("sample_data", {"filename": None}, "expected rows with filename of type str, found None"),
+        ("sample_data", {"filename": 5}, "expected rows with filename of type str, found 5"),
+        ("sample_data", {"is_key_frame": "no"}, "expected rows with is_key_frame of type bool, found 'no'"),
+        ("sample_data", {"timestamp": "soon"}, "expected rows with timestamp of type int, found 'soon'"),
+        ("sample_data", {"sample_token": "gone"}, "expected tokens of sample.json, found 'gone', which it lacks"),
+        ("sample", {"scene_token": "gone"}, "expected tokens of scene.json, found 'gone', which it lacks"),
+        ("calibrated_sensor", {"sensor_token": "gone"}, "expected tokens of sensor.json, found 'gone', which it lacks"),
+        ("scene", {"name": []}, r"expected rows with name of type str, found \[\]"),
+        ("category", {"index": 300}, "expected an index of 0 to 255, found 300"),
+        ("lidarseg", {"sample_data_token": {}}, "expected rows with sample_data_token of type str, found {}"),
+    ],
+)
+def test_tables_of_other_rows_are_refused_in_one_line(table: str, change: dict, told: str, tmp_path: Path):
+    """They ended with errors of Python."""
+    nuscenes_tree(tmp_path)
+    path = tmp_path / "v1.0-mini" / f"{table}.json"
+    content = [row | change for row in json.loads(path.read_text())]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rf"{table}.json: {told}") as error:
+        nuscenes(tmp_path)
+    assert "\n" not in str(error.value)
+    lacking = next(iter(change))
+    path.write_text(json.dumps([{key: value for key, value in row.items() if key != lacking} for row in content]))
+    with pytest.raises(ValueError, match=rf"{table}.json: expected rows with {lacking} of type \w+, found none"):
+        nuscenes(tmp_path)
+
+
 def test_tables_are_read_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     table = [{"token": f"é{i}", "nested": {"a": [1, {"b": "]},{"}]}} for i in range(50)]
     path = tmp_path / "table.json"

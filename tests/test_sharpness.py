@@ -9,7 +9,7 @@ import pytest
 from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.evaluation.measures import MEASURES
 from lidarsynth.evaluation.protocols import STREET_2
-from lidarsynth.evaluation.report import warnings_of
+from lidarsynth.evaluation.report import results_of, warnings_of
 from lidarsynth.evaluation.statistics import Statistics, load_statistics, save_statistics
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
@@ -106,3 +106,15 @@ def test_equal_sides_are_zero_apart(kind: str):
     side.update([street(0.05)], [True], [True])
     row = next(row for row in STREET_2.rows if row.measure == f"sharp-{kind}")
     assert MEASURES[row.measure](row, side, side, 0) == pytest.approx(0, abs=1e-9)
+
+
+def test_why_a_kind_of_returns_is_not_compared_is_told():
+    """It was `no returns to compare`, of scans full of returns."""
+    flat, wall = street(), street()
+    sides = [Statistics(PROTOCOL, SENSOR, role) for role in ("samples", "real")]
+    sides[0].update([flat.keep(flat.points()[..., 2] < -1.7)], [True], [True])
+    sides[1].update([wall], [True], [True])
+    found = {r.name: (r.value, r.reason) for r in results_of(*sides)}
+    told = "no returns of the samples are on walls, within 1 m of both beside them on the ring"
+    assert found["thickness of walls x1e3"] == (None, told)
+    assert found["thickness of the ground x1e3"][0] is not None and found["steps along a ring x1e3"][0] is not None

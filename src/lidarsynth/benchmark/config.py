@@ -116,6 +116,9 @@ def read_config(
     methods = tuple(from_dict(table, f"{path}: method {i}", method) for i, table in enumerate(tables, 1))
     config = replace(from_dict(values, str(path), record), method=methods)
     _check_numbers(config, str(path))
+    words = protocols_of(config)
+    if not words or len(set(words)) < len(words):
+        raise ValueError(f"{path}.protocol: expected one or several protocols, each once, found {list(words)}")
     if isinstance(config, Generation) and config.seed > LARGEST_SEED:  # `evaluate` takes it, too
         raise ValueError(f"{path}.seed: expected at most {LARGEST_SEED}, found {config.seed}")
     for item in methods:

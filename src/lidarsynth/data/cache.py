@@ -91,6 +91,7 @@ def _write(
 ) -> Iterator[int]:
     index = open_index(folder, sensor, source, count, range_step(sensor))
     task = _Task(folder, image, name, count, stored_step(index), stamp, (sensor.height, sensor.width))
+    _refuse_gone(index, task)
     firsts = range(0, count, SHARD)
     for first in firsts if index.pop(MOVED, False) else ():  # a copy has other times
         if (entry := index["shards"].get(_shard(first))) and entry.get("files", [None])[0] == task.files(first)[0]:
@@ -191,6 +192,16 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
     if not path.is_file() or path.stat().st_size != size:
         return False
     return not check or sha256(path) == entry["sha256"]
+
+
+def _refuse_gone(index: dict[str, Any], task: _Task) -> None:
+    """Raises ValueError where whole shards are of files that are gone: the last of the others may be made anew, fewer,
+    so that the cache would have neither all scans nor those that are there."""
+    later = range(-(-task.count // SHARD) * SHARD, index["count"], SHARD) if task.stamp is not None else ()
+    entries = [entry for first in later if (entry := index["shards"].get(_shard(first)))]
+    if frames := [frame for entry in entries for frame in entry.get("frames", [])]:
+        raise ValueError(f"{task.folder}: expected the scan {_path(frames[0])}, as in this cache, found none in its "
+                         "place; name another folder")  # fmt: skip
 
 
 def _path(frame: Sequence[str] | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,19 @@ from lidarsynth.lidar.scan import Scan
 SPLITS = ("all", "mini", "trainval", "test")  # the versions of the tables; all = the only one there is
 CHUNK = 1 << 20  # characters of a table at once
 _BETWEEN = re.compile(r"[\s,]*")
+
+TABLES: dict[str, dict[str, type]] = {  # what is read of the rows of each
+    "scene": {"token": str, "name": str},
+    "sample": {"token": str, "scene_token": str},
+    "sensor": {"token": str, "channel": str},
+    "calibrated_sensor": {"token": str, "sensor_token": str},
+    "sample_data": {
+        "token": str, "sample_token": str, "calibrated_sensor_token": str, "filename": str, "timestamp": int,
+        "is_key_frame": bool,
+    },
+    "category": {"index": int, "name": str},
+    "lidarseg": {"sample_data_token": str, "filename": str},
+}  # fmt: skip
 
 # lidarseg category -> SemanticKITTI training class; what has no counterpart is 0.
 CLASS_OF_CATEGORY: dict[str, int] = {
@@ -76,22 +89,31 @@ def nuscenes(root: str | Path, split: str = "all", sweeps: bool = False) -> NuSc
     root = Path(root)
     tables = _tables(root, split)
     scenes = {row["token"]: row["name"] for row in rows(tables / "scene.json")}
-    scene_of = {row["token"]: scenes[row["scene_token"]] for row in rows(tables / "sample.json")}
+    sample, sensor = tables / "sample.json", tables / "calibrated_sensor.json"
+    scene_of = {row["token"]: _of(scenes, row, "scene", sample) for row in rows(sample)}
     kinds = {row["token"]: row["channel"] for row in rows(tables / "sensor.json")}
-    tops = {r["token"] for r in rows(tables / "calibrated_sensor.json") if kinds[r["sensor_token"]] == "LIDAR_TOP"}
+    tops = {row["token"] for row in rows(sensor) if _of(kinds, row, "sensor", sensor) == "LIDAR_TOP"}
     labels, classes = _lidarseg(root, tables)
     found = []
     for row in rows(tables / "sample_data.json"):
         if row["calibrated_sensor_token"] in tops and (sweeps or row["is_key_frame"]):
             path = root / row["filename"]
             if path.is_file():
-                scene = scene_of[row["sample_token"]]
+                scene = _of(scene_of, row, "sample", tables / "sample_data.json")
                 found.append(Frame(str(path), scene, str(row["timestamp"]), labels.get(row["token"])))
     if not found:
         raise ValueError(f"{root}: expected files of LIDAR_TOP as listed in {tables.name}, found none")
     found.sort(key=lambda frame: (frame.sequence, int(frame.frame)))
     missing = tuple(sorted(set(scenes.values()) - {frame.sequence for frame in found}))
     return NuScenes(found, classes, missing)
+
+
+def _of(named: Mapping[str, str], row: Mapping[str, Any], table: str, path: Path) -> str:
+    """What a row's token of another table stands for. Raises ValueError, naming the file, where that has no such."""
+    token = row[f"{table}_token"]
+    if token not in named:
+        raise ValueError(f"{path}: expected tokens of {table}.json, found {token!r:.60}, which it lacks")
+    return named[token]
 
 
 def _tables(root: Path, split: str) -> Path:
@@ -110,6 +132,8 @@ def _lidarseg(root: Path, tables: Path) -> tuple[dict[str, str], np.ndarray]:
     if not (tables / "lidarseg.json").is_file():
         return {}, classes
     for row in rows(tables / "category.json"):
+        if not 0 <= row["index"] < len(classes):
+            raise ValueError(f"{tables / 'category.json'}: expected an index of 0 to 255, found {row['index']}")
         classes[row["index"]] = CLASS_OF_CATEGORY.get(row["name"], 0)
     return {row["sample_data_token"]: str(root / row["filename"]) for row in rows(tables / "lidarseg.json")}, classes
 
@@ -138,6 +162,15 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
                 else:
                     if not isinstance(row, dict):
                         raise ValueError(f"{path}: expected JSON objects, found {row!r:.40}")
+                    _check(row, path)
                     yield row
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: expected a table of nuScenes, found: {error}") from None
+
+
+def _check(row: Mapping[str, Any], path: Path) -> None:
+    """Raises ValueError, naming the file, unless a row has the fields of its table, of their types."""
+    for name, kind in TABLES.get(path.stem, {}).items():
+        if type(row.get(name)) is not kind:
+            found = repr(row[name]) if name in row else "none"
+            raise ValueError(f"{path}: expected rows with {name} of type {kind.__name__}, found {found:.60}")

@@ -176,13 +176,15 @@ def _spread(protocol: EvaluationProtocol, numbers: range) -> frozenset[int]:
 
 
 def unlike_names(protocol: EvaluationProtocol, names: Sequence[str]) -> tuple[str, ...]:
-    """Warnings where the protocol takes some sequences of the reference only, and none of the names is theirs."""
-    wanted = sorted({*protocol.sequences, *protocol.sequences_bev})
-    if not wanted or any(part in name for name in names for part in wanted):
+    """A warning where the protocol takes some sequences of the reference only, and none of the names is theirs; of the
+    features alone, or of the bird's eye views, where these are of other sequences, which are there."""
+    both = (("features ", protocol.sequences), ("bird's eye views ", protocol.sequences_bev))
+    lacking = [(what, own) for what, own in both if own and not any(part in name for name in names for part in own)]
+    if not lacking:
         return ()
-    return (
-        f"{protocol.title} compares with the sequences {', '.join(wanted)}; the reference has none, all were taken",
-    )
+    what, wanted = lacking[0][0] if len(lacking) == 1 else "", sorted({part for _, own in lacking for part in own})
+    sequences = ", ".join(wanted)
+    return (f"{protocol.title} compares {what}with the sequences {sequences}; the reference has none, all were taken",)
 
 
 def gather(

@@ -312,6 +312,7 @@ def gather_part(
     if out.suffix != ENDING or record.pairs:
         raise ValueError(f"{out}: expected a name that ends in {ENDING} and a protocol of sets, "
                          f"found {out.name[-20:]!r} and {record.name}")  # fmt: skip
+    _check_place(out)  # not after hours
     if files := statistics_files(samples):
         statistics, lacking = merged(files, record)
         if lacking or part != "1/1":
@@ -355,6 +356,13 @@ def check_out(out: Path) -> None:
     page = out.with_suffix(".md")
     if page.exists() and (not page.is_file() or DEFINITIONS not in page.read_text(encoding="utf-8", errors="replace")):
         raise ValueError(f"{out}: expected a name beside whose .md nothing is lost, found {page}, which is no report")
+    _check_place(out)
+
+
+def _check_place(out: Path) -> None:
+    """Raises ValueError unless a file can be put there, whose folder is made, and OSError where that cannot be."""
+    if out.is_dir():
+        raise ValueError(f"{out}: expected the name of a file, found a folder")
     out.parent.mkdir(parents=True, exist_ok=True)
     if not os.access(out.parent, os.W_OK | os.X_OK):
         raise ValueError(f"{out}: expected a folder that may be written to, found none of that right at {out.parent}")

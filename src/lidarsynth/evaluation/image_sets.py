@@ -20,7 +20,7 @@ from lidarsynth.data.folder import check_readable, scans_below
 from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor, within
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
-from lidarsynth.files.fields import MAX_BYTES
+from lidarsynth.files.fields import INTENSITIES, MAX_BYTES
 from lidarsynth.files.formats import READERS, holds_image, naming, no_file, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.depth import OVERSHOOT
@@ -127,6 +127,8 @@ def image_set(source: str | Path | Numbered, intensity: str = "auto") -> ImageSe
 
     intensity  scale of files of points, as in `files.formats.read`
     """
+    if intensity not in INTENSITIES:  # said of images, too, which have no use for it
+        raise ValueError(f"expected an intensity of {', '.join(INTENSITIES)}, found {intensity!r:.60}")
     if not isinstance(source, str | Path):
         names = tuple(f"image {i}" for i in range(len(source)))
         if not names:

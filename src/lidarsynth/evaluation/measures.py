@@ -24,6 +24,12 @@ from lidarsynth.metrics.sensor_report import BeamCounts, compare_beams, drop_rat
 from lidarsynth.metrics.sharpness import KINDS
 
 LARGEST_SEED = 2**32 - 1  # of the generator that `_kernel` draws from
+SHARP = {  # kind of returns of which rows of sharpness are, in words
+    "along": "neighbours along a ring",
+    "down": "neighbours from beam to beam",
+    "ground": "on the ground, within 1 m of both beside them on the ring",
+    "walls": "on walls, within 1 m of both beside them on the ring",
+}
 OnPair = Callable[[int, int], object] | None  # (done, in all), for progress bars
 SetDistances = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -92,6 +98,15 @@ def _sharpness(row: Row, samples: Statistics, real: Statistics, seed: int) -> fl
     return jensen_shannon_distance(*counts) ** 2 if all(c.any() for c in counts) else math.nan
 
 
+def lacking_returns(row: Row, samples: Statistics, real: Statistics) -> str:
+    """Why a row is not a number: which side has no returns, or none that it is of."""
+    kind = row.measure.removeprefix("sharp-")
+    for side, name in ((samples, "samples"), (real, "reference")):
+        if kind in SHARP and side.sharpness and not side.sharpness.counts[kind].any():
+            return f"no returns of the {name} are {SHARP[kind]}"
+    return "no returns to compare"
+
+
 def _sets_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
     counts = [sphere_counts(side.sets() / 2, _sets(side).bins) for side in (samples, real)]
     return jensen_shannon_distance(*counts) ** 2 / math.log(2)
@@ -150,17 +165,27 @@ def _set_distances(samples: Statistics, real: Statistics, on_pair: OnPair) -> Se
 
 
 def _cloud_jsd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    _check_square(samples, real)
     return jensen_shannon_distance(*(_occupancy(side).pooled for side in (samples, real)))
 
 
 def _cloud_tv(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    _check_square(samples, real)
     return total_variation(*(_occupancy(side).pooled for side in (samples, real)))
 
 
 def _cloud_mmd(row: Row, samples: Statistics, real: Statistics, seed: int) -> float:
+    _check_square(samples, real)
     counts = _occupancy(real)
     reference, fake = ([scan for scan in _occupancy(side).scans if len(scan)] for side in (real, samples))
     return minimum_matching(reference, fake, cells_along(counts.matching, counts.extent))
+
+
+def _check_square(samples: Statistics, real: Statistics) -> None:
+    """Raises ValueError where a side has no point in the square of the cells."""
+    for side, name in ((samples, "samples"), (real, "reference")):
+        if not _occupancy(side).pooled.any():
+            raise ValueError(f"no point of the {name} lies within +-{_occupancy(side).extent:g} m")
 
 
 def _occupancy(statistics: Statistics) -> Occupancy:

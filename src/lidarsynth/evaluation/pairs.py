@@ -164,6 +164,7 @@ class Pairs:
                 reason = f"the {lacking[0]} no reflectance" if lacking else ""
             value = None if reason else MEASURES[row.measure](mean, self.confusion, each) * row.scale
             results.append(Result(row.name, value, row.unit, row.digits, reason))
+        results += [Result(name, None, reason=reason) for name, reason in self.protocol.absent]
         counts = {"samples": self.count, "reference": self.count}
         names = ("samples", "reference")
         hashes = {name: f"{digest:032x}" for name, digest in zip(names, self._digests, strict=True)}

@@ -32,15 +32,15 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
     Parts come in the order of their numbers, however the files are named and given: which features the subsets of the
     squared MMD draw depends on their order. Wholes, which have none, stay as they are given.
 
-    Raises ValueError where two hold the same images, or may: parts of different divisions.
+    Raises ValueError where two hold the same images, or may: parts of different divisions. Those of one division that
+    are alike, as of a generator that makes one scan again and again, are each their own.
     """
     loaded = [load_statistics(file, protocol) for file in files]
     parts = [tuple(map(int, metadata.get("part", "1/1").split("/"))) for _, metadata in loaded]
-    digests = [statistics.digest for statistics, _ in loaded]
+    held = [(part, statistics.digest) for part, (statistics, _) in zip(parts, loaded, strict=True)]
     shared = [part for part in parts if part[1] > 1]
     for i, file in enumerate(files):
-        again = int(digests[i], 16) and digests[i] in digests[:i]  # parts without an image are alike
-        if again or (parts[i] in shared and parts[i] in parts[:i]):
+        if held[i] in held[:i] or (parts[i] in shared and parts[i] in parts[:i]):
             raise ValueError(f"{file}: expected a part of its own, found the images of another part")
     if len({n for _, n in parts}) > 1:  # a whole beside parts, too: the images of these may be in it
         raise ValueError(f"expected parts of one division, found {', '.join(f'{i}/{n}' for i, n in parts)}")

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
-from lidarsynth.evaluation.measures import MEASURES, SHARED, filled_scans, kept_distances
+from lidarsynth.evaluation.measures import MEASURES, SHARED, filled_scans, kept_distances, lacking_returns
 from lidarsynth.evaluation.protocol import EvaluationProtocol, Row
 from lidarsynth.evaluation.statistics import Statistics, definition
 from lidarsynth.lidar.beams import same_beams
@@ -83,7 +83,7 @@ def _result(
         except ValueError as error:
             reason = str(error)
         if value is not None and not math.isfinite(value):
-            value, reason = None, "no returns to compare"
+            value, reason = None, lacking_returns(row, samples, real)
     return Result(row.name, value, row.unit, row.digits, reason)
 
 
@@ -121,6 +121,9 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
     if samples.count != real.count:
         told.append(f"{samples.count:,} samples against {real.count:,} of the reference: "
                     "scores of small sets are larger, compare only with the same counts")  # fmt: skip
+    if samples.bev and real.bev and samples.count == real.count and samples.bev.count != real.bev.count:
+        told.append(f"{samples.bev.count:,} samples against {real.bev.count:,} of the reference in bird's eye view: "
+                    "scores of small sets are larger, compare only with the same counts")  # fmt: skip
     for kind in sorted(samples.moments.keys() & real.moments.keys()):
         size = len(samples.moments[kind].mean)
         for statistics, name in ((samples, "samples"), (real, "reference")):
@@ -131,6 +134,10 @@ def warnings_of(samples: Statistics, real: Statistics, results: Sequence[Result]
         empty = len(statistics.bev.scans) - len(filled_scans(statistics)) if statistics.bev else 0
         if empty:
             told.append(f"{empty} of the {name} have no point within the bird's eye gate, and no part in the MMD")
+    for statistics, name in ((samples, "samples"), (real, "reference")):
+        cells = statistics.occupancy
+        if cells and (empty := sum(not len(scan) for scan in cells.scans)):
+            told.append(f"{empty} of the {name} have no point within +-{cells.extent:g} m, and no part in the MMD")
     if protocol.measured and real.measured < real.count:
         told.append(f"{real.count - real.measured:,} of the reference hold no measured points (a cache keeps none): x, "
                     "y, z are those of the pixels' rays, in the official program the points' own")  # fmt: skip

@@ -191,7 +191,8 @@ class Statistics:
     @usual_torch()
     def merge(self, other: Statistics) -> None:
         """Take in all that `other` has seen. Raises ValueError for another protocol, sensor, role or weights."""
-        own, its = ((s.protocol, s.sensor, s.role, s.weights, set(s.moments)) for s in (self, other))
+        both = self.count and other.count  # a part whose images are none of the features' has seen no network
+        own, its = ((s.protocol, s.sensor, s.role, s.weights, set(s.moments) if both else 0) for s in (self, other))
         if own != its:
             wrong = next(i for i, (a, b) in enumerate(zip(own, its, strict=True)) if a != b)
             name = ("protocol", "sensor", "role", "weights", "networks")[wrong]
@@ -203,8 +204,8 @@ class Statistics:
         self.others += other.others
         self._digest = (self._digest + other._digest) % (1 << 128)
         for kind, moments in other.moments.items():
-            self.moments[kind].merge(moments)
-            free = self.protocol.keep - sum(map(len, self._kept[kind]))
+            self.moments.setdefault(kind, Moments(len(moments.mean), moments.mean.device)).merge(moments)
+            free = self.protocol.keep - sum(map(len, self._kept.setdefault(kind, [])))
             self._kept[kind].append(other.features(kind)[: max(free, 0)])
         self._sets += other._sets
         if self.occupancy and other.occupancy:
