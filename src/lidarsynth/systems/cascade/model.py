@@ -51,7 +51,7 @@ from lidarsynth.systems.cascade.images import (
 )
 from lidarsynth.systems.cascade.known import known_of, rays_told, standing, unanswered
 from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, one_thread, sampling, times, told_of
-from lidarsynth.systems.cascade.naming import GROWING, RARER, named, sketched
+from lidarsynth.systems.cascade.naming import GROWING, RARER, RIDERS, named, sketched
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast, unnamed
 from lidarsynth.systems.cascade.request import calls, resolved
@@ -301,9 +301,9 @@ class CascadeModel(AnySensorModel):
         if not self.labelled:
             return [unnamed(image) for image in images]
         assert self.network.classes is not None
-        inside = self.network.inside if recorded and not self.experiment.model.own_classes else None
-        told = self.network.classes, images, self.response, self.sensor, self.precision, least
-        return named(*told, more=None if recorded else RARER, inside=inside)
+        own, told = self.experiment.model.own_classes, (self.network.classes, images, self.response, self.sensor)
+        inside, more = (self.network.inside, RIDERS) if recorded and not own else (None, None if recorded else RARER)
+        return named(*told, self.precision, least, more, inside=inside)
 
     def _between(
         self,
