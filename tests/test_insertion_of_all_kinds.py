@@ -194,6 +194,6 @@ def test_bicyclists_are_named_so_by_a_network_of_streets_alone(monkeypatch: pyte
     found = ls.load("default").insert(SyntheticStreets(991, 64, "os1-64", TRAFFIC)[3], "bicyclist:3", seed=3).scan
     new = found.extra["new"] > 0
     named = ls.load("default").label(found).label
-    assert (named[new] == CLASS_NUMBER["bicyclist"]).mean() > 0.5  # 0.14 of 2,054 points before
+    assert (named[new] == CLASS_NUMBER["bicyclist"]).mean() > 0.5  # hardly any without a logit more
     ls.load("kitti").label(SyntheticStreets(991, 64, "hdl-64e-kitti")[3])
     assert asked == [{"bicyclist": 1.0}, None], "scans that one has learned from tell for themselves"
