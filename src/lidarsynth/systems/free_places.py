@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarsynth.lidar.removal import GROUND
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.streets.actors import MARGIN
 from lidarsynth.streets.apart import CARRIER, footprints, meet
 from lidarsynth.streets.shapes import Mesh
-
-GROUND = ("road", "parking", "sidewalk", "other-ground", "terrain")
 
 
 class Room(NamedTuple):

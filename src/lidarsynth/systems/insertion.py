@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from lidarsynth.files.labels import MOST_INSTANCES
 from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.columns import usual_at_most
 from lidarsynth.lidar.lost_rays import LostRays, lost_rays
@@ -18,7 +19,7 @@ from lidarsynth.lidar.removal import own_classes
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.streets.actors import KINDS, MARGIN
+from lidarsynth.streets.actors import KINDS
 from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
 from lidarsynth.streets.lone import alone
 from lidarsynth.streets.objects import library
@@ -26,16 +27,24 @@ from lidarsynth.streets.raycast import FewTriangles
 from lidarsynth.streets.sensor_model import Returns, sense
 from lidarsynth.streets.shapes import Mesh
 from lidarsynth.streets.wanted import Wanted
-from lidarsynth.systems.cascade.canvas import TINT, axis_of, canvas_of, levelled, span, to_sensor
+from lidarsynth.systems.cascade.canvas import (
+    OCCLUDED,
+    SIZE,
+    TINT,
+    axis_of,
+    box_around,
+    canvas_of,
+    levelled,
+    span,
+    to_sensor,
+)
 from lidarsynth.systems.cascade.response import Response, response_of
 from lidarsynth.systems.free_places import NEAR, Spot, Surroundings
 
-SIZE = (0.97, 1.03)  # things are so much smaller or larger than the streets'
-OCCLUDED = 0.3  # metres nearer than a thing that hide it
 SHOWN, LEAST = 0.4, 8  # of the rays that would meet a thing where there is room, that nothing hides; its returns, and
 # those that it leaves of others that were put
 INSIDE = 5  # measured points that may be in a thing for which somebody names a place: noise
-INSTANCE, MOST_INSTANCES = "instance", (1 << 16) - 1  # field of the numbers of boxes; the most that raw labels hold
+INSTANCE = "instance"  # field of the numbers of boxes
 BESIDE = np.radians(10)  # from one point of a ring to the next, if any of these is to tell how the sensor turns
 RINGS = ("ring", "file_ring")  # further fields that tell of a ray, whatever it meets
 
@@ -122,8 +131,8 @@ def placed(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Ge
         assert named is not None and named.label is not None
         own = named.label if own is None else np.where(own > 0, own, named.label)
     image = check_seen(project(replace(scan, label=own.astype(np.int64)), sensor), len(scan))
-    lost = lost_rays(scan, model.sensor, pixel_of_points(scan, model.sensor, "auto")[0])
-    rays, lost = _rays(scan, model.sensor, lost)
+    row, _ = pixel_of_points(scan, model.sensor, "auto")
+    rays, lost = _rays(scan, model.sensor, row, lost_rays(scan, model.sensor, row))
     around = Surroundings(levelled(sensor, scan.xyz), own, axis_of(canvas_of(image)))
     put: list[Thing] = []
     for thing in things:
@@ -135,12 +144,12 @@ def placed(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Ge
     return Placed(rays, lost, put, model.sensor, response_of(image, image.mask))
 
 
-def _rays(scan: Scan, sensor: Sensor, lost: LostRays) -> tuple[Rays, LostRays]:
-    """The rays of a scan, and the lost ones that nothing on the carrier blocks."""
+def _rays(scan: Scan, sensor: Sensor, row: np.ndarray, lost: LostRays) -> tuple[Rays, LostRays]:
+    """The rays of a scan, row (N,) of each point, and the lost ones that nothing on the carrier blocks."""
     column = ((np.pi - lost.azimuth) / (2 * np.pi) * sensor.width).astype(int) % sensor.width
     free = ~hidden(sensor)[lost.row, column]
     lost = LostRays(*(part[free] for part in lost))
-    row = np.concatenate([pixel_of_points(scan, sensor, "auto")[0], lost.row])
+    row = np.concatenate([row, lost.row])
     offset = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
     starts = np.zeros((len(row), 3), np.float32)
     starts[:, 2] = np.where(row < 0, 0, offset[row])
@@ -366,24 +375,11 @@ def _rings(ring: np.ndarray, rays: Rays, new: np.ndarray, source: np.ndarray) ->
 
 def _boxes(there: Placed, first: int) -> tuple[Box, ...]:
     """Boxes of all things that any point is of, numbered from the first on."""
-    rays, put, sensor = there.rays, there.put, there.sensor
-    points = np.bincount(rays.owner[(rays.owner >= 0) & (rays.metres > 0)], minlength=len(put))
-    boxes = [_box(thing, sensor, first + k, int(points[k]), rays.owner[thing.met] == k) for k, thing in enumerate(put)]
-    return tuple(box for box in boxes if box.points)
-
-
-def _box(thing: Thing, sensor: Sensor, number: int, points: int, shown: np.ndarray) -> Box:
-    """The box around a thing; `shown` (m,) bool, of the rays that would meet it, which do."""
-    corners = thing.mesh.corners.reshape(-1, 3).astype(np.float64)
-    low, high = corners.min(0), corners.max(0)
-    heights = thing.spot.on_ground(thing.mesh).corners[..., 2]
-    (x, y, _), (c, s) = (low + high) / 2, (np.cos(thing.spot.yaw), np.sin(thing.spot.yaw))
-    bottom, top = float(heights.min()), float(heights.max())
-    middle = np.array([thing.spot.x + c * x - s * y, thing.spot.y + s * x + c * y, (bottom + top) / 2])
-    ahead = to_sensor(sensor, np.array([c, s, 0.0]))
-    yaw, still = float(np.arctan2(ahead[1], ahead[0])), (0.0, 0.0, 0.0)
-    x, y, z = to_sensor(sensor, middle).tolist()
-    length, width = (high - low)[:2].tolist()
-    size = (length + 2 * MARGIN, width + 2 * MARGIN, top - bottom + 2 * MARGIN)
-    hidden_share = float(1 - shown.mean())
-    return Box(thing.kind, number, (x, y, z), size, yaw, still, (x, y, z), yaw, still, points, hidden_share)
+    rays, boxes = there.rays, []
+    points = np.bincount(rays.owner[(rays.owner >= 0) & (rays.metres > 0)], minlength=len(there.put)).tolist()
+    for number, (kind, mesh, spot, met) in enumerate(there.put):
+        up = spot.on_ground(mesh).corners[..., 2]
+        stood = (spot.x, spot.y), (float(up.min()), float(up.max())), spot.yaw
+        told = there.sensor, kind, first + number, points[number], float(np.mean(rays.owner[met] != number))
+        boxes += [box_around(mesh, *stood, *told)] if points[number] else []
+    return tuple(boxes)

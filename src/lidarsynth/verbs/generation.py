@@ -27,9 +27,9 @@ from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.cascade.model import FILL_STEPS, CascadeModel
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL
+from lidarsynth.verbs.insertion import BOXES
 
 RECORD = "generate.json"
-BOXES = ".json"  # as `streets --format pcd` has it
 NAMED = frozenset({"model", "sensor"})  # in words what `weights` says in digits, by which alone folders are compared
 MOST = 4  # processes, where nobody says how many: each has a gigabyte and a half
 

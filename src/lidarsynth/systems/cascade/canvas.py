@@ -13,6 +13,7 @@ from lidarsynth.lidar.pieces import connected
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.streets.actors import MARGIN
 from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
 from lidarsynth.streets.lone import alone
 from lidarsynth.streets.materials import MATERIALS
@@ -29,6 +30,8 @@ ALONG, APART = 3, (0.05, 1.5)
 # Metres of a cell; returns of one thing are less than so many cells from others; and so many are enough for one.
 CELL, REACH, FEW = 0.4, 4, 20
 AROUND = 6.0  # metres around a thing where the ground is looked for
+SIZE = (0.97, 1.03)  # things are so much smaller or larger than the streets'
+OCCLUDED = 0.3  # metres nearer than a thing that hide it
 TINT = (-1.0, 2.2)  # in spreads of the material: the darkest would not return
 
 
@@ -231,3 +234,30 @@ def numbered(image: RangeImage) -> RangeImage:
 def to_sensor(sensor: Sensor, vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) of a frame that stands upright, in the sensor's."""
     return vectors @ sensor_pose(sensor, np.zeros(6))[:3, :3]
+
+
+def box_around(
+    mesh: Mesh,
+    place: tuple[float, float],
+    heights: tuple[float, float],
+    yaw: float,
+    sensor: Sensor,
+    kind: str,
+    number: int,
+    points: int = 0,
+    occlusion: float = 0.0,
+) -> Box:
+    """The box, in the sensor's frame and as streets have it, of a thing that stands still: around its mesh, of its own
+    frame, put to a place and turned by yaw, radians; `heights` are those of its bottom and top.
+
+    place, heights  metres of a frame that stands upright, the sensor at its origin
+    """
+    corners = mesh.corners.reshape(-1, 3).astype(np.float64)
+    low, high = corners.min(0), corners.max(0)
+    (x, y, _), (c, s) = (low + high) / 2, (np.cos(yaw), np.sin(yaw))
+    middle = np.array([place[0] + c * x - s * y, place[1] + s * x + c * y, sum(heights) / 2])
+    front, still = to_sensor(sensor, np.array([c, s, 0.0])), (0.0, 0.0, 0.0)
+    x, y, z = to_sensor(sensor, middle).tolist()
+    (length, width), turned = (high - low)[:2].tolist(), float(np.arctan2(front[1], front[0]))
+    size = (length + 2 * MARGIN, width + 2 * MARGIN, heights[1] - heights[0] + 2 * MARGIN)
+    return Box(kind, number, (x, y, z), size, turned, still, (x, y, z), turned, still, points, occlusion)

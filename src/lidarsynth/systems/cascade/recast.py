@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.streets.actors import MARGIN
@@ -27,8 +26,11 @@ from lidarsynth.streets.shapes import Mesh, moved
 from lidarsynth.systems.cascade.canvas import (
     FEW,
     GROUND,
+    OCCLUDED,
+    SIZE,
     Canvas,
     axis_of,
+    box_around,
     canvas_of,
     mirrored,
     numbered,
@@ -70,8 +72,6 @@ LOW = 0.2  # metres above the ground around a thing that are ground
 WIDER, TALLER = 2.5, 2.2  # metres beside and above a thing that are looked at
 OWN, OTHERS, MOST = 220, 340, 2.5  # rays that are looked at, of a thing's and of the others; how many times as many
 TIGHT = 0.4  # metres beside one of several things that are in a row, within which returns are of it
-SIZE = (0.97, 1.03)  # things are so much smaller or larger
-OCCLUDED = 0.3  # metres nearer than a thing that hide it
 SURE = (0.9, 0.4)  # the most that a place costs, and the least share of its rays, that is good enough for a wall, too
 WALL = (0.4, 1.7)  # metres, standard deviations across and along, of returns that are of a wall
 BESIDE = 3  # columns beside a heap's that are as lost as its own
@@ -155,7 +155,9 @@ def _thing(
     there = moved(mesh, place.x, place.y, level, yaw=yaw)
     returns, rays = canvas.cast(there, tint_of(kind.material, shade, rng), rng)
     shown = _put(canvas, returns, rays, mine, level, rng)
-    canvas.boxes.append(_box(canvas, shape.words, mesh, (place.x, place.y, level), yaw, shown))
+    up, number = mesh.corners[..., 2], 1 + len(canvas.boxes)
+    stood = (place.x, place.y), (level + float(up.min()), level + float(up.max())), yaw
+    canvas.boxes.append(box_around(mesh, *stood, sensor, shape.words, number, occlusion=1 - shown))
     canvas.taken.append(stands)
     rest = at[~np.isin(at, mine)]
     return rest if len(rest) >= FEW and len(mine) else None
@@ -240,19 +242,6 @@ def _mesh(
         if not len(canvas.taken) or not meet(stands, np.stack(canvas.taken)).any():
             return mesh, yaw, stands
     return None
-
-
-def _box(canvas: Canvas, word: str, mesh: Mesh, place: tuple[float, float, float], yaw: float, shown: float) -> Box:
-    """The next box of a canvas, around a thing's mesh, put to a place, metres, and turned by yaw, as streets have it;
-    `shown` of its rays nothing hides."""
-    corners = mesh.corners.reshape(-1, 3).astype(np.float64)
-    low, high = corners.min(0), corners.max(0)
-    (x, y, z), (c, s) = (low + high) / 2, (np.cos(yaw), np.sin(yaw))
-    middle = canvas.to_sensor(np.array([c * x - s * y, s * x + c * y, z]) + place)
-    front = canvas.to_sensor(np.array([c, s, 0]))
-    yaw, still = float(np.arctan2(front[1], front[0])), (0.0, 0.0, 0.0)
-    centre, size = tuple(middle.tolist()), tuple((high - low + 2 * MARGIN).tolist())
-    return Box(word, 1 + len(canvas.boxes), centre, size, yaw, still, centre, yaw, still, 0, 1 - shown)
 
 
 def _put(
