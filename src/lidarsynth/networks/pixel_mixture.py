@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarsynth.networks.column_neighbours import Grid
+from lidarsynth.networks.layers import ColumnLinear
 
 # Lowest, highest, and how many bins between them: of the range code (8 % of the range each) and of reflectance.
 CODES, TONES = (-0.9, 1.0, 64), (-0.1, 1.1, 36)
@@ -37,11 +38,11 @@ class PixelDrawer(nn.Module, ABC):
     def __init__(self, features: int, guesses: int, shades: int, pixel: int, blocks: int):
         super().__init__()
         self.guesses, self.copies = guesses, shades
-        self.stem = nn.Linear(features, pixel)
+        self.stem = ColumnLinear(features, pixel)
         self.blocks = nn.ModuleList(Mix(pixel) for _ in range(blocks))
-        self.range_head = nn.Sequential(nn.LayerNorm(pixel), nn.Linear(pixel, 1 + CODES[2] + 3 * guesses))
-        self.shade_stem = nn.Linear(pixel + guesses + 1, pixel // 2)
-        self.shade_head = nn.Linear(pixel // 2, TONES[2] + 3 * shades)
+        self.range_head = nn.Sequential(nn.LayerNorm(pixel), ColumnLinear(pixel, 1 + CODES[2] + 3 * guesses))
+        self.shade_stem = ColumnLinear(pixel + guesses + 1, pixel // 2)
+        self.shade_head = ColumnLinear(pixel // 2, TONES[2] + 3 * shades)
 
     @abstractmethod
     def forward(self, *args: Tensor) -> Tensor:
@@ -92,7 +93,8 @@ class Mix(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.norm, self.up, self.down = nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+        self.norm = nn.LayerNorm(width)
+        self.up, self.down = ColumnLinear(width, 2 * width), ColumnLinear(2 * width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.down(F.silu(self.up(self.norm(x))))

@@ -228,7 +228,7 @@ def answered(
     (1, H, W)."""
     mask = (logit[0] > 0).numpy() & (distance <= sensor.max_range) & (distance >= sensor.min_range) & ~blocked
     shade = reflectance[0].clamp(0, 1).numpy()
-    likeliest, kind = (None if part is None else part[1:].argmax(0).numpy() + 1 for part in (classes, drawn))
+    likeliest, kind = (None if part is None else part[1:].float().numpy().argmax(0) + 1 for part in (classes, drawn))
     label = likeliest if kind is None else likeliest + TEXTURE * kind  # 0, unlabeled, is no answer
     chance = None if sure is None else sure.reshape(distance.shape).numpy()
     # The label is that of all rays: what is known may return.

@@ -172,7 +172,7 @@ def _inside(network: ClassUNet, streets: ClassUNet, told: Tensor, image: RangeIm
     streets  the network of streets, which has its say on people
     """
     logits = _without(_logits(network, told, image.shape), _fair(inside_weights()))
-    count = np.bincount(logits.argmax(0).numpy()[image.mask], minlength=len(logits))
+    count = np.bincount(logits.numpy().argmax(0)[image.mask], minlength=len(logits))
     within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
     telling = within + without
     if telling <= SOME * count.sum() or within <= MOSTLY * telling:
