@@ -17,7 +17,7 @@ from lidarsynth.networks.column_neighbours import (
     shades_expected,
     told,
 )
-from lidarsynth.networks.column_transformer import ColumnTransformer, draw
+from lidarsynth.networks.column_transformer import Block, ColumnTransformer, Kept, draw
 from lidarsynth.networks.drafts import DRAFT_CHANNELS, drafted
 from lidarsynth.networks.pixel_mixture import CODES, TONES, mixture, picked
 from lidarsynth.networks.rays import encode_range
@@ -223,3 +223,12 @@ def test_known_pixels_stay_and_others_are_drawn_around_them(
     assert (found.code[:, :, 60:64] != drawn.code[:, :, 60:64]).any()
     again = draw(network, rays, draft, rngs(), sharp=0.5, heat=1.0, known=(drawn, here))
     assert_close(again.code, drawn.code)  # what it would have drawn changes nothing
+
+
+def test_columns_that_come_one_by_one_are_attended_to_as_all_at_once():
+    torch.manual_seed(3)
+    layer, kept, x = Block(32).eval(), Kept(), torch.randn(5, 20, 32)
+    with torch.inference_mode():
+        whole, each = layer(x), torch.cat([layer(x[:, k : k + 1], kept) for k in range(x.shape[1])], 1)
+    torch.testing.assert_close(each, whole)
+    assert kept.count == 20

@@ -1,11 +1,14 @@
 """Layers: parity with the reference operators, and what makes them operators on a ring."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from torch import nn
 
 from lidarsynth.networks.layers import (
     AdaGroupNorm,
+    ColumnLinear,
     Conv3x3,
     Downsample,
     LogSNREmbedding,
@@ -102,3 +105,16 @@ def test_attention_refuses_heads_that_do_not_divide():
 def test_the_embedding_refuses_odd_widths():
     with pytest.raises(ValueError, match="even and at least 4, got 9"):
         LogSNREmbedding(9)
+
+
+def test_weights_that_lie_column_by_column_do_so_once_loaded_copied_and_learned():
+    usual, layer = nn.Linear(6, 10), ColumnLinear(6, 10)
+    layer.load_state_dict(usual.state_dict())
+    optimizer = torch.optim.AdamW(layer.parameters())
+    x = torch.randn(24, 6)
+    torch.testing.assert_close(layer(x), usual(x))
+    for one in (layer, deepcopy(layer), deepcopy(layer).double(), ColumnLinear(6, 10, bias=False)):
+        assert one.weight.shape == (10, 6) and one.weight.t().is_contiguous() and not one.weight.is_contiguous()
+    layer(x).square().mean().backward()
+    optimizer.step()
+    assert layer.weight.t().is_contiguous() and not torch.equal(layer.weight, usual.weight)
