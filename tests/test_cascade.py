@@ -33,6 +33,7 @@ from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.naming import FAIR, weights
 from lidarsynth.systems.cascade.surfaces import across_rings, straightened
 from lidarsynth.systems.denser import spread
+from lidarsynth.systems.precision import resolved_precision
 from lidarsynth.weights.load import load_parts
 
 SMALL = Sensor("small", tuple(np.linspace(5, -25, 24).tolist()), 256, 0.5, 120.0, mount=1.8)
@@ -612,6 +613,19 @@ def test_bf16_errs_little_and_auto_asks_the_processor(model: CascadeModel, monke
         assert model.at_precision("auto").precision == ("bf16" if has else "fp32")
     with pytest.raises(ValueError, match="expected a precision of auto, fp32, bf16, found 'fp8'"):
         model.at_precision("fp8")
+
+
+@pytest.mark.parametrize(("of", "flags", "faster"), [
+    ("Intel Xeon", {"amx_bf16": True, "avx512_bf16": True}, True),
+    ("Intel Xeon", {"avx512_bf16": True}, False),  # as where a virtual machine has no AMX
+    ("AMD EPYC 9R14", {"avx512_bf16": True}, True),
+    ("AMD EPYC 7R13", {"avx512_bf16": False}, False),
+])  # fmt: skip
+def test_auto_takes_bf16_where_it_is_faster(
+    of: str, flags: dict[str, bool], faster: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"cpu_name": of} | flags, raising=False)
+    assert resolved_precision("auto", torch.device("cpu")) == ("bf16" if faster else "fp32")
 
 
 class Constant(CoarseUNet):
