@@ -43,8 +43,8 @@ class Reading:
 
     intensity  scale, as in `files.formats.read_with_report`
     topic      of a bag, or ADDRESS:PORT of a sensor in a capture; None = the only one
-    metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; None =
-               what the bag tells, or the only one beside it
+    metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; angle
+               correction `.csv` of the Hesai of a capture; None = what the bag tells, or the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
