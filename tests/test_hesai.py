@@ -218,13 +218,13 @@ def test_without_angles_one_line_asks_for_them(tmp_path: Path, capsys: pytest.Ca
         )
         assert "web page exports it" in said
     (tmp_path / "xt.csv").write_text(angles_csv(range(15, -17, -1), [0] * 32))
-    with pytest.raises(FileError, match="the Pandar64, or one of 64 channels beside the capture, found none"):
+    with pytest.raises(FileError, match="the Pandar64, or one of 64 channels beside it, found none"):
         next(capture_turns(path))
     with pytest.raises(FileError, match=r"xt.csv: expected the 64 channels of a Pandar64, found 32"):
         next(capture_turns(path, tmp_path / "xt.csv"))
     for name in ("one.csv", "two.csv"):
         (tmp_path / name).write_text(angles_csv(PANDAR64.elevations, OFFSETS))
-    with pytest.raises(FileError, match=r"found several beside the capture: one.csv, two.csv"):
+    with pytest.raises(FileError, match=r"found several beside it: one.csv, two.csv"):
         next(capture_turns(path))
     (tmp_path / "one.csv").rename(tmp_path / "c_angles.csv")
     assert len(list(capture_turns(path))) == 2, "that of its name"

@@ -95,9 +95,11 @@ def _row(where: str, line: str, columns: tuple[int, int, int]) -> tuple[int, flo
 
 
 def angles_beside(path: Path, channels: int, model: str) -> Angles | None:
-    """Those of a sensor of so many channels, in the only file for it in the folder of a recording; None where none is
-    for it. Raises FileError where several are, which lists them, or the only one is broken."""
-    files = [file for file in sorted(path.parent.glob("*.[cC][sS][vV]")) if is_angles(file)]
+    """Those of a sensor of so many channels, in the only file for it in the folder of a recording, or in that which
+    the recording is; None where none is for it. Raises FileError where several are, which lists them, or one is broken
+    and none fits."""
+    folders = [path.parent, path] if path.is_dir() else [path.parent]
+    files = [file for one in folders for file in sorted(one.glob("*.[cC][sS][vV]")) if is_angles(file)]
     read: dict[Path, Angles] = {}
     broken: list[FileError] = []
     for file in files:
@@ -112,7 +114,7 @@ def angles_beside(path: Path, channels: int, model: str) -> Angles | None:
     if fit:
         listed = ", ".join(file.name for file in named or fit)
         raise FileError(f"{path}: expected --metadata ANGLES.csv, the angle correction file of the {model}, found "
-                        f"several beside the capture: {listed}")  # fmt: skip
+                        f"several beside it: {listed}")  # fmt: skip
     if broken:
         raise broken[0]
     return None

@@ -7,7 +7,7 @@ correction file (`angle_files`), nominal ones of the XT-16 and XT-32.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -108,6 +108,24 @@ def turns(packets: Iterable[Datagram], layout: Layout, angles: Angles) -> Iterat
     return (turn() for turn in unread_turns(packets, layout, angles))
 
 
+def layout_in(packets: Iterable[Datagram]) -> Layout | None:
+    """Which of LAYOUTS the first has that has any."""
+    return next((found for packet in packets if (found := layout_of(packet.payload)) is not None), None)
+
+
+def returns(packets: Sequence[Datagram], angles: Angles | None) -> Fields:
+    """The same of all returns of some packets of one sensor, as one turn. Raises FileError where none is of LAYOUTS, or
+    its angles are those of another number of lasers, or of none."""
+    if (layout := layout_in(packets)) is None or angles is None:
+        sizes = ", ".join(sorted({str(len(packet.payload)) for packet in packets})[:4])
+        raise FileError(f"expected packets of {', '.join(one.name for one in LAYOUTS)}, found "
+                        + (f"others, of {sizes} bytes" if sizes else "none"))  # fmt: skip
+    if len(angles.elevations) != layout.lasers:
+        raise FileError(f"expected packets of {len(angles.elevations)} channels, as the angles are, found those of a "
+                        f"{layout.name}")  # fmt: skip
+    return sweeps.returns([packet for packet in packets if layout.fits(packet.payload)], _blocks(layout, angles))
+
+
 def unread_turns(packets: Iterable[Datagram], layout: Layout, angles: Angles) -> Iterator[Unread]:
     """The same, each decoded when it is called."""
     return sweeps.unread_turns(packets, _blocks(layout, angles))
@@ -124,7 +142,7 @@ def angles_for(layout: Layout, path: Path, metadata: Path | None) -> Angles:
         return found
     if (beside := angles_beside(path, layout.lasers, layout.name)) is not None:
         return beside
-    asked = f"the angle correction file of the {layout.name}, or one of {layout.lasers} channels beside the capture"
+    asked = f"the angle correction file of the {layout.name}, or one of {layout.lasers} channels beside it"
     if layout.nominal is None:
         raise FileError(f"{path}: expected --metadata ANGLES.csv, {asked}, found none: {HOW}")
     warnings.warn(f"{path}: found no {asked.removeprefix('the ')}: its nominal angles are taken, which may be some "

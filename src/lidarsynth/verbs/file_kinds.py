@@ -167,7 +167,7 @@ def _bag(path: Path, reading: Reading) -> Lines:
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
         clouds = bag.scan_topics()
-        if reading.metadata is not None and not any(bag.of_ouster(name) for name in clouds):
+        if reading.metadata is not None and not any(bag.takes_metadata(name) for name in clouds):
             raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found none")
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):

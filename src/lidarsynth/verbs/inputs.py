@@ -259,7 +259,7 @@ def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | N
     with open_bag(path) as bag:
         name = bag.point_topic(reading.topic)
         cut += bag.cut
-        return bag.count_of(name), bag.of_ouster(name)
+        return bag.count_of(name), bag.takes_metadata(name)
 
 
 def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
