@@ -69,7 +69,6 @@ class Message(NamedTuple):
     data       its bytes
     published  nanoseconds, when it was sent, of MCAP; None = `time`
     sequence   its number, of MCAP; 0 where nobody counted
-    angles     of the Hesai whose packets it holds; None = not known
     """
 
     topic: Topic
@@ -77,7 +76,21 @@ class Message(NamedTuple):
     data: bytes
     published: int | None = None
     sequence: int = 0
-    angles: Angles | None = None
+
+
+class AngledMessage(NamedTuple):
+    """A message of a Hesai's packets, and its beams' angles; None where the packets do not tell whose they are."""
+
+    message: Message
+    angles: Angles | None
+
+    @property
+    def time(self) -> int:
+        """Nanoseconds, when it was recorded."""
+        return self.message.time
+
+
+Packed: TypeAlias = "Message | AngledMessage | TimedTurn"  # a scan still in its bytes
 
 
 @dataclass(frozen=True)
@@ -121,7 +134,7 @@ class Bag:
         with naming(self.path):
             yield from self.source(names, start)
 
-    def scans(self, topic: str, told: Told | None = None, start: int = 0) -> Iterator[Message | TimedTurn]:
+    def scans(self, topic: str, told: Told | None = None, start: int = 0) -> Iterator[Packed]:
         """The scans of a topic, still in their bytes: messages, from `start` (nanoseconds) on, or, of an Ouster's
         packets, all turns (`whole_turns`).
 
@@ -134,12 +147,12 @@ class Bag:
             return self._angled(topic, told if isinstance(told, Angles) else None, start)
         return self._messages(topic, start)
 
-    def _angled(self, topic: str, angles: Angles | None, start: int) -> Iterator[Message]:
+    def _angled(self, topic: str, angles: Angles | None, start: int) -> Iterator[AngledMessage]:
         """A Hesai's messages with its angles; whose they must be its first packet tells."""
         for message in self._messages(topic, start):
             if angles is None and (layout := _layout_in(message)) is not None:
                 angles = hesai.angles_for(layout, self.path, None)
-            yield message._replace(angles=angles)
+            yield AngledMessage(message, angles)
 
     def count_of(self, topic: str) -> int | None:
         """How many scans a topic holds, or None where only reading tells."""
@@ -259,19 +272,20 @@ def opened(topic: Topic, data: bytes) -> bytes:
         return data
 
 
-def cloud_of(message: Message | TimedTurn) -> Cloud:
+def cloud_of(scan: Packed) -> Cloud:
     """The point cloud in a message of PointCloud2, or of packets, or in a turn of an Ouster's: its stamp is then when
     the first packet was recorded, and its time when the last was. Raises FileError, without the bag's path, for one
     that is broken."""
-    if isinstance(message, TimedTurn):
-        return Cloud(message.stamp, FRAME, message.time, message.turn())
+    if isinstance(scan, TimedTurn):
+        return Cloud(scan.stamp, FRAME, scan.time, scan.turn())
+    message, angles = scan if isinstance(scan, AngledMessage) else (scan, None)
     kind = message.topic.kind if message.topic.kind in (PACKETS, *HESAI) else POINTS
     try:
         points = _deserialized(message, kind)
         stamp, frame_id = points.header.stamp, points.header.frame_id
         number = points.header.seq if message.topic.encoding == "ros1" else message.sequence
         times = stamp.sec * 10**9 + stamp.nanosec, frame_id, message.time
-        fields = decode(points) if kind == POINTS else _returns(message, points)
+        fields = decode(points) if kind == POINTS else _returns(message, points, angles)
         left_out = fields_left_out(points.fields) if kind == POINTS else None
         return Cloud(*times, fields, message.published, number, left_out)
     except FileError:
@@ -280,10 +294,10 @@ def cloud_of(message: Message | TimedTurn) -> Cloud:
         raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {one_line(error)}") from None
 
 
-def _returns(message: Message, scan: Any) -> Fields:
+def _returns(message: Message, scan: Any, angles: Angles | None) -> Fields:
     """The returns of a message of packets."""
     packets = _datagrams(message, scan)
-    return returns(packets) if message.topic.kind == PACKETS else hesai.returns(packets, message.angles)
+    return returns(packets) if message.topic.kind == PACKETS else hesai.returns(packets, angles)
 
 
 def _layout_in(message: Message) -> hesai.Layout | None:

@@ -9,11 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarsynth.data.bag_records import Message, cloud_of
+from lidarsynth.data.bag_records import Packed, cloud_of
 from lidarsynth.data.bags import is_bag, metadata_from, open_bag
 from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import unread_turns
-from lidarsynth.data.whole_turns import TimedTurn, Unread
+from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import (
     PLACE,
     Fields,
@@ -124,7 +124,7 @@ class MessageInput:
     name: str
     path: Path
     reading: Reading
-    message: Message | TimedTurn
+    message: Packed
 
     def read(self) -> Loaded:
         """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
