@@ -21,7 +21,7 @@ def info(
     axes: Annotated[str, arg(metavar="XYZ", help="where x, y, z of a scan point: CARLA has fru, AirSim frd.")] = "flu",
     mount: Annotated[float | None, arg(metavar="M", help="metres of the sensor above a scan's z = 0.")] = None,
     rings: Rings = None,
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture or packets in a bag.")] = None,
+    metadata: Annotated[Path | None, arg(metavar="FILE", help="JSON of an Ouster's, CSV of a Hesai's packets.")] = None,
     seed: NoSeed = 0,
 ) -> None:
     """What a model, a preset, a sensor, a file or a folder is."""

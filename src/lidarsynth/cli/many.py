@@ -36,7 +36,7 @@ class Many:
         arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
     ] = None
     keep_topics: Annotated[bool, arg(help="copy all other topics, attachments and metadata into the new bag.")] = False
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture or packets in a bag.")] = None
+    metadata: Annotated[Path | None, arg(metavar="FILE", help="JSON of an Ouster's, CSV of a Hesai's packets.")] = None
     transform: Annotated[
         str | None,
         arg(
@@ -277,8 +277,8 @@ def _settings(job: Job, model: ScanModel | None, out: Path, many: Many, ending: 
 
 
 def _told_by(metadata: Path) -> str:
-    """The digits of a `.json` of an Ouster, wherever it is; of a bag that holds one, which may be large, its name."""
-    if metadata.suffix.lower() != ".json" or not metadata.is_file():
+    """The digits of a `.json` or `.csv`, wherever it is; of a bag that holds one, which may be large, its name."""
+    if metadata.suffix.lower() not in (".json", ".csv") or not metadata.is_file():
         return metadata.name
     return blake2b(metadata.read_bytes(), digest_size=8).hexdigest()
 

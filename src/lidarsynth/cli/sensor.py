@@ -23,7 +23,9 @@ def sensor(
     topic: Annotated[
         str | None, arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture.")
     ] = None,
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster: it tells all beams.")] = None,
+    metadata: Annotated[
+        Path | None, arg(metavar="FILE", help="JSON of an Ouster: it tells all beams; or CSV of a Hesai's capture.")
+    ] = None,
     rings: Rings = None,
     transform: Annotated[
         str | None, arg(metavar="T", help="brings points into the sensor's frame, as of complete; later verbs take it.")

@@ -31,7 +31,7 @@ def view(
         str | None,
         arg(metavar="NAME", help="of a bag, or ADDRESS:PORT of a sensor in a capture; the only one if not given."),
     ] = None,
-    metadata: Annotated[Path | None, arg(metavar="JSON", help="of an Ouster's capture or packets in a bag.")] = None,
+    metadata: Annotated[Path | None, arg(metavar="FILE", help="JSON of an Ouster's, CSV of a Hesai's packets.")] = None,
     transform: Annotated[
         str | None,
         arg(metavar="T", help="brings points into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4."),

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from lidarsynth.data import ouster
+from lidarsynth.data import hesai, ouster
+from lidarsynth.data.angle_files import Angles
 from lidarsynth.data.bag_errors import BROKEN, library_errors, naming, one_line
 from lidarsynth.data.capture import Datagram
 from lidarsynth.data.velodyne import returns
@@ -25,7 +26,12 @@ PACKETS = "velodyne_msgs/msg/VelodyneScan"  # packets of about a turn, as velody
 OUSTER = (  # a packet each, as ouster_ros publishes them; of its inertial sensor, too, on another topic
     "ouster_ros/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg", "ouster_msgs/msg/PacketMsg"
 )  # fmt: skip
-OF_PACKETS = (PACKETS, *OUSTER)
+HESAI = (
+    "hesai_lidar/msg/PandarScan",
+    "hesai_ros_driver/msg/UdpFrame",
+)  # packets of about a turn, as its drivers cut it
+OF_PACKETS = (PACKETS, *HESAI, *OUSTER)
+Told: TypeAlias = "ouster.Metadata | Angles"  # what is to be known of a sensor whose packets do not tell its beams
 STRING = "std_msgs/msg/String"  # as which it publishes the metadata
 LARGE = 1000  # bytes: smaller packets are inertial measurements
 ASKED = "in or beside the bag, or a bag as --metadata that holds it (the first of a split recording)"
@@ -72,6 +78,21 @@ class Message(NamedTuple):
     sequence: int = 0
 
 
+class AngledMessage(NamedTuple):
+    """A message of a Hesai's packets, and its beams' angles; None where the packets do not tell whose they are."""
+
+    message: Message
+    angles: Angles | None
+
+    @property
+    def time(self) -> int:
+        """Nanoseconds, when it was recorded."""
+        return self.message.time
+
+
+Packed: TypeAlias = "Message | AngledMessage | TimedTurn"  # a scan still in its bytes
+
+
 @dataclass(frozen=True)
 class Cloud:
     """The points of one message.
@@ -113,16 +134,25 @@ class Bag:
         with naming(self.path):
             yield from self.source(names, start)
 
-    def scans(
-        self, topic: str, metadata: ouster.Metadata | None = None, start: int = 0
-    ) -> Iterator[Message | TimedTurn]:
+    def scans(self, topic: str, told: Told | None = None, start: int = 0) -> Iterator[Packed]:
         """The scans of a topic, still in their bytes: messages, from `start` (nanoseconds) on, or, of an Ouster's
         packets, all turns (`whole_turns`).
 
-        metadata  of the Ouster; None = as `metadata_of`
-        Raises FileError for a broken bag, where nothing tells of an Ouster, and for packets of another.
+        told  of the Ouster; None = as `metadata_of`; of the Hesai; None = as `hesai.angles_for`
+        Raises FileError for a broken bag, where nothing tells of an Ouster or Hesai, and for packets of another.
         """
-        return self._turns(topic, metadata) if self.of_ouster(topic) else self._messages(topic, start)
+        if self.kind_of(topic) in OUSTER:
+            return self._turns(topic, None if isinstance(told, Angles) else told)
+        if self.kind_of(topic) in HESAI:
+            return self._angled(topic, told if isinstance(told, Angles) else None, start)
+        return self._messages(topic, start)
+
+    def _angled(self, topic: str, angles: Angles | None, start: int) -> Iterator[AngledMessage]:
+        """A Hesai's messages with its angles; whose they must be its first packet tells."""
+        for message in self._messages(topic, start):
+            if angles is None and (layout := _layout_in(message)) is not None:
+                angles = hesai.angles_for(layout, self.path, None)
+            yield AngledMessage(message, angles)
 
     def count_of(self, topic: str) -> int | None:
         """How many scans a topic holds, or None where only reading tells."""
@@ -130,9 +160,9 @@ class Bag:
         counts = [one.count for one in self.topics if (one.name, one.kind) == (topic, kind)]
         return None if kind in OUSTER else sum(counts) or None
 
-    def of_ouster(self, topic: str) -> bool:
-        """Whether a topic is of an Ouster's packets, which make turns only with its metadata."""
-        return self.kind_of(topic) in OUSTER
+    def takes_metadata(self, topic: str) -> bool:
+        """Whether a topic is of an Ouster's or Hesai's packets, which do not tell their beams themselves."""
+        return self.kind_of(topic) in (*OUSTER, *HESAI)
 
     def kind_of(self, topic: str) -> str:
         """The type of a topic's messages; of several that which is read: points, else packets."""
@@ -192,10 +222,10 @@ class Bag:
     def _first(self, topic: Topic) -> Message | None:
         return next(self._messages(topic.name, kind=topic.kind), None)
 
-    def clouds(self, topic: str, metadata: ouster.Metadata | None = None) -> Iterator[Cloud | FileError]:
+    def clouds(self, topic: str, told: Told | None = None) -> Iterator[Cloud | FileError]:
         """The point clouds of a topic, as `scans`, one at a time; a broken one comes as its error, and the next
         follow."""
-        for scan in self.scans(topic, metadata):
+        for scan in self.scans(topic, told):
             try:
                 yield cloud_of(scan)
             except FileError as error:
@@ -226,7 +256,7 @@ class Bag:
     def _of_lidar(self, topic: Topic) -> bool:
         """Whether a topic is of a LiDAR's packets: those of an Ouster's inertial sensor are small."""
         first = self._first(topic) if topic.kind in OUSTER else None
-        return topic.kind == PACKETS or (first is not None and len(first.data) > LARGE)
+        return topic.kind in (PACKETS, *HESAI) or (first is not None and len(first.data) > LARGE)
 
 
 def opened(topic: Topic, data: bytes) -> bytes:
@@ -242,19 +272,20 @@ def opened(topic: Topic, data: bytes) -> bytes:
         return data
 
 
-def cloud_of(message: Message | TimedTurn) -> Cloud:
+def cloud_of(scan: Packed) -> Cloud:
     """The point cloud in a message of PointCloud2, or of packets, or in a turn of an Ouster's: its stamp is then when
     the first packet was recorded, and its time when the last was. Raises FileError, without the bag's path, for one
     that is broken."""
-    if isinstance(message, TimedTurn):
-        return Cloud(message.stamp, FRAME, message.time, message.turn())
-    kind = message.topic.kind if message.topic.kind == PACKETS else POINTS
+    if isinstance(scan, TimedTurn):
+        return Cloud(scan.stamp, FRAME, scan.time, scan.turn())
+    message, angles = scan if isinstance(scan, AngledMessage) else (scan, None)
+    kind = message.topic.kind if message.topic.kind in (PACKETS, *HESAI) else POINTS
     try:
         points = _deserialized(message, kind)
         stamp, frame_id = points.header.stamp, points.header.frame_id
         number = points.header.seq if message.topic.encoding == "ros1" else message.sequence
         times = stamp.sec * 10**9 + stamp.nanosec, frame_id, message.time
-        fields = decode(points) if kind == POINTS else returns(map(_datagram, points.packets))
+        fields = decode(points) if kind == POINTS else _returns(message, points, angles)
         left_out = fields_left_out(points.fields) if kind == POINTS else None
         return Cloud(*times, fields, message.published, number, left_out)
     except FileError:
@@ -263,14 +294,36 @@ def cloud_of(message: Message | TimedTurn) -> Cloud:
         raise FileError(f"expected a point cloud, found {len(message.data)} broken bytes: {one_line(error)}") from None
 
 
+def _returns(message: Message, scan: Any, angles: Angles | None) -> Fields:
+    """The returns of a message of packets."""
+    packets = _datagrams(message, scan)
+    return returns(packets) if message.topic.kind == PACKETS else hesai.returns(packets, angles)
+
+
+def _layout_in(message: Message) -> hesai.Layout | None:
+    """What the packets of a Hesai in a message are; None where they, or the message, are broken."""
+    try:
+        return hesai.layout_in(_datagrams(message, _deserialized(message, message.topic.kind)))
+    except (FileError, *BROKEN, *library_errors()):
+        return None
+
+
 def _deserialized(message: Message, kind: str) -> Any:
-    store = typestore(message.topic.encoding)
+    store = defined(message.topic) if kind in HESAI else typestore(message.topic.encoding)
     read = store.deserialize_ros1 if message.topic.encoding == "ros1" else store.deserialize_cdr
     return read(message.data, kind)
 
 
-def _datagram(packet: Any) -> Datagram:
-    return Datagram(packet.stamp.sec * 10**9 + packet.stamp.nanosec, 0, packet.data.tobytes())
+def _datagrams(message: Message, scan: Any) -> list[Datagram]:
+    """The packets in a message; one that says no time has that of the message. Raises FileError for other fields."""
+    found: list[Datagram] = []
+    for held in map(vars, vars(scan).get("packets", [scan])):
+        if "data" not in held:
+            raise FileError(f"expected packets with data in a {message.topic.kind}, found {', '.join(held)}")
+        time = held["stamp"].sec * 10**9 + held["stamp"].nanosec if "stamp" in held else message.time
+        data = held["data"].tobytes()
+        found.append(Datagram(time, 0, data[: held.get("size", len(data))]))
+    return found
 
 
 _STORES: dict[str, Any] = {}  # encoding -> the types of that ROS; a second to build, so once
@@ -290,3 +343,21 @@ def typestore(encoding: str) -> Any:
         for kind in OUSTER:
             store.register(get_types_from_msg("uint8[] buf", kind))
     return _STORES[encoding]
+
+
+def defined(topic: Topic) -> Any:
+    """The types of a topic's ROS, and those of its messages as the bag itself defines them. Raises FileError where it
+    does not."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    language, text = topic.schema[0], topic.schema[1].decode("utf-8", "replace")
+    if not text.strip() or language not in ("ros1msg", "ros2msg"):
+        raise FileError(f"expected a bag that defines {topic.kind}, found {'another language' if text else 'none'}")
+    key = f"{topic.encoding} {text}"
+    if key not in _STORES:
+        known = typestore(topic.encoding).types  # refuses other encodings
+        store = get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.LATEST)
+        types = get_types_from_msg(text, topic.kind)
+        store.register({name: told for name, told in types.items() if name not in known})
+        _STORES[key] = store
+    return _STORES[key]

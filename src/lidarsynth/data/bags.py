@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from lidarsynth.data import ouster
+from lidarsynth.data.angle_files import read_angles
 from lidarsynth.data.bag_errors import BROKEN, check_packages, library_errors, naming
-from lidarsynth.data.bag_records import Attached, Bag, Message, Topic, opened
+from lidarsynth.data.bag_records import HESAI, Attached, Bag, Message, Told, Topic, opened
 from lidarsynth.data.cut_bags import Mended, mend
 from lidarsynth.data.cut_databases import has_log, read_database
 from lidarsynth.files.fields import FileError
@@ -67,12 +68,15 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         opened.close()
 
 
-def metadata_from(path: Path | None, bag: Bag, topic: str) -> ouster.Metadata | None:
-    """The metadata of the Ouster whose packets a topic of a bag holds, in a `.json` file, or in another bag, on the
-    topic beside one of that name: of a recording that ROS 1 has split the first alone may hold it. None for no file,
-    and for a topic of something else. Raises FileError."""
-    if path is None or not bag.of_ouster(topic):
+def metadata_from(path: Path | None, bag: Bag, topic: str) -> Told | None:
+    """What a file tells of the sensor whose packets a topic of a bag holds: the angles of a Hesai in a `.csv`, the
+    metadata of an Ouster in a `.json`, or in another bag, on the topic beside one of that name: of a recording that
+    ROS 1 has split the first alone may hold it. None for no file, and for a topic of something else. Raises
+    FileError."""
+    if path is None or not bag.takes_metadata(topic):
         return None
+    if bag.kind_of(topic) in HESAI:
+        return read_angles(path)
     if not is_bag(path):
         return ouster.read_metadata(path)
     with open_bag(path) as other:

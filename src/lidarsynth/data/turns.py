@@ -1,18 +1,19 @@
-"""The turns in a capture: of its one LiDAR, or of the one named; Velodyne's by the packets, Ouster's with metadata."""
+"""The turns in a capture: of its one LiDAR, or of the one named; Velodyne's by the packets, Hesai's with their angles
+beside, Ouster's with metadata."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
-from lidarsynth.data import ouster, velodyne
+from lidarsynth.data import hesai, ouster, velodyne
 from lidarsynth.data.capture import Datagram, datagrams
 from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import Fields, FileError
 
 LOOKED_AT = 2000  # packets from the first of a LiDAR on: 0.2 s of the fastest sensor, so that every other one shows
-LARGE = 1000  # bytes: smaller packets are positions and inertial measurements
+LARGE = 1000  # bytes: smaller packets are positions and inertial measurements, but some of a Hesai's
 Test = Callable[[Datagram], bool]
 Turns = Callable[[Iterator[Datagram]], Iterator[Unread]]
 
@@ -20,7 +21,7 @@ Turns = Callable[[Iterator[Datagram]], Iterator[Unread]]
 def capture_turns(path: Path, metadata: Path | None = None, sender: str | None = None) -> Iterator[Fields]:
     """The turns of a LiDAR in a capture. Raises FileError where there is none, or several and none is named.
 
-    metadata  `.json` of an Ouster; None = the only one beside the capture
+    metadata  `.json` of an Ouster, angle correction `.csv` of a Hesai; None = the only one beside the capture
     sender    ADDRESS:PORT, of the sensor and to which its packets go; None = the only one
     """
     return (turn() for turn in unread_turns(path, metadata, sender))
@@ -70,25 +71,44 @@ def sound_datagrams(path: Path) -> Iterator[Datagram]:
 
 
 def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, Turns]:
-    """How the packets of a LiDAR are told, and what makes turns of them: a Velodyne where one sends, else an Ouster."""
-    large = [p for p in islice(sound_datagrams(path), 2 * LOOKED_AT) if len(p.payload) > LARGE]
+    """How the packets of a LiDAR are told, and what makes turns of them: a Velodyne or Hesai where one sends, else an
+    Ouster."""
+    large = [p for p in islice(sound_datagrams(path), 2 * LOOKED_AT) if _is_large(p)]
     large = [p for p in large if sender in (None, p.sender)] or large
     if not large:
-        large = list(islice((p for p in sound_datagrams(path) if len(p.payload) > LARGE), 1))
+        large = list(islice(filter(_is_large, sound_datagrams(path)), 1))
     if not large:
         raise FileError(f"{path}: expected packets of a LiDAR, found none")
-    if any(velodyne.is_velodyne(packet.payload) for packet in large):
-        return lambda packet: velodyne.is_velodyne(packet.payload), velodyne.unread_turns
+    if any(map(_of_blocks, large)):
+        return _of_blocks, lambda packets: _block_turns(packets, path, metadata)
     described = ouster.read_metadata(metadata or ouster.metadata_beside(path, "beside the capture"))
     size = ouster.packet_size(described)
     return lambda packet: len(packet.payload) == size, lambda packets: ouster.unread_turns(packets, described)
+
+
+def _is_large(packet: Datagram) -> bool:
+    return len(packet.payload) > LARGE or hesai.is_hesai(packet.payload)
+
+
+def _of_blocks(packet: Datagram) -> bool:
+    """Whether a packet tells by itself whose it is."""
+    return velodyne.is_velodyne(packet.payload) or hesai.is_hesai(packet.payload)
+
+
+def _block_turns(packets: Iterator[Datagram], path: Path, metadata: Path | None) -> Iterator[Unread]:
+    """The turns of one sensor whose packets tell whose they are."""
+    first = next(packets)
+    own = chain([first], packets)
+    if (layout := hesai.layout_of(first.payload)) is None:
+        return velodyne.unread_turns(own)
+    return hesai.unread_turns(own, layout, hesai.angles_for(layout, path, metadata))
 
 
 def _listed(path: Path, belongs: Test) -> list[str]:
     """ADDRESS:PORT of those whose packets belong."""
     found = list(dict.fromkeys(p.sender for p in islice(filter(belongs, sound_datagrams(path)), LOOKED_AT)))
     if not found:
-        first = next(len(p.payload) for p in sound_datagrams(path) if len(p.payload) > LARGE)
-        raise FileError(f"{path}: expected packets of a Velodyne or of the Ouster that the metadata describes, found "
-                        f"none; the first large packet has {first} bytes")  # fmt: skip
+        first = next(len(p.payload) for p in sound_datagrams(path) if _is_large(p))
+        raise FileError(f"{path}: expected packets of a Velodyne, of a Hesai that is known or of the Ouster that the "
+                        f"metadata describes, found none; the first large packet has {first} bytes")  # fmt: skip
     return sorted(found)

@@ -6,27 +6,21 @@ valgur/velodyne_decoder (`types.h`, `packet_decoder.cpp`) have them; formulas on
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
-from itertools import chain, islice, pairwise
 
 import numpy as np
 
+from lidarsynth.data import sweeps
 from lidarsynth.data.capture import Datagram
-from lidarsynth.data.whole_turns import Unread, until_broken, whole_turns
+from lidarsynth.data.sweeps import TURN, Blocks
+from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import Fields, FileError
 
 SIZE = 1206  # bytes of a packet's payload
 FLAG = 0xEEFF  # of a block
-TURN = 36000  # hundredths of a degree
-LATE = 2000  # of them: two packets of the fastest spin; what lies no farther back is late, and begins no turn
-LOOKED_AT = 2000  # packets for the sector that a sensor is set to: more than a turn of any
-REPEATED = 8  # packets that are looked through for the same one
 BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("return", [("distance", "<u2"), ("light", "u1")], 32)])
 DUAL = 0x39
-NAMES = ("x", "y", "z", "intensity", "ring", "time")
 
 
 @dataclass(frozen=True)
@@ -95,27 +89,17 @@ def turns(packets: Iterable[Datagram]) -> Iterator[Fields]:
 
 def returns(packets: Iterable[Datagram]) -> Fields:
     """The same of all returns of some packets, as one turn. Raises FileError for what is none of a model of MODELS."""
-    pieces = [(packet, 0, 12) for packet in packets]
-    if not pieces:
+    own = list(packets)
+    if not own:
         raise FileError("expected Velodyne packets, found none")
-    return _decoded(pieces)
+    for packet in own:
+        _check_size(packet.payload)
+    return sweeps.returns(own, BLOCKS)
 
 
 def unread_turns(packets: Iterable[Datagram]) -> Iterator[Unread]:
     """The same, each decoded when it is called."""
-    fault: list[FileError] = []
-    stream = until_broken(packets, fault)
-    first = list(islice(stream, LOOKED_AT))
-    return whole_turns(_parts(chain(first, stream), _seam(first)), fault)
-
-
-def _seam(packets: list[Datagram]) -> int:
-    """Where one turn ends and the next begins, hundredths of a degree: amid what a sector leaves out, else 0."""
-    own = [_azimuths(packet.payload) for packet in packets if is_velodyne(packet.payload)]
-    seen = np.unique(np.concatenate(own)).astype(int) if own else np.zeros(1, int)
-    gaps = np.diff(seen, append=seen[0] + TURN)
-    widest = int(gaps.argmax())
-    return int(seen[widest] + gaps[widest] // 2) % TURN if gaps[widest] >= LATE else 0
+    return sweeps.unread_turns(packets, BLOCKS)
 
 
 def _azimuths(payload: bytes) -> np.ndarray:
@@ -123,57 +107,13 @@ def _azimuths(payload: bytes) -> np.ndarray:
     return np.frombuffer(payload, BLOCK, 12)["azimuth"]
 
 
-_Piece = tuple[Datagram, int, int]  # a packet, the first of its blocks that are meant, and the one after the last
+def _returns_of(payload: bytes, time: int) -> Fields:
+    return decode(payload, time)[0]
 
 
-def _parts(packets: Iterable[Datagram], seam: int) -> Iterator[tuple[float, Unread]]:
-    """Share and turn of each, from seam to seam. A packet that comes once more, as from two interfaces, is passed over;
-    one that comes after its next is of its own turn."""
-    before: list[_Piece] = []  # of the turn that ended last, which is held until the next one has ended
-    pieces: list[_Piece] = []
-    recent: deque[bytes] = deque(maxlen=REPEATED)
-    last: int | None = None
-    begun = swept = ended = 0
-    for packet in packets:
-        if not is_velodyne(packet.payload) or packet.payload in recent:
-            continue
-        recent.append(packet.payload)
-        _model(packet.payload)
-        azimuth = (_azimuths(packet.payload).astype(int) - seam) % TURN
-        for first, end in _runs(azimuth):
-            start = int(azimuth[first])
-            late = last is not None and 0 < (last - start) % TURN < LATE
-            if last is None:
-                begun = start
-            elif not late and start < last:  # passed the seam
-                if before:
-                    yield ended / TURN, partial(_decoded, before)
-                before, ended = pieces, swept
-                pieces, begun = [], start
-            own = before if before and last is not None and late and start > last else pieces
-            own.append((packet, first, end))
-            if not late:
-                last = int(azimuth[end - 1])
-                swept = last - begun
-    for share, held in ((ended, before), (swept, pieces)):
-        if held:
-            yield share / TURN, partial(_decoded, held)
-
-
-def _runs(azimuth: np.ndarray) -> list[tuple[int, int]]:
-    """Runs (first block, block after the last) of a packet, cut where the azimuth, from the seam on, falls."""
-    cuts = [0, *(np.flatnonzero(np.diff(azimuth) <= -LATE) + 1).tolist(), len(azimuth)]
-    return list(pairwise(cuts))
-
-
-def _decoded(pieces: list[_Piece]) -> Fields:
-    """The returns of a turn."""
-    parts: list[Fields] = []
-    for packet, first, end in pieces:
-        points, _ = decode(packet.payload, packet.time)
-        inside = (points["block"] >= first) & (points["block"] < end)
-        parts.append({name: points[name][inside] for name in NAMES})
-    return {name: np.concatenate([part[name] for part in parts]) for name in NAMES}
+def _check_size(payload: bytes) -> None:
+    if not is_velodyne(payload):
+        raise FileError(f"expected a Velodyne packet of {SIZE} bytes, found {len(payload)}")
 
 
 def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
@@ -182,8 +122,7 @@ def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
     time  nanoseconds of the packet; a point's is that plus its place in the firing order
     Fields x y z intensity ring time, and block and azimuth (hundredths of a degree, as fired). Raises FileError.
     """
-    if not is_velodyne(payload):
-        raise FileError(f"expected a Velodyne packet of {SIZE} bytes, found {len(payload)}")
+    _check_size(payload)
     model, dual = _model(payload), payload[1204] == DUAL
     blocks = np.frombuffer(payload, BLOCK, 12)
     block, place = np.meshgrid(np.arange(12), np.arange(32), indexing="ij")
@@ -196,11 +135,9 @@ def decode(payload: bytes, time: int = 0) -> tuple[Fields, np.ndarray]:
         keep &= block % 2 == 0
     laser = place % model.lasers
     seconds = time / 1e9 + micros / 1e6
-    order = np.argsort(-np.array(model.elevations))
-    row = np.empty(model.lasers, np.int32)
-    row[order] = np.arange(model.lasers)
     fields = _points(model, laser[keep], azimuth[keep], distance[keep])
-    fields |= {"intensity": blocks["return"]["light"][keep], "ring": row[laser[keep]], "time": seconds[keep]}
+    ring = sweeps.rows(model.elevations)[laser[keep]]
+    fields |= {"intensity": blocks["return"]["light"][keep], "ring": ring, "time": seconds[keep]}
     return fields | {"block": block[keep], "azimuth": azimuth[keep]}, blocks["azimuth"]
 
 
@@ -230,13 +167,10 @@ def _rate(azimuth: np.ndarray, micros: np.ndarray) -> float:
 
 
 def _points(model: Model, laser: np.ndarray, azimuth: np.ndarray, distance: np.ndarray) -> Fields:
-    """x y z of returns: the azimuth runs clockwise from x, so y is to the left where it is negative."""
-    elevation = np.radians(np.array(model.elevations))[laser]
-    angle = np.radians(azimuth / 100 - (np.array(model.azimuths)[laser] if model.azimuths else 0))
-    flat = distance * np.cos(elevation)
+    """x y z of returns whose lasers fired at an azimuth, in hundredths of a degree."""
+    angle = azimuth / 100 - (np.array(model.azimuths)[laser] if model.azimuths else 0)
     height = np.array(model.heights)[laser] if model.heights else 0
-    return {
-        "x": (flat * np.cos(angle)).astype(np.float32),
-        "y": (-flat * np.sin(angle)).astype(np.float32),
-        "z": (distance * np.sin(elevation) + height).astype(np.float32),
-    }
+    return sweeps.points(distance, np.array(model.elevations)[laser], angle, height)
+
+
+BLOCKS = Blocks(is_velodyne, _model, _azimuths, _returns_of)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.data.angle_files import is_angles, read_angles
 from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, metadata_from, open_bag
 from lidarsynth.data.capture import is_capture
@@ -75,6 +76,8 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
             return _bag(path, reading)
         if not (path / INDEX).exists():
             return _folder(path, reading)
+    if is_angles(path):
+        return _angles(path)
     if path.name.lower().endswith(tuple(READERS)) and not path.is_dir():
         placed = {} if reading.moves or (note := viewpoint_note(path)) is None else {"viewpoint": note}
         return _image(path) | _scan_file(path, reading) | placed
@@ -164,7 +167,7 @@ def _bag(path: Path, reading: Reading) -> Lines:
         if bag.cut:
             lines["ends early"] = "; ".join(text.removeprefix(f"{path}: ") for text in bag.cut)
         clouds = bag.scan_topics()
-        if reading.metadata is not None and not any(bag.of_ouster(name) for name in clouds):
+        if reading.metadata is not None and not any(bag.takes_metadata(name) for name in clouds):
             raise FileError(f"{path}: {OF_METADATA} {reading.metadata}, found none")
         told = [_first_of_topic(bag, name, reading) for name in clouds]
     if told and all(fault is not None for _, fault in told):
@@ -207,6 +210,12 @@ def _capture(path: Path, reading: Reading) -> Lines:
         title = "first turn" if len(found) == 1 else f"--topic {sender}"
         lines |= {f"{title}: {key}": text for key, text in scan_lines(scan, dropped, reading).items()}
     return lines
+
+
+def _angles(path: Path) -> Lines:
+    up = read_angles(path).elevations
+    beams = f"{len(up)} from {max(up):+.2f} to {min(up):+.2f} degrees"
+    return {"kind": "angle correction file of a Hesai sensor, for --metadata", "beams": beams}
 
 
 def _cache(path: Path) -> Lines:

@@ -9,11 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarsynth.data.bag_records import Message, cloud_of
+from lidarsynth.data.bag_records import Packed, cloud_of
 from lidarsynth.data.bags import is_bag, metadata_from, open_bag
 from lidarsynth.data.frames import moved
 from lidarsynth.data.turns import unread_turns
-from lidarsynth.data.whole_turns import TimedTurn, Unread
+from lidarsynth.data.whole_turns import Unread
 from lidarsynth.files.fields import (
     PLACE,
     Fields,
@@ -43,8 +43,8 @@ class Reading:
 
     intensity  scale, as in `files.formats.read_with_report`
     topic      of a bag, or ADDRESS:PORT of a sensor in a capture; None = the only one
-    metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; None =
-               what the bag tells, or the only one beside it
+    metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; angle
+               correction `.csv` of the Hesai of a capture; None = what the bag tells, or the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
     labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
     rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
@@ -124,7 +124,7 @@ class MessageInput:
     name: str
     path: Path
     reading: Reading
-    message: Message | TimedTurn
+    message: Packed
 
     def read(self) -> Loaded:
         """The scan, with the message's stamp and frame. Raises FileError that names bag and message."""
@@ -259,7 +259,7 @@ def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | N
     with open_bag(path) as bag:
         name = bag.point_topic(reading.topic)
         cut += bag.cut
-        return bag.count_of(name), bag.of_ouster(name)
+        return bag.count_of(name), bag.takes_metadata(name)
 
 
 def _bag_inputs(path: Path, reading: Reading, folder: str) -> Iterator[Input]:
