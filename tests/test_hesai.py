@@ -387,3 +387,11 @@ def test_the_points_of_a_real_pandar64_lie_as_its_packets_say(shared: Path, tmp_
     assert np.linalg.norm(sides[0] - sides[1], axis=1).max() < 0.005, (
         "millimetres, as angles are hundredths of a degree"
     )
+
+
+def test_another_model_of_hesais_is_told_by_its_packets_size(tmp_path: Path):
+    other = b"\xee\xff\x01\x04" + bytes(1450)
+    path = as_capture(tmp_path / "at128.pcap", [other] * 20)
+    with pytest.raises(FileError, match=r"expected a Hesai's packets of Pandar40P, .* found those of another model, "
+                                        r"of 1454 bytes"):  # fmt: skip
+        next(capture_turns(path))

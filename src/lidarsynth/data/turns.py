@@ -81,6 +81,10 @@ def _kind(path: Path, metadata: Path | None, sender: str | None) -> tuple[Test, 
         raise FileError(f"{path}: expected packets of a LiDAR, found none")
     if any(map(_of_blocks, large)):
         return _of_blocks, lambda packets: _block_turns(packets, path, metadata)
+    if all(p.payload.startswith(hesai.HEADER) for p in large):
+        known = ", ".join(layout.name for layout in hesai.LAYOUTS)
+        raise FileError(f"{path}: expected a Hesai's packets of {known}, found those of another model, of "
+                        f"{len(large[0].payload)} bytes")  # fmt: skip
     described = ouster.read_metadata(metadata or ouster.metadata_beside(path, "beside the capture"))
     size = ouster.packet_size(described)
     return lambda packet: len(packet.payload) == size, lambda packets: ouster.unread_turns(packets, described)
