@@ -356,3 +356,10 @@ def test_batches_travel_through_the_loader_in_order():
     experiment = replace(TINY, training=replace(TINY.training, steps=3))
     batches = list(load_batches(Examples(experiment, Noise(), 2, draw_images), 1, range(2)))  # type: ignore[arg-type]
     assert len(batches) == 4 and all(isinstance(b, DiffusionBatch) and len(b.x_0) == 2 for b in batches)
+
+
+def test_steps_are_counted_as_they_come():
+    experiment = with_fields(TINY, {"training.steps": 10**15})
+    batches = load_batches(Examples(experiment, Noise(), 1, draw_images), 7, range(1))  # type: ignore[arg-type]
+    assert tuple(next(batches).seeds) == draw(TINY, Noise().x_0([0, 1, 2, 3]), 7, [0, 1, 2, 3]).seeds
+    batches.close()

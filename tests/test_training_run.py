@@ -509,3 +509,59 @@ def test_a_fault_ends_the_processes_that_read_ahead(cache: Path, tmp_path: Path)
     """They ignore SIGTERM, by which Python would end them as it leaves: it waited for them for ever."""
     ended = subprocess.run([sys.executable, "-c", DIES, cache, tmp_path / "run"], capture_output=True, timeout=120)
     assert ended.returncode == 1 and b"a fault of ours" in ended.stderr
+
+
+def test_a_run_that_is_refused_leaves_nothing(cache: Path, tmp_path: Path):
+    list(
+        write_cache(
+            tmp_path / "other",
+            lambda i: noise_image(i, SENSOR.resized(8, 64)),
+            1,
+            SENSOR.resized(8, 64),
+            {"name": "noise"},
+        )
+    )
+    for data, validation in ((cache, "other"), (cache, "nowhere"), ("synthetic", "other")):
+        with pytest.raises(ValueError, match=r"expected (the sensor|a cache folder|images of 16 x 64, found 8 x 64)"):
+            list(run(tiny(2), data, tmp_path / "out", validation=tmp_path / validation, options=QUIET))
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_run_that_was_stopped_before_it_had_looked_looks_where_it_goes_on(cache: Path, tmp_path: Path):
+    options = Options(sample_every=2, save_every=1, workers=0)
+    list(run(tiny(3), cache, tmp_path / "whole", options=options, validation=cache))
+    for step in (2, 3):  # in the midst of the run, and behind its last step
+        stopped = run(tiny(3), cache, tmp_path / str(step), options=options, validation=cache)
+        for progress in stopped:
+            if progress.step == step - 1:
+                signal.raise_signal(signal.SIGTERM)
+        assert progress.step == step and not progress.judged, "stopped where it would have looked"
+        again = list(run(tiny(3), cache, tmp_path / str(step), options=options, validation=cache))
+        assert [progress.step for progress in again if progress.judged] == sorted({step, 3})
+        assert (tmp_path / str(step) / "judged.csv").read_text() == (tmp_path / "whole" / "judged.csv").read_text()
+        names = [sorted(p.name for p in (tmp_path / at / "pictures").iterdir()) for at in (str(step), "whole")]
+        assert names[0] == names[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [("diffusion.gamma=1e300", "diffusion.gamma: expected 0 to 3.4e+38, found 1e+300"),
+     ("training.clip_norm=1e39", "training.clip_norm: expected 1e-09 to 3.4e+38, found 1e+39"),
+     ("upsampling.first=9", "upsampling.first: expected less than 4, the rows of upsampling.factor, found 9")],
+)  # fmt: skip
+def test_numbers_that_nothing_can_be_done_with_are_refused(change: str, said: str):
+    with pytest.raises(ValueError) as refused:
+        resolve("iln-tiny", (change,))
+    assert str(refused.value) == said
+
+
+def test_numbers_may_be_written_without_a_point(cache: Path, tmp_path: Path):
+    experiment = resolve("tiny", ("training.betas=[0,0]", "training.steps=1"), data=cache)
+    assert all(type(beta) is float for beta in experiment.training.betas), "torch takes no others"
+    assert [progress.step for progress in run(experiment, cache, tmp_path, options=QUIET)] == [0, 1]
+
+
+@pytest.mark.parametrize("name", ["threads", "workers"])
+def test_a_million_threads_or_processes_are_refused(name: str):
+    with pytest.raises(ValueError, match=f"expected {name} of at most 1,024, found 1,000,000"):
+        Options(**{name: 1_000_000})

@@ -18,6 +18,7 @@ from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.systems.interpolation.model import interpolated
 from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.systems.table import load_folder as load
+from lidarsynth.systems.upsampling.model import places
 from lidarsynth.systems.upsampling.training import PairBatch, QueryBatch, draw_pairs, draw_queries
 from lidarsynth.training.loop import Run, learning_rate, start, train
 from lidarsynth.training.options import Options
@@ -255,3 +256,8 @@ def test_a_run_in_a_folder_learns_from_a_cache_and_starts_another(tmp_path):
     ours, theirs = tiny("lidar-sr"), tiny("iln")
     with pytest.raises(ValueError, match=r"expected weights of lidar-sr, \(4, 1\), False, .*, found iln"):
         transfer(build_network(ours), ours, build_network(theirs), theirs, "iln")
+
+
+def test_one_known_beam_is_too_few_to_learn_what_lies_between():
+    with pytest.raises(ValueError, match="expected two known beams at least to put others between, found 1"):
+        places([3.0], [3.0])

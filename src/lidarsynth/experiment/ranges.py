@@ -7,6 +7,7 @@ from dataclasses import field, fields
 from typing import Any
 
 FINITE = (-(2.0**62), 2.0**62)
+LARGEST = 3.4e38  # that a tensor of float32 takes
 
 
 def within(default: Any, least: float, most: float = FINITE[1]) -> Any:
@@ -22,9 +23,10 @@ def check_ranges(record: Any) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool) or not isinstance(number, int | float):
                 continue
-            limit = math.inf if most == FINITE[1] and isinstance(number, float) else most
+            limit = LARGEST if most == FINITE[1] and isinstance(number, float) else most
             if not (math.isfinite(number) and least <= number <= limit):
-                span = f"at least {_plain(least)}" if most == FINITE[1] else f"{_plain(least)} to {_plain(most)}"
+                ends = most < FINITE[1] or number > limit
+                span = f"{_plain(least)} to {_plain(limit)}" if ends else f"at least {_plain(least)}"
                 raise ValueError(f"{part.name}: expected {span}, found {str(number)[:40]}")
 
 

@@ -279,6 +279,8 @@ def _value(value: Any, hint: Any, source: str) -> Any:
         name = hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint)
         form = "; it is written as a list, [1, 2]" if name.startswith("tuple") and isinstance(value, str) else ""
         raise ValueError(f"{source}: expected {name}, found {value!r:.60}{form}")
+    if get_origin(hint) is tuple and get_args(hint)[0] is float:
+        return tuple(map(float, value))  # [0, 0.99]: torch takes no other betas
     return value
 
 

@@ -8,7 +8,6 @@ import signal
 import sys
 from collections.abc import Generator
 from functools import lru_cache, partial
-from itertools import product
 from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -189,7 +188,7 @@ def load_batches(
         DataLoader(
             examples,
             batch_size=None,
-            sampler=product(range(first, examples.experiment.training.steps), parts),
+            sampler=((step, part) for step in range(first, examples.experiment.training.steps) for part in parts),
             num_workers=workers,
             pin_memory=pinned,
             worker_init_fn=_leave_endings if workers else None,

@@ -73,6 +73,12 @@ class Journal:
         self._judged.flush()
         self.curves(step, values)
 
+    def looked(self, step: int) -> bool:
+        """Whether the second table has what was seen at a step."""
+        path = self.out / JUDGED
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()[1:] if path.exists() else []
+        return any(_step_of(line) == step for line in lines)
+
     def curves(self, step: int, values: dict[str, float]) -> None:
         """A point of each named curve."""
         for name, value in values.items():

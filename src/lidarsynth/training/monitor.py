@@ -8,8 +8,9 @@ from torch import nn
 
 from lidarsynth.data.dataset import SeveralCaches
 from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.training.examples import Streets, folders_of, open_images, words_of
+from lidarsynth.training.examples import CASCADE, Streets, folders_of, open_images, words_of
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.task import Task
 
@@ -33,17 +34,21 @@ class Monitor:
         self._name = "validation" if held_out else "training_images"
         self._images: list[RangeImage] = []
         if validation is not None:  # now, and not in 5,000 steps
-            open_images(validation, experiment, VALIDATION_SEED)
+            sensors = open_images(validation, experiment, VALIDATION_SEED).sensor, build_sensor(experiment)
+            found, expected = ((sensor.height, sensor.width) for sensor in sensors)
             if not words_of(data) and not words_of(validation):
                 SeveralCaches([*folders_of(data), *folders_of(validation)])  # refuses another sensor's
+            elif experiment.model.network != CASCADE and found != expected:
+                raise ValueError(f"{validation}: expected images of {expected[0]} x {expected[1]}, "
+                                 f"found {found[0]} x {found[1]}")  # fmt: skip
 
     def look(self, network: nn.Module, step: int, journal: Journal) -> dict[str, float]:
         """The task's numbers and pictures of the averaged weights, into the journal; and the numbers."""
         self._images = self._images or _spread(self._experiment, self._source)
         values = self._task.judge(self._experiment, network, self._images)
         values = {f"{self._name}/{name}": float(value) for name, value in values.items()}
-        journal.judged(step, values)
         journal.pictures(step, "sample", self._task.pictures(self._experiment, network, self._images))
+        journal.judged(step, values)  # last: it tells a run that goes on that this look was a whole one
         return values
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+MOST = 1024  # threads or processes: a machine that is asked for a million stands still
+
 
 @dataclass(frozen=True)
 class Options:
-    """Settings that may change from one continuation of a run to the next. Raises ValueError for counts too small."""
+    """Settings that may change from one continuation of a run to the next. Raises ValueError for absurd counts."""
 
     # of the network; default: as `accelerate config` or `accelerate launch` says, else fp32
     precision: Literal["fp32", "bf16", "fp16"] | None = None
@@ -31,3 +33,6 @@ class Options:
                 raise ValueError(f"expected {name} of at least {smallest}, found {value}")
         if self.workers is not None and self.workers < 0:
             raise ValueError(f"expected workers of at least 0, found {self.workers}")
+        for name in ("threads", "workers"):
+            if (value := getattr(self, name) or 0) > MOST:
+                raise ValueError(f"expected {name} of at most {MOST:,}, found {value:,}")

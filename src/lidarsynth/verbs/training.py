@@ -69,7 +69,7 @@ def resolve(name: str, changes: tuple[str, ...] = (), seed: int = 0, data: str |
 
 
 def check_words(experiment: Experiment) -> None:
-    """Raises ValueError by name for a word that its table does not have, and for no steps."""
+    """Raises ValueError by name for a word that its table does not have, for no steps, and for no known rows."""
     tables = {
         "data": {"codec": CODECS, "projection": PROJECTIONS},
         "model": {"network": SYSTEMS},
@@ -82,6 +82,9 @@ def check_words(experiment: Experiment) -> None:
                 raise ValueError(f"{group}.{name}: expected one of {', '.join(table)}, found {word!r}")
     if experiment.training.steps < 1:
         raise ValueError("training.steps: expected at least 1, found 0")
+    if (group := experiment.upsampling) and group.first >= group.factor[0]:
+        raise ValueError(f"upsampling.first: expected less than {group.factor[0]}, the rows of upsampling.factor, "
+                         f"found {group.first}")  # fmt: skip
 
 
 def _for_images(experiment: Experiment, data: str | Path, chosen: set[str]) -> Experiment:
@@ -142,12 +145,17 @@ def _run(
     resume: bool,
     accelerator: Accelerator,
 ) -> Iterator[Progress]:
+    task = task_of(experiment)
+    task = replace(task, pictures=completions) if experiment.base else task  # which a base generates
+    monitor = Monitor(experiment, task, data, validation)  # first, as it refuses images before anything is written
     experiment, state, note = _begin(experiment, images, data, out, begun, resume, accelerator)
-    task = replace(state.task, pictures=completions) if experiment.base else state.task  # which a base generates
-    monitor = Monitor(experiment, task, data, validation)
     if accelerator.is_main_process:
         yield Progress(state.step, {}, 0.0, 0.0, note=note)
     with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
+        due = state.step and options.sample_every and _due(state.step, options.sample_every, experiment)
+        if journal and due and not journal.looked(state.step):  # the run was stopped at this step, before it had looked
+            judged = monitor.look(state.ema.to(accelerator.device), state.step, journal)
+            yield Progress(state.step, {}, 0.0, 0.0, judged=judged)
         for progress in _named(train(experiment, state, images, options, accelerator), out):
             stop = any_process(accelerator, bool(received))
             if journal:

@@ -208,8 +208,10 @@ def scaled(distance: Tensor, group: Upsampling) -> Tensor:
 def places(elevations: Sequence[float] | np.ndarray, beams: Sequence[float] | np.ndarray) -> np.ndarray:
     """(H,) where `elevations` (H,) lie among `beams` (h,), as fractional index; both fall, in the same unit.
 
-    Beyond the outermost beams the spacing is that of the two next to there. Needs two beams.
+    Beyond the outermost beams the spacing is that of the two next to there. Raises ValueError for fewer than two.
     """
+    if len(beams) < 2:
+        raise ValueError(f"expected two known beams at least to put others between, found {len(beams)}")
     wanted, beams = np.asarray(elevations, np.float64), np.asarray(beams, np.float64)
     last = len(beams) - 1
     place = np.interp(-wanted, -beams, np.arange(len(beams)))
