@@ -161,6 +161,15 @@ def test_boxes_move_with_their_velocity(driven: list[Frame]):
     assert moved >= 3
 
 
+@pytest.mark.parametrize("rate", [10, 20, 50])
+def test_everyone_is_as_fast_in_the_first_turn_as_they_go(rate: int):
+    """Of 50 turns a second the first is over before a step of the traffic's clock is: all were a third too slow."""
+    drive = LabelledStreets(0, 1, SMALL, Options(frames=1, rate=rate, density=Density(traffic=2))).drive(0)
+    begun, first = drive.moment(0.0), drive.moment(0.5 / rate)
+    assert first.present.any() and np.linalg.norm(first.velocity, axis=1).max() > 3
+    np.testing.assert_allclose(begun.place + first.velocity * 0.5 / rate, first.place, atol=2e-3)
+
+
 def test_what_stands_is_at_one_place_through_a_drive(driven: list[Frame]):
     """Poses and deskewed points are of one world: parked boxes, and their points in it, do not wander."""
     first, last = driven[0], driven[-1]

@@ -27,14 +27,16 @@ from lidarsynth.data.bag_writer import message_of, write_bag
 from lidarsynth.data.bags import open_bag
 from lidarsynth.files.formats import read, write
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import RAW
 from lidarsynth.lidar.sensor import SENSORS
+from lidarsynth.streets.actors import KINDS
 from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Loaded, Reading, inputs_of
 from lidarsynth.verbs.placement import read_transform
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.colouring import colourings
 from lidarsynth.viewer.packing import Shown, packed
-from lidarsynth.viewer.page import page
+from lidarsynth.viewer.page import STATIC, page
 from lidarsynth.viewer.pairs import compared
 from lidarsynth.viewer.rows import rows_of
 from lidarsynth.viewer.series import Stream, series_of
@@ -86,6 +88,31 @@ def test_fields_come_back_and_absent_ones_do_not():
     np.testing.assert_allclose(blocks["reflectance"] / 255, scan.reflectance, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(blocks["confidence"] / 255, np.clip(np.linspace(-1, 2, n), 0, 1), atol=0.5 / 255 + 1e-6)
     assert set(unpacked(packed(Shown(Scan(scan.xyz))))[1]) == {"xyz", "row"}
+
+
+def test_raw_ids_are_shown_as_their_classes_and_labels_that_are_none_are_told(tmp_path: Path):
+    """`realise` of a labelled `.bin` writes a `.ply` with `raw_label`; the page had no classes, and no word of why."""
+    scan = turn()
+    n = len(scan)
+    words = RAW[np.arange(n) % 20] | np.uint32(7 << 16)
+    write(tmp_path / "raw.ply", Scan(scan.xyz, scan.reflectance, extra={"raw_label": words}))
+    header, blocks = unpacked(packed(read_shown(tmp_path / "raw.ply")))
+    np.testing.assert_array_equal(blocks["label"], np.arange(n) % 20)
+    assert header["notes"] == []
+    for extra, told in (
+        ({"label": np.full(n, 252, np.uint16)}, "training classes of 0-19 in the field label, found 252"),
+        ({"Class": np.full(n, 1.5, np.float32)}, "training classes of 0-19 in the field Class, found 1.5"),
+        ({"raw_label": np.full(n, 9, np.uint32)}, "SemanticKITTI's raw ids in the field raw_label, found others"),
+    ):
+        header, blocks = unpacked(packed(Shown(Scan(scan.xyz, extra=extra))))
+        assert header["notes"] == [f"classes left out: expected {told}"] and "label" not in blocks
+
+
+def test_every_kind_of_box_has_a_colour():
+    """Lorries and coaches were of no kind."""
+    script = (STATIC / "lines.js").read_text(encoding="utf-8")
+    colours = script.split("const BOX_COLOURS = {")[1].split("};")[0]
+    assert [kind for kind in KINDS if not re.search(rf"\b{kind}: ", colours)] == []
 
 
 def test_rows_are_the_beams_however_they_are_told():

@@ -84,9 +84,10 @@ class Drive:
     def moment(self, time: float) -> Moment:
         """Where everyone is at `time`, seconds from the start."""
         place, yaw = self._placed(time)
-        before, after = self._placed(time - STEP / 2), self._placed(time + STEP / 2)
-        velocity = (after[0] - before[0]) / STEP
-        spin = (np.mod(after[1] - before[1] + np.pi, 2 * np.pi) - np.pi) / STEP
+        early, late = max(time - STEP / 2, 0.0), time + STEP / 2  # of more than 20 turns a second the first has no more
+        before, after = self._placed(early), self._placed(late)
+        velocity = (after[0] - before[0]) / (late - early)
+        spin = (np.mod(after[1] - before[1] + np.pi, 2 * np.pi) - np.pi) / (late - early)
         s = _at(self.along, np.array([time]))[0]
         half, ends = self.actors.size[:, 0] / 2, self.reach[self.number]
         present = (self.number < 0) | ((s - half > ends[:, 0]) & (s + half < ends[:, 1]))

@@ -13,7 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from lidarsynth.files.fields import find
+from lidarsynth.files.whole_numbers import stray
+from lidarsynth.lidar.removal import own_classes
 from lidarsynth.lidar.scan import Scan
+from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.viewer.rows import rows_of
 
 MAGIC = b"LSV1"
@@ -47,7 +51,7 @@ def packed(shown: Shown) -> bytes:
         "blocks": [{"name": name, "type": values.dtype.str[1:], "count": values.size}
                    for name, values in blocks.items()],
         "boxes": list(shown.boxes),
-        "notes": [*shown.notes, *([] if len(scan) else ["no point in this scan"])],
+        "notes": [*shown.notes, *_classes_left_out(scan), *([] if len(scan) else ["no point in this scan"])],
         "name": shown.name,
     }  # fmt: skip
     text = json.dumps(header, allow_nan=False).encode()
@@ -69,13 +73,24 @@ def _fields(scan: Scan) -> dict[str, np.ndarray]:
     fields: dict[str, np.ndarray] = {}
     if scan.reflectance.any():
         fields["reflectance"] = _in_255(scan.reflectance)
-    if scan.label is not None:
-        fields["label"] = scan.label.astype(np.uint8)
+    if (classes := own_classes(scan)) is not None:
+        fields["label"] = classes.astype(np.uint8)
     if (new := scan.extra.get("new")) is not None:
         fields["new"] = (np.asarray(new) > 0).astype(np.uint8)
     if (confidence := scan.extra.get("confidence")) is not None:
         fields["confidence"] = _in_255(confidence)
     return fields
+
+
+def _classes_left_out(scan: Scan) -> list[str]:
+    """What is to be said of labels that are no class of ours, a line each."""
+    name = find(dict(scan.extra), "label")
+    if own_classes(scan) is not None or (name is None and "raw_label" not in scan.extra):
+        return []
+    if name is None:
+        return ["classes left out: expected SemanticKITTI's raw ids in the field raw_label, found others"]
+    found = stray(scan.extra[name], len(CLASSES) - 1)
+    return [f"classes left out: expected training classes of 0-{len(CLASSES) - 1} in the field {name}, found {found}"]
 
 
 def _in_255(values: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ function ringLines(distances, ground) {
 
 const BOX_COLOURS = {
   car: [100, 170, 255], van: [100, 170, 255], truck: [164, 120, 255], bus: [164, 120, 255], trailer: [164, 120, 255],
+  lorry: [164, 120, 255], coach: [164, 120, 255],
   person: [255, 92, 92], pedestrian: [255, 92, 92], bicyclist: [255, 110, 210], motorcyclist: [255, 110, 210],
   bicycle: [120, 230, 235], motorcycle: [120, 230, 235],
 };
