@@ -408,3 +408,6 @@ def test_the_verb_writes_says_and_grows(tmp_path: Path, capsys: pytest.CaptureFi
         main([*words, "-n", "2", "--rain", "-3"])
     assert refused.value.code == 2
     assert "expected rain of 0 to 200 mm/h" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main([*words[:-1], "-1", "-n", "2"])
+    assert "expected --workers of at least 0, found -1" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from lidarsynth.cli.arguments import arg
 from lidarsynth.cli.scan_files import may_draw
-from lidarsynth.cli.terminal import counted, say
+from lidarsynth.cli.terminal import at_least, counted, say
 from lidarsynth.lidar.plural import plural
 
 if TYPE_CHECKING:
@@ -64,6 +64,7 @@ def streets(
     from lidarsynth.streets.frame import LabelledStreets, Options
     from lidarsynth.streets.weather import Weather
 
+    at_least(0, {"workers": workers})
     density = Density(traffic, parking, pedestrians, vegetation, groups, motorcycles, works, kerbs, cyclists, heavy,
                       walls, barriers, panels, garages, riders, walkers, racks)  # fmt: skip
     weather, speed = Weather(rain, fog), speed and speed / 3.6
