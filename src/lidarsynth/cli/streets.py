@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 def streets(
     out: Annotated[Path, arg(help="folder of the data set.")],
     count: Annotated[int, arg(aliases=["-n"], help="how many scans, or drives with --frames, at least.")] = 100,
-    sensor: Annotated[
-        str, arg(metavar="SENSOR", help="a word such as vlp-16, or a .toml/.json file.")
-    ] = "hdl-64e-kitti",
+    sensor: Annotated[str, arg(metavar="SENSOR", help="such as vlp-16, or a .toml/.json file.")] = "hdl-64e-kitti",
     format: Annotated[
         Literal["semantickitti", "kitti", "nuscenes", "pcd"], arg(help="layout that others' tools read.")
     ] = "semantickitti",
