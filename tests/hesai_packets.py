@@ -6,6 +6,9 @@ import struct
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
+
+from lidarsynth.cli.main import main
 
 # What is sent before the blocks and before each of them, blocks, lasers, bytes after a reflectivity, bytes at the end.
 HEADS: dict[str, tuple[bytes, bytes, int, int, int, int]] = {
@@ -50,3 +53,13 @@ def angles_csv(elevations: Sequence[float], azimuths: Sequence[float], first: st
     """An angle correction file."""
     rows = [f"{i},{e},{a}" for i, (e, a) in enumerate(zip(elevations, azimuths, strict=True), 1)]
     return "\n".join([f"{first},Elevation,Azimuth", *rows, ""])
+
+
+def asked_for_angles(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line by which a verb asks for the angles of a Pandar64."""
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "expected --metadata ANGLES.csv, the angle correction file of the Pandar64" in said
+    return said

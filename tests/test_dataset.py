@@ -252,7 +252,7 @@ def test_scans_that_changed_are_made_anew(tmp_path: Path, capsys: pytest.Capture
         error = capsys.readouterr().err
         assert told in error and len(error) < 700
         assert "name hdl-32e" in error or "split" in error
-    for more in (["--split", "train"], ["--projection", "unfolding"]):
+    for more in (["--split", "train"], ["--projection", "unfolding"], ["--intensity", "byte"]):
         with pytest.raises(SystemExit, match="2"):
             main(["data", "synthetic", str(tmp_path / "streets"), "-n", "2", *more])
         assert f"expected {more[0]} with a data set, found it with synthetic" in capsys.readouterr().err

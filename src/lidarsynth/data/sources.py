@@ -103,7 +103,9 @@ def prepare(
     count  of synthetic scans alone; None = 1000
     """
     if name == "synthetic":
-        others = {"--split": split, "--projection": projection, "--transform": transform, "--rings": rings}
+        scale = None if intensity == "auto" else intensity
+        others = {"--split": split, "--projection": projection, "--intensity": scale, "--transform": transform}
+        others |= {"--rings": rings}
         for word, given in others.items():
             if given is not None:
                 raise ValueError(f"expected {word} with a data set, found it with synthetic, whose scans are cast")

@@ -20,8 +20,8 @@ def pad_width(x: Tensor, ring: bool = True) -> Tensor:
 
 
 class ColumnLinear(nn.Linear):
-    """`nn.Linear` whose weights (O, I) lie column by column: of 8 to 48 rows at a time, as where pixels are drawn one
-    after the other, its product takes two thirds of the time."""
+    """`nn.Linear`, (..., I) -> (..., O), whose weights (O, I) lie column by column: of 8 to 24 rows at a time, as where
+    pixels are drawn one after the other, its product takes about two thirds of the time."""
 
     def __init__(self, in_features: int, out_features: int, bias: bool = True):
         super().__init__(in_features, out_features, bias)

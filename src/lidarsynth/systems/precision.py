@@ -18,8 +18,7 @@ def resolved_precision(word: str, device: torch.device) -> str:
 def multiplies_bf16(device: torch.device) -> bool:
     """Whether bf16 is faster than fp32 there: a GPU with it, or a processor with AMX or AVX-512 instructions for it.
 
-    Without AMX, Intel's multiply half as many pairs of bf16 in a cycle as others do, and completion takes a quarter
-    longer than in fp32.
+    Of Intel's it is AMX alone: without it completion takes a quarter longer than in fp32 (docs/scaling.md).
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
