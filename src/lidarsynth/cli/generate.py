@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,6 +24,8 @@ from lidarsynth.lidar.plural import plural
 
 if TYPE_CHECKING:
     from lidarsynth.lidar.sensor import Sensor
+
+FEW = 8  # scans, as many as are drawn together at least, which one process makes
 
 
 def generate(
@@ -53,12 +56,16 @@ def generate(
     picture: Picture = True,
 ) -> None:
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
+    from lidarsynth.data.workers import begin_early
     from lidarsynth.files.lock import only_writer
-    from lidarsynth.systems.fingerprint import fingerprint
-    from lidarsynth.verbs import generation
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
+    if count > FEW and (workers or os.cpu_count() or 1) > 1 and device == "cpu":
+        begin_early("lidarsynth.verbs.generation", "lidarsynth.weights.load")
+    from lidarsynth.systems.fingerprint import fingerprint
+    from lidarsynth.verbs import generation
+
     labels = labels or boxes
     endings = generation.endings_of(format, labels, picture, boxes)
     source = generation.Drawing(model, device, sensor, labels, layouts, precision)

@@ -71,6 +71,7 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     """Do the job with every scan, say what came of it, and return the results, after those of scans that were there
     already, as far as reports tell them. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
+    from lidarsynth.data.workers import begin_early
     from lidarsynth.verbs.expansion import is_stream
     from lidarsynth.verbs.inputs import Reading, inputs_of
     from lidarsynth.verbs.placement import parse_rings, read_transform
@@ -88,6 +89,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
              "read them")  # fmt: skip
     for line in inputs.words:
         warn(line)
+    if many.workers > 1 and not inputs.single:
+        begin_early("lidarsynth.verbs.batch", "lidarsynth.weights.load")
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)

@@ -12,8 +12,9 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain, islice
+from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
@@ -23,6 +24,7 @@ AHEAD = 16  # items of each process that are begun or wait for it: there may be 
 
 Item = TypeVar("Item")
 _make: list[Callable[[Any], Any]] = []  # of this worker process; sent once, not with every item
+_begun: list[str] = []  # what `begin_early` has begun
 
 
 def in_order(make: Callable[[Item], Any], items: Iterable[Item], workers: int) -> Generator[Any, None, None]:
@@ -44,6 +46,19 @@ def in_order(make: Callable[[Item], Any], items: Iterable[Item], workers: int) -
             begun.extend(submit(_work, item) for item in islice(items, 1))
 
 
+def begin_early(*modules: str) -> None:
+    """On Linux, begins the process from which this one's workers then come, and which imports modules meanwhile: those
+    that come without it do so each by itself, and not before they are asked for.
+
+    To be called where this process still has much to do, as reading a model; `os.environ` of workers is as it is now.
+    """
+    if sys.platform == "linux":
+        with _uninterrupted(), suppress(OSError):  # there is none where TMPDIR is too long for the name of a socket
+            forkserver.set_forkserver_preload([*modules])
+            forkserver.ensure_running()
+            _begun.extend(modules)
+
+
 @contextmanager
 def pool_of(
     workers: int, start: Callable[[Any], None], make: Any, goes_on: str
@@ -54,8 +69,9 @@ def pool_of(
     Raises OSError when one is gone.
     """
     # Not fork: threads of torch in this process would be copied in whatever state they are.
+    context = multiprocessing.get_context("forkserver" if _begun else "spawn")
     others, done = set(multiprocessing.active_children()), False
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start, (make,))
+    pool = ProcessPoolExecutor(workers, context, start, (make,))
 
     def submit(call: Callable[[Any], Any], item: Any) -> Future:
         with _uninterrupted():

@@ -84,13 +84,14 @@ def perspective(
     seen = (depth > NEAR) & inside.all(axis=1)
     order = np.flatnonzero(seen)[np.argsort(-depth[seen], kind="stable")]
     winner = _z_buffer(pixel[order], radius[order], (width, height))
-    canvas = np.empty((height * width, 3), np.uint8)
-    canvas[:] = background_colour(background)
+    canvas = np.empty((height, width, 3), np.uint8)
+    canvas[0] = background_colour(background)
+    canvas[1:] = canvas[0]
     drawn = np.flatnonzero(winner >= 0)
     colours = point_colours(scan, by, max_range)[order][winner[drawn]]
     light = (INK if background == "white" else 1) * _eye_dome(winner, depth[order], drawn, width, height, shading)
-    canvas[drawn] = np.rint(colours * light[:, None]).astype(np.uint8)
-    return np.asarray(Image.fromarray(canvas.reshape(height, width, 3)).reduce(2))
+    canvas.reshape(-1, 3)[drawn] = np.rint(colours * light[:, None]).astype(np.uint8)
+    return np.asarray(Image.fromarray(canvas).reduce(2))
 
 
 def _z_buffer(pixel: np.ndarray, radius: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -103,11 +104,13 @@ def _z_buffer(pixel: np.ndarray, radius: np.ndarray, size: tuple[int, int]) -> n
     count = np.searchsorted(np.sort(away), radius, side="right")
     point = np.repeat(np.arange(len(pixel), dtype=np.int32), count)
     offset = np.arange(len(point)) - np.repeat(np.cumsum(count) - count, count)
-    column, row = (np.floor(pixel).astype(np.int32)[point] + grid[offset].astype(np.int32)).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    winner = np.full(height * width, -1, np.int32)
-    winner[row[inside] * width + column[inside]] = point[inside]  # numpy keeps the last, that is the nearest
-    return winner
+    margin = 2 * reach + 2  # pixels around the picture, where discs of points beside it go
+    wide = width + 2 * margin
+    column, row = np.floor(pixel).astype(np.int32).T + margin
+    winner = np.full((height + 2 * margin) * wide, -1, np.int32)
+    at = (row * wide + column)[point] + (grid @ [1, wide]).astype(np.int32)[offset]
+    winner[at] = point  # numpy keeps the last, that is the nearest
+    return winner.reshape(-1, wide)[margin:-margin, margin:-margin].ravel()
 
 
 def _eye_dome(
@@ -115,14 +118,11 @@ def _eye_dome(
 ) -> np.ndarray:
     """(len(drawn),) light in (0, 1]: exp(-strength * sum over 8 neighbours of max(0, log depth - log depth'))."""
     pad = max(width // 800, 2)  # pixels between a pixel and its neighbours
-    far = np.full((height + 2 * pad, width + 2 * pad), np.inf, np.float32)
-    inner = np.full(height * width, np.inf, np.float32)
-    inner[drawn] = np.log2(depth[winner[drawn]])
-    far[pad:-pad, pad:-pad] = inner.reshape(height, width)
-    far, index = far.ravel(), (drawn // width + pad) * (width + 2 * pad) + drawn % width + pad
-    here = inner[drawn]
+    wide = width + 2 * pad
+    far, index = np.full((height + 2 * pad) * wide, np.inf, np.float32), drawn + (2 * (drawn // width) + wide + 1) * pad
+    far[index] = here = np.log2(depth[winner[drawn]])
     shade = np.zeros(len(drawn), np.float32)
     for row, column in np.ndindex(3, 3):
-        neighbour = far[index + pad * ((row - 1) * (width + 2 * pad) + column - 1)]
+        neighbour = far[index + pad * ((row - 1) * wide + column - 1)]
         shade += np.clip(here - neighbour, 0, 0.5)
     return np.exp(-strength * shade)
