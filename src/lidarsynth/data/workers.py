@@ -14,7 +14,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from itertools import chain, islice
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
@@ -53,6 +53,7 @@ def begin_early(*modules: str) -> None:
     To be called where this process still has much to do, as reading a model; `os.environ` of workers is as it is now.
     """
     if sys.platform == "linux":
+        resource_tracker.ensure_running()  # which lets Ctrl-C through where it begins
         with _uninterrupted(), suppress(OSError):  # there is none where TMPDIR is too long for the name of a socket
             forkserver.set_forkserver_preload([*modules])
             forkserver.ensure_running()

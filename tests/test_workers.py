@@ -1,0 +1,50 @@
+"""Workers that come from a process which begins while the first one still reads its model."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lidarsynth.cli.generate import FEW
+from lidarsynth.systems.cascade.layout import BY_COLUMNS, block
+
+EARLY = """
+from lidarsynth.data.workers import begin_early, in_order
+if __name__ == "__main__":
+    begin_early("lidarsynth.lidar.plural")
+    told = "(__import__('sys').modules.keys() >= {'lidarsynth.lidar.plural'}, __import__('os').getcwd(), %d)"
+    print(list(in_order(eval, [told % i for i in range(5)], 2)))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers begin by themselves")
+@pytest.mark.parametrize("length", [1, 120])
+def test_early_ones_have_imported_it_and_answer_in_order(length: int, tmp_path: Path):
+    """Of a TMPDIR whose sockets have too long a name there are others, which import it themselves, or not at all."""
+    (tmp_path / "early.py").write_text(EARLY)
+    (temporary := tmp_path / ("t" * length)).mkdir()
+    words, env = [sys.executable, tmp_path / "early.py"], os.environ | {"TMPDIR": str(temporary)}
+    done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=100)
+    assert done.stderr == ""
+    assert done.stdout == f"{[(length == 1, str(tmp_path), i) for i in range(5)]}\n"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers begin by themselves")
+@pytest.mark.parametrize("seconds", [0.4, 1.2, 2.5])
+def test_ctrl_c_in_a_terminal_is_one_line_while_workers_begin(seconds: float, tmp_path: Path):
+    """There it goes to all processes of a command, whatever these import at that moment."""
+    words = [sys.executable, "-m", "lidarsynth", "generate", "-n", "64", "--workers", "2", "--out", tmp_path]
+    process = subprocess.Popen(words, stdout=-1, stderr=-1, text=True, start_new_session=True)
+    time.sleep(seconds)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=100)
+    assert out == "" and "Traceback" not in err
+    assert process.returncode in (130, -signal.SIGINT)
+
+
+def test_as_few_scans_as_one_process_draws_begin_no_other():
+    assert min(block((BY_COLUMNS, 128), choice) for choice in (1, 3)) == FEW
