@@ -45,7 +45,7 @@ function writeCaption(context) {
   } else if (legend.querySelector(".note")) { // a scan without that field
     context.fillText(legend.textContent, 16, 82);
   } else {
-    [...legend.querySelectorAll(".class")].forEach((row, k) => {
+    [...legend.querySelectorAll(".class[aria-pressed=true]")].forEach((row, k) => {
       context.fillStyle = row.querySelector("i").style.background;
       context.fillRect(16, 84 + 19 * k, 10, 10);
       context.fillStyle = "#8d97a6";
