@@ -27,6 +27,7 @@ from lidarsynth.pictures.colours import (
 from lidarsynth.pictures.figure import PAPER, class_legend, colour_bar, compare, panel
 from lidarsynth.pictures.learned import learned_figure
 from lidarsynth.pictures.perspective import Camera, perspective
+from lidarsynth.pictures.portrait import _ahead as portrait_from_above
 from lidarsynth.pictures.portrait import before_and_after, portrait, strips
 from lidarsynth.pictures.render import (
     BACKGROUNDS,
@@ -147,6 +148,30 @@ def test_bev_leaves_out_what_is_outside_and_draws_rings():
         bev(no_points(), extent=0)
     with pytest.raises(ValueError, match="background of dark, white, found 'pink'"):
         bev(no_points(), background="pink")
+
+
+@pytest.mark.parametrize("right", [False, True])
+def test_distances_from_above_can_be_read_wherever_forward_is(right: bool):
+    picture = bev(no_points(), background="white", rings=30.0, right=right).astype(int)
+    text = (picture < 200).all(-1)
+    text[380:420, 380:420] = False  # the arrow
+    rows, columns = (np.flatnonzero(text.any(axis)) for axis in (1, 0))
+    assert len(columns) and np.ptp(columns) > 1.5 * np.ptp(rows), "a line of text is wide"
+    where = (800 - rows.mean()) if not right else columns.mean()
+    assert where == pytest.approx(400 + 30 / 40 * 400, abs=30)
+    forward = bev(one_point(15, 0), background="white", rings=0, right=right) != bev(
+        no_points(), background="white", rings=0, right=right
+    )
+    assert np.argwhere(forward.any(-1)).mean(0) == pytest.approx([400, 550] if right else [250, 400], abs=1)
+
+
+def test_the_view_from_above_in_a_picture_has_readable_distances():
+    picture = portrait_from_above(no_points(), 640).astype(int)
+    text = (picture < 200).all(-1)
+    text[150:210, 290:350] = False
+    columns = np.flatnonzero(text.any(0))
+    rows = np.flatnonzero(text[:, columns[-1] - 25 :].any(1))  # of the outermost
+    assert np.ptp(rows) < 15
 
 
 def test_camera_looks_at_its_target_with_left_on_the_left():

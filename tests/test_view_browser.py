@@ -365,6 +365,17 @@ def test_the_screenshot_holds_view_and_strips(page: Page, alone: str):
     assert (shot[80:95, 16:256].max(axis=2) > 100).mean() > 0.5, "the legend"
 
 
+def test_the_screenshot_has_the_distances_of_the_rings(page: Page, alone: str):
+    opened(page, alone)
+    shots = []
+    for text in ("", "10 m"):
+        page.run(f"motion.paint(1), [...$('distances').children].forEach((one) => one.textContent = '{text}')")
+        shots.append(pixels(base64.b64decode(page.run("pictureNow().toDataURL('image/png')").partition(",")[2])))
+    page.run("$('distances').replaceChildren()")  # which are made anew
+    x, y = np.argwhere((shots[0] != shots[1]).any(-1)).mean(0)[::-1]
+    assert abs(x - 640) < 20 and 0 < y < page.run("$('scene').height")
+
+
 def test_the_screenshot_says_what_a_scan_lacks(page: Page, tmp_path: Path):
     path, bare = tmp_path / "view.html", Scan(street().xyz)
     write_page(path, "pair", [Entry("pair", {"after": Shown(street()), "before": Shown(bare)})])

@@ -85,7 +85,7 @@ def _nothing(strip: np.ndarray, name: str = "") -> Picture:
 
 def _ahead(points: Scan | RangeImage, width: int) -> np.ndarray:
     """(width * 9 // 16, width, 3) uint8: the bird's eye view turned so that the road runs to the right."""
-    square = np.rot90(bev(points, extent=EXTENT, size=width, background="white"), -1)
+    square = bev(points, extent=EXTENT, size=width, background="white", right=True)
     spare = (width - width * 9 // 16) // 2
     return np.ascontiguousarray(square[spare : spare + width * 9 // 16])
 

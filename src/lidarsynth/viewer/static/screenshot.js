@@ -23,8 +23,17 @@ function pictureNow() {
   context.drawImage(view, 0, 0);
   strips.forEach((strip, k) => context.drawImage(strip, 0, view.height + gap + k * (tall + gap), canvas.width, tall));
   context.scale(scale, scale);
+  writeDistances(context);
   writeCaption(context);
   return canvas;
+}
+
+function writeDistances(context) {
+  Object.assign(context, { font: "11px system-ui, sans-serif", textBaseline: "middle", fillStyle: "#8390a8" });
+  for (const label of $("distances").children) {
+    const { e: x, f: y } = new DOMMatrix(label.style.transform);
+    if (!label.hidden) context.fillText(label.textContent, x - 12, y);
+  }
 }
 
 function writeCaption(context) {
