@@ -438,6 +438,14 @@ def test_a_first_scan_that_is_broken_is_no_fault_of_the_page(page: Page, tmp_pat
             assert page.run("scene.lines.length") == wanted
 
 
+def test_the_title_stands_while_the_first_scan_is_read(page: Page, alone: str):
+    opened(page, alone)
+    early = "const read = Source.prototype.load; Source.prototype.load = () => new Promise(() => {});"
+    page.run(f"(() => {{ {early} $('title').textContent = ''; begin(); Source.prototype.load = read; }})()")
+    assert page.run("$('title').textContent") == "street · first"
+    page.shown = ("", 0, 0)  # to be opened anew
+
+
 def test_nobody_goes_back_from_the_first_to_a_last_that_is_not_known(page: Page):
     items = [StandIn(f"item {k}", Path(), street(2_000, k)) for k in range(3)]
     stream = Stream(lambda mark, number: ((0, item) for item in items), None)

@@ -266,6 +266,7 @@ function begin() {
   addEventListener("keydown", onKey);
   $("scene").addEventListener("webglcontextlost", () => show("the graphics card was lost: load the page again"));
   steer($("scene"), $("strips"));
+  paintBar(); // its title, while the first scan is read
   return go(0, 0);
 }
 
