@@ -95,6 +95,14 @@ class Page:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=held, clickCount=1)
         self.settle()
 
+    def click(self, at: tuple[float, float], times: int = 1, shift: bool = False) -> None:
+        """Press and let go there, so many times in a row."""
+        for count in range(1, times + 1):
+            for kind in ("mousePressed", "mouseReleased"):
+                self.call("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], button="left", buttons=1,
+                          clickCount=count, modifiers=8 * shift)  # fmt: skip
+        self.settle()
+
     def wheel(self, at: tuple[int, int], turned: int) -> None:
         """Turn the wheel over a place."""
         self.call("Input.dispatchMouseEvent", type="mouseWheel", x=at[0], y=at[1], deltaX=0, deltaY=turned)

@@ -19,7 +19,7 @@ from lidarsynth.systems.diffusion.model import LidarModel
 from lidarsynth.systems.filling import Filling
 from lidarsynth.systems.interpolation.model import interpolated
 from lidarsynth.systems.table import assemble
-from lidarsynth.verbs.completion import complete_scan, hidden_part, judged, named_sensor, upsample_scan
+from lidarsynth.verbs.completion import _measured, complete_scan, hidden_part, judged, named_sensor, upsample_scan
 from lidarsynth.weights.load import load
 
 FLAT = Sensor("flat", (2.0, 0.0, -2.0, -4.0), width=8, min_range=1.0, max_range=50.0)
@@ -240,6 +240,15 @@ def test_a_scan_without_reflectance_is_judged_by_range_alone(model: LidarModel):
     assert all(math.isnan(e.reflectance_mae) and math.isnan(e.reflectance_rmse) for e in errors.values())
     assert all(e.range_mae > 0 for e in errors.values())
     assert not math.isnan(complete_scan(model, scan, "beams:2").errors["nearest"].reflectance_mae)
+
+
+def test_a_reflectance_that_the_model_gave_is_not_drawn_as_measured(model: LidarModel):
+    scan = room(SENSORS["hdl-64e-kitti"].resized(width=256))
+    for given in (scan, replace(scan, reflectance=np.zeros(len(scan), np.float32))):
+        image = complete_scan(model, given).image
+        points = np.where(image.mask[..., None], image.points(), np.float32(0))
+        lit = replace(image, xyz=points, reflectance=np.where(image.mask, np.float32(0.5), np.float32(0)))
+        assert _measured(model, given, lit, Filling()).reflectance.any() == given.reflectance.any()
 
 
 def test_interpolation_works_in_metres_and_cuts_overshoots():

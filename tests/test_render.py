@@ -10,6 +10,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.sector import runs_outside
 from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.pictures.colours import (
@@ -26,7 +27,8 @@ from lidarsynth.pictures.colours import (
 from lidarsynth.pictures.figure import PAPER, class_legend, colour_bar, compare, panel
 from lidarsynth.pictures.learned import learned_figure
 from lidarsynth.pictures.perspective import Camera, perspective
-from lidarsynth.pictures.portrait import before_and_after, portrait
+from lidarsynth.pictures.portrait import _ahead as portrait_from_above
+from lidarsynth.pictures.portrait import before_and_after, portrait, strips
 from lidarsynth.pictures.render import (
     BACKGROUNDS,
     EMPTY,
@@ -146,6 +148,30 @@ def test_bev_leaves_out_what_is_outside_and_draws_rings():
         bev(no_points(), extent=0)
     with pytest.raises(ValueError, match="background of dark, white, found 'pink'"):
         bev(no_points(), background="pink")
+
+
+@pytest.mark.parametrize("right", [False, True])
+def test_distances_from_above_can_be_read_wherever_forward_is(right: bool):
+    picture = bev(no_points(), background="white", rings=30.0, right=right).astype(int)
+    text = (picture < 200).all(-1)
+    text[380:420, 380:420] = False  # the arrow
+    rows, columns = (np.flatnonzero(text.any(axis)) for axis in (1, 0))
+    assert len(columns) and np.ptp(columns) > 1.5 * np.ptp(rows), "a line of text is wide"
+    where = (800 - rows.mean()) if not right else columns.mean()
+    assert where == pytest.approx(400 + 30 / 40 * 400, abs=30)
+    forward = bev(one_point(15, 0), background="white", rings=0, right=right) != bev(
+        no_points(), background="white", rings=0, right=right
+    )
+    assert np.argwhere(forward.any(-1)).mean(0) == pytest.approx([400, 550] if right else [250, 400], abs=1)
+
+
+def test_the_view_from_above_in_a_picture_has_readable_distances():
+    picture = portrait_from_above(no_points(), 640).astype(int)
+    text = (picture < 200).all(-1)
+    text[150:210, 290:350] = False
+    columns = np.flatnonzero(text.any(0))
+    rows = np.flatnonzero(text[:, columns[-1] - 25 :].any(1))  # of the outermost
+    assert np.ptp(rows) < 15
 
 
 def test_camera_looks_at_its_target_with_left_on_the_left():
@@ -314,6 +340,27 @@ def test_a_reflectance_that_nobody_gave_is_not_drawn_as_if_it_were_dark():
     above, strips = drawn[: drawn.shape[0] // 6, right], lit[: lit.shape[0] // 6, right]
     assert colours_of(strips) - colours_of(above), "of the first row"
     assert (above == np.array(black)).all(-1).sum() == 0 and drawn.shape == lit.shape
+
+
+def test_a_portrait_says_where_there_is_no_reflectance():
+    image = replace(small_image(), label=None)
+    dark, black = replace(image, reflectance=np.zeros_like(image.reflectance)), reflectance_colours(0.0)
+    assert (portrait(dark) == black).all(-1).sum() == 0, "it is not drawn as if it were dark"
+    assert portrait(dark).shape == portrait(image).shape
+
+
+@pytest.mark.parametrize(("view", "columns"), [
+    ([-60, 60], [*range(11, 21)]), ([120, 240], [*range(27, 32), *range(5)]), ([-170, 170], [*range(32)])])  # fmt: skip
+def test_strips_of_a_sector_are_of_what_the_sensor_sees(view: list[int], columns: list[int]):
+    """Also of one that looks back, over the seam; a narrow gap, as behind a mast, is drawn."""
+    image = replace(small_image(), sensor=replace(SMALL, blocked=runs_outside(view, 4, 32, "mine")))
+    mask = ~image.sensor.blocked_rays()
+    image = replace(image, mask=mask, range=np.where(mask, 2.0 + np.arange(32), 0).astype(np.float32))
+    wide = round(1024 / len(columns))
+    for strip, whole in zip(
+        strips(image, 50.0), (range_strip(image, 50.0, 48), reflectance_strip(image, 48)), strict=True
+    ):
+        np.testing.assert_array_equal(strip, np.repeat(whole[:, columns], wide, axis=1))
 
 
 @pytest.mark.parametrize("word", ["vlp-16", "hdl-64e-kitti", "os1-128"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lidarsynth.cli.main import main
+from lidarsynth.data import street_sets
 from lidarsynth.data.layouts.calibration import AXES, PROJECTION
 from lidarsynth.data.layouts.kitti import in_view, label_line
 from lidarsynth.data.layouts.nuscenes_tables import quaternion
@@ -19,6 +20,7 @@ from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.streets import drawing
 from lidarsynth.streets.areas import Density
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
@@ -392,6 +394,20 @@ def test_boxes_of_a_sensor_that_leans_are_told_to_fit_in_the_world_alone(
         c, s = np.cos(box.heading), np.sin(box.heading)
         mine = (points[frame.raw >> 16 == box.instance] - box.place) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         assert (np.abs(mine) <= np.array(box.size) / 2 + 0.01).all()
+
+
+@pytest.mark.parametrize(("count", "wide"), [(1, 1), (2, 2), (3, 3), (4, 2)])
+def test_frames_of_the_overview_are_all_of_one_size(count: int, wide: int, monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+    monkeypatch.setattr(street_sets, "panel", lambda rows: drawn.extend(rows))
+    street_sets.overview(LabelledStreets(0, count, Sensor("own", (5.0, -5.0, -20.0), 128), Options()))
+    assert [len(row) for row in drawn] == [wide] * (count // wide) + [1]
+
+
+@pytest.mark.parametrize(("beams", "tall"), [(16, 192), (64, 192), (128, 256), (300, 300)])
+def test_the_strips_of_an_overview_are_about_equally_tall(beams: int, tall: int):
+    sensor = Sensor("own", tuple(np.linspace(5, -20, beams)), 256)
+    assert drawing.strips(LabelledStreets(0, 1, sensor, Options())[0], sensor).shape == (2 * tall, 1024, 3)
 
 
 def test_the_verb_writes_says_and_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

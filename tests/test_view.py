@@ -36,7 +36,7 @@ from lidarsynth.verbs.placement import read_transform
 from lidarsynth.viewer.beside import read_shown
 from lidarsynth.viewer.colouring import colourings
 from lidarsynth.viewer.packing import Shown, packed
-from lidarsynth.viewer.page import STATIC, page
+from lidarsynth.viewer.page import STATIC, page, settings_of
 from lidarsynth.viewer.pairs import compared
 from lidarsynth.viewer.rows import rows_of
 from lidarsynth.viewer.series import Stream, series_of
@@ -106,6 +106,28 @@ def test_raw_ids_are_shown_as_their_classes_and_labels_that_are_none_are_told(tm
     ):
         header, blocks = unpacked(packed(Shown(Scan(scan.xyz, extra=extra))))
         assert header["notes"] == [f"classes left out: expected {told}"] and "label" not in blocks
+
+
+def test_confidences_none_of_which_is_a_number_are_told(tmp_path: Path):
+    lost = {"confidence": np.full(5, np.nan, np.float32)}
+    header, blocks = unpacked(packed(Shown(Scan(np.ones((5, 3), np.float32), extra=lost))))
+    assert header["notes"] == ["confidence left out: expected numbers from 0 to 1, found none"]
+    assert "confidence" not in blocks
+    lost["confidence"][2] = 1
+    header, blocks = unpacked(packed(Shown(Scan(np.ones((5, 3), np.float32), extra=lost))))
+    assert header["notes"] == [] and blocks["confidence"].tolist() == [0, 0, 255, 0, 0]
+
+
+def test_several_paths_are_as_many_scans_as_they_hold(tmp_path: Path):
+    (tmp_path / "of").mkdir()
+    for name in ("of/a", "of/b", "c"):
+        write(tmp_path / f"{name}.ply", Scan(np.ones((5, 3), np.float32)))
+    assert list(compared([tmp_path / "of", tmp_path / "c.ply"], None, Reading())) == ["3 scans"]
+    assert list(compared([tmp_path / "of"], None, Reading())) == ["of"]
+
+
+def test_a_browser_without_scripts_is_told_so():
+    assert "<noscript>" in page(settings_of(Shown(Scan(np.ones((5, 3), np.float32))), "scan"), "nonce")
 
 
 def test_every_kind_of_box_has_a_colour():

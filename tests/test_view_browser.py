@@ -63,7 +63,8 @@ REACHED = """new Promise((done) => {{
     const wait = () => state.number === {} ? done() : setTimeout(wait, 20);
     wait();
 }})"""
-AS_OPENED = """(state.word = 'range', $('boxes').checked = $('rings').checked = true, $('strips').hidden = false,
+AS_OPENED = """(state.word = 'range', state.hidden = {}, state.pin = null, $('least').value = 0,
+    $('boxes').checked = $('rings').checked = true, $('strips').hidden = false,
     look('behind'), show(''), go(0, 0))"""
 
 
@@ -229,6 +230,111 @@ def test_the_pointer_turns_moves_and_nears(page: Page, alone: str):
     assert page.run("$('views').querySelectorAll('[aria-pressed=true]').length") == 0
 
 
+def place_of(page: Page, element: str) -> tuple[float, float]:
+    """The middle of an element on the screen."""
+    box = page.run(f"(({{ x, y, width, height }}) => [x, y, width, height])({element}.getBoundingClientRect())")
+    return box[0] + box[2] / 2, box[1] + box[3] / 2
+
+
+def test_a_click_on_a_class_hides_it_and_with_shift_the_others(page: Page, alone: str):
+    """From the view, the strips and what is pointed at; the next scan, and the colours, have it so too."""
+    opened(page, alone)
+    page.key("4")
+    names = "[...$('legend').querySelectorAll('.class')].map((row) => row.querySelector('span').textContent)"
+    label, first = np.array(page.run("[...state.scan.fields.label]")), page.run(names)[0]
+    number = page.run(f"colourings.label.classes.findIndex(([name]) => name === '{first}')")
+    page.click(place_of(page, "$('legend').children[0]"))
+    left = int((label != number).sum())
+    assert f"{len(label):,} points to" in (facts := page.run("$('facts').textContent"))
+    assert f", {left:,} of them drawn" in facts
+    assert page.run("(scene.xyz ?? []).length") == 3 * left
+    assert not (label[[i for i in page.run("[...state.pixels]") if i >= 0]] == number).any()
+    page.run("$('rings').checked = $('boxes').checked = false, relines()")
+    page.click(place_of(page, "$('legend').children[0]"), shift=True)  # it alone
+    assert page.run("scene.xyz.length / 3") == len(label) - left
+    hit = page.run("Array.from({ length: 200 }, (_, k) => pick($('scene'), 300 + 4 * k, 430)).filter((i) => i !== null)"
+                   ".map((i) => state.scan.fields.label[i])")  # fmt: skip
+    assert hit and set(hit) == {number}
+    page.key("1")
+    page.run("go(1)")
+    assert page.run("scene.xyz.length / 3 === state.scan.fields.label.reduce((n, c) => n + (c === "
+                    f"{number}), 0)") is True  # fmt: skip
+    page.key("4")
+    row = f"[...$('legend').children].find((one) => one.textContent.startsWith('{first}'))"
+    page.click(place_of(page, row), shift=True)  # all again
+    assert "drawn" not in page.run("$('facts').textContent") and page.run("state.drawn") is None
+
+
+def test_what_is_too_unsure_is_hidden(page: Page, alone: str):
+    opened(page, alone)
+    assert page.run("$('with-least').hidden") is False
+    page.run("$('least').value = 0.6, $('least').oninput()")
+    confidence = np.array(page.run("[...state.scan.fields.confidence]"))
+    assert page.run("scene.xyz.length / 3") == (confidence >= 0.6 * 255).sum()
+    assert page.run("$('panel').scrollWidth <= $('panel').clientWidth") is True
+    page.run("go(0, 1)")
+    assert page.run("$('with-least').hidden") is False
+
+
+def test_a_click_pins_a_point_to_measure_from(page: Page, alone: str):
+    opened(page, alone)
+    page.click((700, 450))
+    pin = page.run("state.pin")
+    assert page.run("$('readout').textContent").endswith("pinned") and page.run("$('pin').hidden") is False
+    other = page.run("[...state.scan.xyz.subarray(300, 303)]")
+    assert page.run("told(100)").endswith(f"{np.linalg.norm(np.subtract(other, pin)):.2f} m from the pin")
+    page.drag((600, 300), (640, 300))
+    page.click((760, 480), times=2)  # turns about a point, and pins none
+    assert page.run("state.pin") == pin
+    page.run("go(1)")
+    assert page.run("state.pin") == pin and "from the pin" in page.run("told(100)")
+    page.key("Escape")
+    assert page.run("state.pin") is None and page.run("$('pin').hidden") is True
+
+
+def test_of_what_the_slider_passes_only_some_is_read(page: Page, tmp_path: Path):
+    for i in range(40):
+        write(tmp_path / f"{i:06d}.ply", street(500, i))
+    with on_a_server(page, Show("folder", compared([tmp_path], None, Reading()))):
+        page.requests.clear()
+        page.run("for (let i = 1; i < 40; i++) { $('slider').value = i; $('slider').oninput(); }")
+        page.run(REACHED.format(39))
+        assert page.run("[$('where').textContent, $('slider').value]") == ["40 / 40", "39"]
+        assert sum("/scan/" in url for url in page.requests) < 6
+
+
+def test_a_page_without_its_server_says_so(page: Page, tmp_path: Path):
+    for i in range(3):
+        write(tmp_path / f"{i}.ply", street(2_000, i))
+    gone = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    with on_a_server(page, Show("folder", compared([tmp_path], None, Reading()))):
+        page.call("Network.emulateNetworkConditions", offline=True, **gone)
+        page.run("go(2)")
+        page.call("Network.emulateNetworkConditions", offline=False, **gone)
+        assert page.run("$('message').textContent").startswith("expected an answer of lidarsynth view, found none")
+        page.errors.clear()  # the browser's own words
+        page.run("go(2)")
+        assert page.run("$('message').hidden") is True
+
+
+@pytest.mark.parametrize(("script", "told"), [
+    ("delete globalThis.DecompressionStream", "expected a browser of 2023 or later"),
+    ("", ""),
+])  # fmt: skip
+def test_an_old_browser_is_told_so(page: Page, alone: str, script: str, told: str):
+    added = page.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    page.open(alone)
+    page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+    assert page.run("$('message').textContent").startswith(told) and page.run("$('message').hidden") is (not told)
+
+
+def test_points_are_counted_in_words(page: Page, tmp_path: Path):
+    for count, told in ((0, "no points"), (1, "1 point to"), (2, "2 points to")):
+        write_page(tmp_path / "view.html", "few", [Entry("few", {"scan": Shown(street()[:count])})])
+        page.open(f"{(tmp_path / 'view.html').as_uri()}?{count}")
+        assert page.run("$('facts').textContent").startswith(told)
+
+
 def test_play_goes_round(page: Page, alone: str):
     opened(page, alone)
     page.key(" ")
@@ -257,6 +363,17 @@ def test_the_screenshot_holds_view_and_strips(page: Page, alone: str):
     assert shot.shape == (view + 2 * 78, 1280, 3)
     assert colours_in(shot[view:]) > 100
     assert (shot[80:95, 16:256].max(axis=2) > 100).mean() > 0.5, "the legend"
+
+
+def test_the_screenshot_has_the_distances_of_the_rings(page: Page, alone: str):
+    opened(page, alone)
+    shots = []
+    for text in ("", "10 m"):
+        page.run(f"motion.paint(1), [...$('distances').children].forEach((one) => one.textContent = '{text}')")
+        shots.append(pixels(base64.b64decode(page.run("pictureNow().toDataURL('image/png')").partition(",")[2])))
+    page.run("$('distances').replaceChildren()")  # which are made anew
+    x, y = np.argwhere((shots[0] != shots[1]).any(-1)).mean(0)[::-1]
+    assert abs(x - 640) < 20 and 0 < y < page.run("$('scene').height")
 
 
 def test_the_screenshot_says_what_a_scan_lacks(page: Page, tmp_path: Path):
@@ -319,6 +436,14 @@ def test_a_first_scan_that_is_broken_is_no_fault_of_the_page(page: Page, tmp_pat
         for wanted in (0, 1):
             page.run("$('rings').click()")
             assert page.run("scene.lines.length") == wanted
+
+
+def test_the_title_stands_while_the_first_scan_is_read(page: Page, alone: str):
+    opened(page, alone)
+    early = "const read = Source.prototype.load; Source.prototype.load = () => new Promise(() => {});"
+    page.run(f"(() => {{ {early} $('title').textContent = ''; begin(); Source.prototype.load = read; }})()")
+    assert page.run("$('title').textContent") == "street · first"
+    page.shown = ("", 0, 0)  # to be opened anew
 
 
 def test_nobody_goes_back_from_the_first_to_a_last_that_is_not_known(page: Page):

@@ -216,5 +216,5 @@ def overview(streets: LabelledStreets) -> np.ndarray:
     chosen = sorted({len(streets) * k // 4 for k in range(4)})
     frames = [streets[index] for index in chosen]
     views = [(f"frame {index}", bev_with_boxes(frame)) for index, frame in zip(chosen, frames, strict=True)]
-    rows = [views[:2], views[2:], [("range and class of the first", strips(frames[0], streets.sensor))]]
-    return panel([row for row in rows if row])
+    rows = [views[:2], views[2:]] if len(views) == 4 else [views]  # in rows of one number all are of one size
+    return panel([*rows, [("range and class of the first", strips(frames[0], streets.sensor))]])

@@ -57,6 +57,7 @@ def bev(
     size: int = 800,  # pixels along each side
     background: str = "dark",
     rings: float = 10.0,  # metres between range rings, 0 for none
+    right: bool = False,  # x (forward) to the right and y (left) up
 ) -> np.ndarray:
     """(size, size, 3) uint8: the scan from above, x (forward) up and y (left) left, the sensor in the middle.
 
@@ -67,13 +68,13 @@ def bev(
         raise ValueError(f"extent and size must be positive, got {extent} metres and {size} pixels")
     scan, max_range = as_scan(points)
     scan = scan[np.abs(scan.xyz[:, :2]).max(axis=1, initial=0) < extent]
-    canvas = _rings(extent, size, background_colour(background), rings)
+    canvas = _rings(extent, size, background_colour(background), rings, right)
     column_row = (extent - scan.xyz[:, [1, 0]]) * (size / (2 * extent))
     colour, opacity = _splat(column_row, point_colours(scan, by, max_range), size)
     drawn = opacity > 0
     picture, share = canvas.copy(), opacity[drawn][:, None]
     picture[drawn] = np.rint(canvas[drawn] * (1 - share) + colour[drawn] * share).astype(np.uint8)
-    return _ego_marker(picture, size, background)
+    return np.rot90(_ego_marker(picture, size, background), -int(right))
 
 
 def as_scan(points: Scan | RangeImage, max_range: float = 80.0) -> tuple[Scan, float]:
@@ -97,8 +98,9 @@ def _splat(column_row: np.ndarray, colours: np.ndarray, size: int) -> tuple[np.n
     return mean.T.reshape(size, size, 3), 1 - np.exp(-1.6 * total[3]).reshape(size, size)
 
 
-def _rings(extent: float, size: int, colour: tuple[int, int, int], step: float) -> np.ndarray:
-    """(size, size, 3) uint8: a circle and its radius in metres every `step` metres, drawn twice as large and halved."""
+def _rings(extent: float, size: int, colour: tuple[int, int, int], step: float, right: bool) -> np.ndarray:
+    """(size, size, 3) uint8, x up: a circle and its radius in metres every `step` metres, drawn twice as large and
+    halved; the radii can be read where x is turned to the right."""
     faint = tuple(c + (26 if c < 128 else -30) for c in colour)
     picture = Image.new("RGB", (2 * size, 2 * size), colour)
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(max(2 * size // 60, 8))
@@ -108,8 +110,9 @@ def _rings(extent: float, size: int, colour: tuple[int, int, int], step: float) 
         draw.ellipse((size - r, size - r, size + r, size + r), outline=faint, width=2)
         if r < size:
             text = tuple(c + (90 if c < 128 else -110) for c in colour)
-            draw.text((size + 8, size - r + 4), f"{radius:g} m", fill=text, font=font)
-    return np.asarray(picture.reduce(2))
+            place, anchor = ((size + r - 8, size + 4), "ra") if right else ((size + 8, size - r + 4), "la")
+            draw.text(place, f"{radius:g} m", fill=text, font=font, anchor=anchor)
+    return np.rot90(np.asarray(picture.reduce(2)), int(right))
 
 
 def _ego_marker(rgb: np.ndarray, size: int, background: str) -> np.ndarray:

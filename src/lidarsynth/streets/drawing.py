@@ -7,6 +7,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.pictures.portrait import STRIP, enlarged, rows_of_a_beam
 from lidarsynth.pictures.render import bev, label_strip, range_strip
 from lidarsynth.streets.frame import Frame
 
@@ -38,9 +39,11 @@ def bev_with_boxes(frame: Frame, extent: float = 40.0, size: int = 700, by: str 
 
 
 def strips(frame: Frame, sensor: Sensor) -> np.ndarray:
-    """(H', W, 3) uint8: range over classes of the frame's range image."""
-    image = project(frame.scan, sensor, method="unfolding", width=min(sensor.width, 1024))
-    return np.concatenate([range_strip(image), label_strip(image)])
+    """(H', W', 3) uint8: range over classes of the frame's range image, each about 192 pixels tall."""
+    image = project(frame.scan, sensor, method="unfolding", width=min(sensor.width, STRIP))
+    rows = rows_of_a_beam(image)
+    both = range_strip(image, row_scale=rows), label_strip(image, rows)
+    return np.concatenate([enlarged(strip, image) for strip in both])
 
 
 def _pixels(points: np.ndarray, extent: float, size: int) -> list[tuple[float, float]]:

@@ -152,11 +152,13 @@ def _sure(filled: RangeImage, least: float | None) -> RangeImage:
 
 
 def _measured(model: ScanModel, scan: Scan, filled: RangeImage, how: Filling) -> RangeImage:
-    """The scan's own image: the pixels of a filled one that hold measured points, where it has all and says which."""
+    """The scan's own image: the pixels of a filled one that hold measured points, where it has all and says which. A
+    reflectance that the model gave them was not measured."""
     if filled.xyz is None or how.removed is not None:
         return model.image_of(scan)
     x, y, z = np.moveaxis(filled.xyz, -1, 0)
-    return filled.keep((x != 0) | (y != 0) | (z != 0))
+    image = filled.keep((x != 0) | (y != 0) | (z != 0))
+    return image if scan.reflectance.any() else replace(image, reflectance=np.zeros_like(image.reflectance))
 
 
 def judged(

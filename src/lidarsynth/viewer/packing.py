@@ -51,7 +51,8 @@ def packed(shown: Shown) -> bytes:
         "blocks": [{"name": name, "type": values.dtype.str[1:], "count": values.size}
                    for name, values in blocks.items()],
         "boxes": list(shown.boxes),
-        "notes": [*shown.notes, *_classes_left_out(scan), *([] if len(scan) else ["no point in this scan"])],
+        "notes": [*shown.notes, *_classes_left_out(scan), *_confidence_left_out(scan),
+                  *([] if len(scan) else ["no point in this scan"])],
         "name": shown.name,
     }  # fmt: skip
     text = json.dumps(header, allow_nan=False).encode()
@@ -77,7 +78,7 @@ def _fields(scan: Scan) -> dict[str, np.ndarray]:
         fields["label"] = classes.astype(np.uint8)
     if (new := scan.extra.get("new")) is not None:
         fields["new"] = (np.asarray(new) > 0).astype(np.uint8)
-    if (confidence := scan.extra.get("confidence")) is not None:
+    if (confidence := scan.extra.get("confidence")) is not None and np.isfinite(confidence).any():
         fields["confidence"] = _in_255(confidence)
     return fields
 
@@ -91,6 +92,14 @@ def _classes_left_out(scan: Scan) -> list[str]:
         return ["classes left out: expected SemanticKITTI's raw ids in the field raw_label, found others"]
     found = stray(scan.extra[name], len(CLASSES) - 1)
     return [f"classes left out: expected training classes of 0-{len(CLASSES) - 1} in the field {name}, found {found}"]
+
+
+def _confidence_left_out(scan: Scan) -> list[str]:
+    """What is to be said of confidences none of which is a number, as of points that lost theirs on the way."""
+    confidence = scan.extra.get("confidence")
+    if confidence is None or not len(scan) or np.isfinite(confidence).any():
+        return []
+    return ["confidence left out: expected numbers from 0 to 1, found none"]
 
 
 def _in_255(values: np.ndarray) -> np.ndarray:

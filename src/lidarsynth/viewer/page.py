@@ -16,8 +16,8 @@ from lidarsynth.viewer.colouring import colourings, ground_height
 from lidarsynth.viewer.packing import Shown, packed
 
 STATIC = Path(__file__).parent / "static"
-SCRIPTS = ("decode.js", "colours.js", "camera.js", "scene.js", "splat.js", "lines.js", "strips.js", "legend.js",
-           "source.js", "motion.js", "pointer.js", "screenshot.js", "app.js")  # fmt: skip
+SCRIPTS = ("decode.js", "colours.js", "hiding.js", "camera.js", "scene.js", "splat.js", "lines.js", "strips.js",
+           "legend.js", "source.js", "motion.js", "pointer.js", "screenshot.js", "app.js")  # fmt: skip
 LIVE = "default-src 'none'; style-src 'nonce-{0}'; script-src 'nonce-{0}'; connect-src 'self'; img-src blob: data:"
 ALONE = "default-src 'none'; style-src 'nonce-{0}'; script-src 'nonce-{0}'; img-src blob: data:"
 

@@ -24,7 +24,9 @@ def compared(paths: Sequence[Path], other: Path | None, reading: Reading) -> dic
     two differ in number.
     """
     if other is None:
-        return {_caption(paths): series_of(paths, reading)}
+        scans = series_of(paths, reading)
+        several = len(paths) > 1 and scans.count is not None  # folders and captures hold more than one
+        return {plural(scans.count or 0, "scan") if several else _caption(paths): scans}
     first, second = _captions(paths, other)
     scans = series_of(paths, _own(paths, [other], reading))
     partners = series_of([other], _own([other], paths, reading))

@@ -8,8 +8,9 @@ const RINGS = [10, 20, 40, 80, 120];
 const WORDS = { range: "Range", height: "Height", reflectance: "Reflectance", label: "Class", new: "New", confidence: "Confidence" };
 const KEYS = { v: "behind", a: "above", d: "driver", e: "side" };
 const TURN = 100; // milliseconds between scans while playing, a turn of most sensors
+const SLOW = 300; // milliseconds until a scan that is not there yet is said to be read
 
-const state = { number: 0, version: 0, word: "range", scan: null, rgba: null, pixels: null, playing: 0, mark: null };
+const state = { number: 0, version: 0, word: "range", scan: null, rgba: null, pixels: null, playing: 0, mark: null, pin: null, hidden: {}, drawn: null };
 const camera = new Camera(colourings.range.high);
 let scene, motion;
 
@@ -21,6 +22,7 @@ function show(text) {
 async function go(number, version = state.version) {
   const wanted = (state.wanted = Symbol("the last asked for"));
   version = Math.min(version, source.captions(number).length - 1);
+  const slow = setTimeout(() => { $("readout").textContent = "reading …"; }, SLOW);
   try {
     const scan = await source.load(number, version);
     if (state.wanted !== wanted) return;
@@ -31,6 +33,8 @@ async function go(number, version = state.version) {
     if (state.wanted !== wanted) return;
     Object.assign(state, { number, version, scan: null }); // the one before is not what its name says
     show(error.message);
+  } finally {
+    clearTimeout(slow);
   }
   pointAt(null); // which was one of the scan before
   refresh();
@@ -41,11 +45,25 @@ function refresh() {
   paintBar();
   paintVersions();
   if (state.scan) {
-    state.pixels = pixelsOf(state.scan);
+    hide();
     if (!canColour(state.scan, colourings[state.word]) && !wordsHere().includes(state.word)) state.word = "range";
     paintPanel();
     recolour(true);
   } else clear();
+}
+
+function hide() {
+  state.drawn = drawnOf(state.scan, state.hidden, Number($("least").value));
+  state.pixels = pixelsOf(state.scan, state.drawn);
+}
+
+// Of the scan that is shown other points.
+function rehide() {
+  if (!state.scan) return;
+  hide();
+  pointAt(null);
+  paintPanel();
+  recolour(true);
 }
 
 // Nothing is left of a scan before one that cannot be read; the choice of colours stays for the next.
@@ -53,7 +71,7 @@ function clear() {
   scene.setPoints(Float32Array.of(), Uint8Array.of());
   scene.setLines([]);
   for (const id of ["facts", "words", "unit", "legend", "notes", "strips"]) $(id).replaceChildren();
-  $("with-boxes").hidden = true;
+  $("with-boxes").hidden = $("with-least").hidden = true;
   motion.redraw();
 }
 
@@ -67,7 +85,7 @@ function wordsHere() {
 function recolour(moved = false) {
   const { scan } = state, by = colourings[state.word];
   state.rgba = coloursOf(scan, state.word, by);
-  if (moved) scene.setPoints(scan.xyz, state.rgba);
+  if (moved || state.drawn) scene.setPoints(...onlyDrawn(scan.xyz, state.rgba, state.drawn));
   else scene.recolour(state.rgba);
   relines();
   paintLegend($("legend"), scan, state.word, by);
@@ -85,12 +103,21 @@ function relines() {
 }
 
 function paintPanel() {
-  const { scan } = state, farthest = scan.range.reduce((a, b) => Math.max(a, b), 0);
-  $("facts").textContent = `${scan.n.toLocaleString("en")} points to ${farthest.toFixed(0)} m; ${scan.strip.height} ${scan.strip.origin}`;
+  const { scan } = state;
+  $("facts").textContent = facts();
   choice("words", wordsHere().map((word, i) => [word, WORDS[word], `key ${i + 1}`]), state.word, (word) => { state.word = word; recolour(); });
   $("with-boxes").hidden = !scan.boxes.length;
+  $("with-least").hidden = !wordsHere().includes("confidence");
   $("kinds").textContent = scan.boxes.length;
   $("notes").replaceChildren(...scan.notes.map((note) => made("p", "note", note)));
+}
+
+function facts() {
+  const { scan, drawn } = state, farthest = scan.range.reduce((a, b) => Math.max(a, b), 0);
+  if (!scan.n) return "no points";
+  const count = `${scan.n.toLocaleString("en")} ${scan.n === 1 ? "point" : "points"} to ${farthest.toFixed(0)} m`;
+  const shown = drawn ? `, ${counted(drawn).toLocaleString("en")} of them drawn` : "";
+  return `${count}${shown}; ${scan.strip.height} ${scan.strip.origin}`;
 }
 
 function paintVersions() {
@@ -104,7 +131,7 @@ function paintBar() {
   $("title").textContent = reach > 1 && name !== settings.title ? `${settings.title} · ${name}` : settings.title;
   document.title = `${$("title").textContent} – lidarsynth`;
   $("slider").max = reach - 1;
-  $("slider").value = state.number;
+  if (!state.sliding) $("slider").value = state.number;
   $("where").textContent = `${state.number + 1} / ${source.count ?? "…"}`;
   $("where").title = name;
   $("bar").hidden = reach <= 1;
@@ -153,6 +180,16 @@ function step(by) {
   go((state.number + by + reach) % reach);
 }
 
+// Of the scans that the slider passes those are asked for that there is time for, and the one where it stops.
+async function slide() {
+  state.sought = Number($("slider").value);
+  if (state.sliding) return;
+  state.sliding = true;
+  for (let at = null; at !== state.sought;) await go(at = state.sought);
+  state.sliding = false;
+  paintBar();
+}
+
 function play(on) {
   clearInterval(state.playing);
   state.playing = on ? setInterval(() => { if (!state.busy) { state.busy = true; go((state.number + 1) % source.reach(state.number)).finally(() => { state.busy = false; }); } }, TURN) : 0;
@@ -178,7 +215,15 @@ function told(i) {
   if (scan.row[i] >= 0) words.push(`row ${scan.row[i]}`);
   for (const word of ["reflectance", "confidence"]) if (scan.fields[word]) words.push(`${word} ${valueOf(scan, word, i).toFixed(2)}`);
   for (const word of ["label", "new"]) if (scan.fields[word]) words.push(colourings[word].classes[scan.fields[word][i]]?.[0] ?? "");
+  const away = state.pin && Math.hypot(x - state.pin[0], y - state.pin[1], z - state.pin[2]);
+  if (state.pin) words.push(away ? `${away.toFixed(2)} m from the pin` : "pinned");
   return words.join("   ");
+}
+
+// A place to measure from, which stays where it is while scans change.
+function pinAt(i) {
+  state.pin = i === null ? null : [...state.scan.xyz.subarray(3 * i, 3 * i + 3)];
+  pointAt(i);
 }
 
 function pointAt(i) {
@@ -193,11 +238,11 @@ function onKey(event) {
   const acts = {
     arrowleft: () => step(-1), arrowright: () => step(1), " ": () => play(!state.playing),
     b: () => go(state.number, (state.version + 1) % source.captions(state.number).length),
-    i: toggleStrips, p: () => screenshot(), "?": () => { $("help").hidden = !$("help").hidden; }, escape: () => { $("help").hidden = true; },
+    i: toggleStrips, p: () => screenshot(), "?": () => { $("help").hidden = !$("help").hidden; }, escape: () => { $("help").hidden = true; pinAt(null); },
   };
   const act = acts[key] || (KEYS[key] && (() => look(KEYS[key]))) ||
     (words[Number(key) - 1] && (() => { state.word = words[Number(key) - 1]; recolour(); }));
-  const own = event.target.id === "size" ? key.startsWith("arrow") : key === " " && event.target.matches("button, summary, input");
+  const own = ["size", "least"].includes(event.target.id) ? key.startsWith("arrow") : key === " " && event.target.matches("button, summary, input");
   if (!act || own) return; // what has the focus knows what to do with it
   event.preventDefault();
   act();
@@ -207,11 +252,12 @@ function begin() {
   scene = sceneOn($("scene"));
   motion = new Motion(scene, camera);
   choice("views", Object.entries(KEYS).map(([key, word]) => [word, word[0].toUpperCase() + word.slice(1), `key ${key.toUpperCase()}`]), "behind", look);
-  $("slider").oninput = () => go(Number($("slider").value));
+  $("slider").oninput = slide;
   $("back").onclick = () => step(-1);
   $("forth").onclick = () => step(1);
   $("play").onclick = () => play(!state.playing);
   $("size").oninput = () => motion.redraw();
+  $("least").oninput = () => { $("least-is").textContent = $("least").value; rehide(); };
   $("boxes").onchange = $("rings").onchange = () => { relines(); motion.redraw(); };
   $("strips-on").onclick = toggleStrips;
   $("shot").onclick = screenshot;
@@ -220,6 +266,7 @@ function begin() {
   addEventListener("keydown", onKey);
   $("scene").addEventListener("webglcontextlost", () => show("the graphics card was lost: load the page again"));
   steer($("scene"), $("strips"));
+  paintBar(); // its title, while the first scan is read
   return go(0, 0);
 }
 

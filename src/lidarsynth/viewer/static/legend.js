@@ -1,9 +1,11 @@
 // What colours mean: a ramp with ticks and its unit, or the classes that the scan has with their shares of the points.
 
 function paintLegend(element, scan, word, by) {
+  const focus = [...element.children].findIndex((row) => row === document.activeElement);
   element.replaceChildren();
-  if (!canColour(scan, by)) return element.append(made("p", "note", `this scan has no ${by.fields.join(" and ")}`));
+  if (!canColour(scan, by)) return element.append(made("p", "note", `this scan has no ${by.fields.join(" and ").replace("new", "field new")}`));
   element.append(...(by.classes ? classRows(scan, word, by) : ramp(by)));
+  if (focus >= 0 && by.classes) element.children[focus]?.focus(); // who toggles by the keyboard stays there
 }
 
 function ramp(by) {
@@ -29,7 +31,10 @@ function classRows(scan, word, by) {
   for (const value of scan.fields[word]) counts[value]++;
   const order = counts.map((count, k) => k).filter((k) => counts[k]).sort((a, b) => counts[b] - counts[a]);
   return order.map((k) => {
-    const row = made("div", "class"), swatch = made("i", "swatch"), share = (100 * counts[k]) / scan.n;
+    const row = made("button", "class"), swatch = made("i", "swatch"), share = (100 * counts[k]) / scan.n;
+    row.title = "hide or show; with Shift, show it alone";
+    row.setAttribute("aria-pressed", String(!state.hidden[word]?.has(k)));
+    row.onclick = (event) => toggleClass(word, k, event.shiftKey);
     swatch.style.background = `rgb(${by.classes[k][1].join(",")})`;
     row.append(swatch, made("span", "", by.classes[k][0]), made("b", "", share < 0.1 ? "< 0.1 %" : `${share.toFixed(1)} %`));
     return row;

@@ -61,7 +61,7 @@ class Motion {
   }
 }
 
-// Metres beside the rings of distance, and a ring around the point that is pointed at.
+// Metres beside the rings of distance, a ring around the point that is pointed at, and one around the pin.
 function placeLabels(camera, canvas) {
   const { clientWidth: width, clientHeight: height } = canvas; // asked once: after a change it would be laid out anew
   const m = camera.matrix(width / height), host = $("distances");
@@ -77,4 +77,5 @@ function placeLabels(camera, canvas) {
   });
   const mark = state.mark === null ? [0, 0, 0] : state.scan.xyz.subarray(3 * state.mark, 3 * state.mark + 3);
   put($("cross"), mark, state.mark !== null);
+  put($("pin"), state.pin ?? [0, 0, 0], state.pin !== null);
 }

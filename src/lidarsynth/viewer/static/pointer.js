@@ -2,13 +2,15 @@
 
 const REST = 60; // milliseconds until the point under a resting pointer is looked up
 const CATCH = 12; // pixels around the pointer
+const STEADY = 4; // pixels that the pointer moves at most between down and up of a click
 
 function steer(canvas, strips) {
   const down = new Map();
-  let spread = 0, rest = 0;
+  let spread = 0, rest = 0, start = [0, 0];
   canvas.addEventListener("pointerdown", (event) => {
     canvas.focus();
     canvas.setPointerCapture(event.pointerId);
+    start = [event.clientX, event.clientY];
     down.set(event.pointerId, [event.clientX, event.clientY]);
     spread = 0;
   });
@@ -37,10 +39,24 @@ function steer(canvas, strips) {
     press("views", "");
     motion.move();
   }, { passive: false });
+  canvas.addEventListener("click", (event) => {
+    if (Math.hypot(event.clientX - start[0], event.clientY - start[1]) <= STEADY) clicked(event, pick(canvas, event.clientX, event.clientY));
+  });
   canvas.addEventListener("dblclick", (event) => about(pick(canvas, event.clientX, event.clientY)));
   strips.addEventListener("pointermove", (event) => pointAt(pixelUnder(event)));
   strips.addEventListener("pointerleave", () => pointAt(null));
+  strips.addEventListener("click", (event) => clicked(event, pixelUnder(event)));
   strips.addEventListener("dblclick", (event) => about(pixelUnder(event)));
+}
+
+// The second click of two takes back what the first did: a double click pins nothing.
+function clicked(event, i) {
+  if (event.shiftKey || !state.scan) return;
+  if (event.detail > 1) state.pin = state.pinBefore;
+  else {
+    state.pinBefore = state.pin;
+    pinAt(i);
+  }
 }
 
 function about(i) {
@@ -54,12 +70,12 @@ function about(i) {
 // The point nearest to the eye among those next to the pointer.
 function pick(canvas, clientX, clientY) {
   if (!state.scan) return null;
-  const box = canvas.getBoundingClientRect(), m = camera.matrix(box.width / box.height), { xyz, n } = state.scan;
+  const box = canvas.getBoundingClientRect(), m = camera.matrix(box.width / box.height), { xyz, n } = state.scan, { drawn } = state;
   const px = ((clientX - box.left) / box.width) * 2 - 1, py = 1 - ((clientY - box.top) / box.height) * 2;
   let best = null, least = Infinity;
   for (let i = 0; i < n; i++) {
     const [x, y, w] = projected(m, xyz[3 * i], xyz[3 * i + 1], xyz[3 * i + 2]);
-    if (w <= 0) continue;
+    if (w <= 0 || (drawn && !drawn[i])) continue;
     const away = Math.hypot(((x - px) * box.width) / 2, ((y - py) * box.height) / 2);
     if (away < CATCH && w * (1 + away) < least) [best, least] = [i, w * (1 + away)];
   }

@@ -23,8 +23,17 @@ function pictureNow() {
   context.drawImage(view, 0, 0);
   strips.forEach((strip, k) => context.drawImage(strip, 0, view.height + gap + k * (tall + gap), canvas.width, tall));
   context.scale(scale, scale);
+  writeDistances(context);
   writeCaption(context);
   return canvas;
+}
+
+function writeDistances(context) {
+  Object.assign(context, { font: "11px system-ui, sans-serif", textBaseline: "middle", fillStyle: "#8390a8" });
+  for (const label of $("distances").children) {
+    const { e: x, f: y } = new DOMMatrix(label.style.transform);
+    if (!label.hidden) context.fillText(label.textContent, x - 12, y);
+  }
 }
 
 function writeCaption(context) {
@@ -45,7 +54,7 @@ function writeCaption(context) {
   } else if (legend.querySelector(".note")) { // a scan without that field
     context.fillText(legend.textContent, 16, 82);
   } else {
-    [...legend.querySelectorAll(".class")].forEach((row, k) => {
+    [...legend.querySelectorAll(".class[aria-pressed=true]")].forEach((row, k) => {
       context.fillStyle = row.querySelector("i").style.background;
       context.fillRect(16, 84 + 19 * k, 10, 10);
       context.fillStyle = "#8d97a6";

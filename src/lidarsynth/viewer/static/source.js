@@ -39,13 +39,16 @@ class Source {
   }
 
   async inside(number, version) {
+    if (!globalThis.DecompressionStream) throw new Error("expected a browser of 2023 or later, found one that cannot unpack the scans of this page");
     const text = document.getElementById(`scan-${number}-${version}`).textContent;
     const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
     return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
   }
 
   async served(number, version) {
-    const response = await fetch(`scan/${number}/${version}`);
+    const response = await fetch(`scan/${number}/${version}`).catch(() => {
+      throw new Error("expected an answer of lidarsynth view, found none: was it ended? Start it again, and open the address that it prints");
+    });
     if (response.status === 204) { // behind the last, of those that are counted as they are read
       this.count = number;
       throw new End();

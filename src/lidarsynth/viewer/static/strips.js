@@ -1,10 +1,10 @@
 // A scan as an image of its beams (rows) and directions (columns): column 0 looks backwards, the middle one ahead.
 
-// (height * width) index of the nearest point of each pixel, -1 where there is none.
-function pixelsOf(scan) {
+// (height * width) index of the nearest point of each pixel that is drawn, -1 where there is none.
+function pixelsOf(scan, drawn = null) {
   const { height, width } = scan.strip, pixels = new Int32Array(height * width).fill(-1);
   for (let i = 0; i < scan.n; i++) {
-    if (scan.row[i] < 0) continue;
+    if (scan.row[i] < 0 || (drawn && !drawn[i])) continue;
     const turn = (1 - Math.atan2(scan.xyz[3 * i + 1], scan.xyz[3 * i]) / Math.PI) / 2;
     const at = scan.row[i] * width + (Math.floor(turn * width) % width);
     if (pixels[at] < 0 || scan.range[i] < scan.range[pixels[at]]) pixels[at] = i;
