@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -92,6 +93,8 @@ def _write(
     index = open_index(folder, sensor, source, count, range_step(sensor))
     task = _Task(folder, image, name, count, stored_step(index), stamp, (sensor.height, sensor.width))
     _refuse_gone(index, task)
+    if stamp is not None:  # fewer than before, where the last of a shard are gone
+        index["count"] = count
     firsts = range(0, count, SHARD)
     for first in firsts if index.pop(MOVED, False) else ():  # a copy has other times
         if (entry := index["shards"].get(_shard(first))) and entry.get("files", [None])[0] == task.files(first)[0]:
@@ -215,6 +218,14 @@ def _refuse_none(index: dict[str, Any], entry: dict[str, Any]) -> None:
         sequence, frame, reason = entry["skipped"][0]
         raise ValueError(f"expected a scan that can be projected among {entry['tried']}, found none; "
                          f"the first, {sequence}/{frame}: {reason}")  # fmt: skip
+
+
+def begins_shard(start: bytes) -> bool:
+    """Whether a file's first 256 bytes are those of a shard, of whichever sensor; by their look, as nobody knows whose
+    file it is."""
+    return bool(
+        re.match(rb"\x93NUMPY\x01\0..{'descr': \[\('range', .*\('reflectance', .*\('label', ", start, re.DOTALL)
+    )
 
 
 def npy_header(dtype: np.dtype, count: int) -> bytes:
