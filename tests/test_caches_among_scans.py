@@ -21,6 +21,7 @@ from lidarsynth.files.formats import write
 from lidarsynth.verbs.expansion import has_scans
 from lidarsynth.verbs.file_kinds import file_lines
 from lidarsynth.verbs.inputs import Reading, inputs_of
+from lidarsynth.verbs.training_start import unfinished
 from lidarsynth.viewer.series import series_of
 
 
@@ -56,6 +57,10 @@ def test_a_cache_among_scans_is_none_of_them(scans: Path, monkeypatch, capsys: p
     assert (file_lines(scans, Reading()) or {})["scans"] == "2 .npy"
     assert "found a cache of range images" in refused(["data", "files", scans / "cache", scans / "o"], capsys)
     assert not has_scans(scans / "cache")
+    for path in scans.glob("*.npy"):
+        path.write_bytes(b"broken")
+    error = refused(["data", "files", scans, scans.parent / "o", "--sensor", "vlp-16", "--workers", "0"], capsys)
+    assert "expected a scan that can be projected among 2, found none; the first, a.npy: " in error
 
 
 def test_scans_that_lie_in_a_cache_and_others_of_such_names_are_read(scans: Path):
@@ -83,12 +88,14 @@ def test_info_tells_of_a_cache_in_the_making(tmp_path: Path, capsys: pytest.Capt
     main(["info", str(tmp_path / "cache")])
     told = " ".join(capsys.readouterr().out.split())
     assert "images 64" in told and "unfinished 64 of 150 scans done; the same data command goes on" in told
+    assert "found 64 of 150 scans done" in unfinished(f"{tmp_path}/cache") and unfinished("synthetic") == ""
     (tmp_path / "cache" / "index.json").unlink()  # as one that was killed at once
     (tmp_path / "cache" / "report.json").unlink()
     main(["info", str(tmp_path / "cache")])
     assert "was begun, still without index.json; the same data command goes on" in capsys.readouterr().out
     list(write_cache(tmp_path / "cache", image, 150, SENSOR, WHAT))
     assert "unfinished" not in (file_lines(tmp_path / "cache", Reading()) or {})
+    assert unfinished(tmp_path / "cache") == ""
     (tmp_path / "in" / "empty").mkdir(parents=True)
     shutil.copytree(tmp_path / "cache", tmp_path / "in" / "cache")
     assert "found only caches or empty folders" in refused(["info", tmp_path / "in"], capsys)

@@ -137,6 +137,11 @@ def report(index: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def done(index: dict[str, Any]) -> int:
+    """How many of the `count` scans of an index are stored, or were skipped: fewer, where it was killed."""
+    return sum(entry["count"] + len(entry.get("skipped", [])) for entry in index["shards"].values())
+
+
 @contextmanager
 def resumable_file(path: Path, size: int) -> Iterator[Path]:
     """`whole_file` of `size` bytes; its OSError is one line that says how much room was wanted, and how to go on."""

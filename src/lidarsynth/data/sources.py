@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.cache import write_cache
+from lidarsynth.data.cache import shown, write_cache
 from lidarsynth.data.folder import folder as scan_folder
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import Frames, Reader, choose, stamped
@@ -267,7 +267,7 @@ def unfit(
         with suppress(ValueError):
             text, certain = placement(with_points(reader[i]), named)
             looked += 1
-            where = reader.frames[i].path if isinstance(reader, Frames) else "/".join(reader.name(i)[1:])
+            where = reader.frames[i].path if isinstance(reader, Frames) else shown(reader.name(i)[1:])
             told += [] if text is None else [(certain, f"{where}: {text}")]
     sure = [line for certain, line in told if certain]
     lines = sure or [line for _, line in told]
@@ -297,7 +297,7 @@ def _sensors(reader: Reader, numbers: range) -> Iterator[tuple[str | None, str, 
     """`recognise` of those scans that can be read, and their names; others will be skipped, and named in the report."""
     for i in numbers:
         with suppress(ValueError):
-            name = "/".join(reader.name(i)[1:])
+            name = shown(reader.name(i)[1:])
             yield *recognise(reader[i], name), name
 
 

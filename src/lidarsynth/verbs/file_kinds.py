@@ -16,7 +16,7 @@ from lidarsynth.data.cache_files import is_cache
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import check_readable, scan_files, walk
 from lidarsynth.data.frames import moved
-from lidarsynth.data.index import INDEX, read_index, report
+from lidarsynth.data.index import INDEX, done, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import WITHOUT, FileError, scan_from_fields
@@ -226,8 +226,8 @@ def _cache(path: Path) -> Lines:
     index = read_index(path)
     told, sensor = report(index), from_dict(index["sensor"], str(path), "own")
     lines = {"kind": "cache of range images, for training and as a reference", "images": str(told["stored"])}
-    if (tried := told["stored"] + len(told["skipped"])) < index["count"]:
-        lines["unfinished"] = f"{tried} of {plural(index['count'], 'scan')} done; {GOES_ON}"
+    if done(index) < index["count"]:
+        lines["unfinished"] = f"{done(index)} of {plural(index['count'], 'scan')} done; {GOES_ON}"
     lines["sensor"] = f"{sensor.name}, {sensor.height} beams x {sensor.width} columns, to {sensor.max_range:g} m"
     lines |= {"projection": index["source"]["projection"]} if "projection" in index["source"] else {}
     return lines | {key: str(len(told[key])) for key in ("sequences", "skipped", "missing")}

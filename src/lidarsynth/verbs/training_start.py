@@ -10,7 +10,7 @@ from os.path import normpath
 from pathlib import Path
 
 from lidarsynth.data.dataset import SeveralCaches
-from lidarsynth.data.index import PLACE, read_index
+from lidarsynth.data.index import PLACE, done, read_index
 from lidarsynth.experiment.record import Card
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import write_whole
@@ -62,6 +62,16 @@ def shared_images(data: str | Path, validation: str | Path | None) -> str:
         return ""
     return (f"{validation}: expected scans that are not trained on, found {shared:,} of its {len(held_out):,} "
             f"in {data}: what they judge says nothing of other scans")  # fmt: skip
+
+
+def unfinished(data: str | Path) -> str:
+    """A note where a cache that is learned from was killed in the making, or ""."""
+    for folder in () if words_of(data) else folders_of(data):
+        index = read_index(folder)
+        if done(index) < index["count"]:
+            return (f"{folder}: expected a finished cache, found {done(index):,} of {index['count']:,} scans done; the "
+                    "same data command goes on, and a run that was begun before does not")  # fmt: skip
+    return ""
 
 
 def _marks(folder: str) -> Iterator[set[str]]:
