@@ -16,6 +16,7 @@ from lidarsynth.lidar.frame import parse_transform
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.training.examples import folders_of
+from lidarsynth.verbs.training_start import shared_images
 
 SMALL = SENSORS["hdl-64e-kitti"].resized(16, 64)
 
@@ -210,3 +211,23 @@ def test_streets_of_another_sensor_are_told_by_its_name(tmp_path: Path, capsys: 
     capsys.readouterr()
     line = refused([*words, "hdl-32e"], capsys)
     assert "made with {sensor hdl-32e}, found {sensor vlp-16}; use another --out" in line
+
+
+def test_scans_to_judge_on_that_are_learned_from_are_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def made(name: str, root: str, first: int) -> Path:
+        """A cache of four scans of a folder, from a number on."""
+        frames, source = (lambda i: ("files", ".", f"{first + i}.bin")), {"name": "files", "root": root}
+        list(write_cache(tmp_path / name, lambda i: noise_image(first + i), 4, SMALL, source, frames))
+        return tmp_path / name
+
+    a, b, some = made("a", "/in", 0), made("b", "/in", 9), made("some", "/in", 2)
+    copy, others = made("copy", "/elsewhere", 0), made("others", "/elsewhere", 9)
+    told = "expected scans that are not trained on, found"
+    assert shared_images(f"{a},{b}", others).startswith(f"{others}: {told} 4 of its 4 in {a},{b}: what they judge")
+    assert f"{told} 4 of its 4" in shared_images(a, a) and f"{told} 4 of its 4" in shared_images(a, copy)
+    assert f"{told} 2 of its 4" in shared_images(a, some), "by the paths of the scans"
+    for data, validation in ((a, others), (a, "synthetic"), ("synthetic", "synthetic"), (a, None)):
+        assert shared_images(data, validation) == ""
+    words = ["train", "tiny", "--data", str(a), "--out", str(tmp_path / "run"), "--training.steps", "1"]
+    main([*words, "--workers", "0", "--sample-every", "0", "--validation", str(a)])
+    assert f"{a}: {told} 4 of its 4 in {a}" in capsys.readouterr().err

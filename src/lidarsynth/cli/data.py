@@ -67,6 +67,6 @@ def data(
     there = shards(cache or root)
     for _ in counted(prepare(source, root, cache, split, sensor, projection, width, *more)):
         pass
-    if (note := unfit(source, root, sensor, intensity, *frame)) is not None:
+    if (note := unfit(source, root, sensor, intensity, *frame, split)) is not None:
         warn(note)
     say(f"{'nothing is new:' if shards(cache or root) == there else 'wrote'} {summary(cache or root)}")

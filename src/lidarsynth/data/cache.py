@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -92,6 +93,8 @@ def _write(
     index = open_index(folder, sensor, source, count, range_step(sensor))
     task = _Task(folder, image, name, count, stored_step(index), stamp, (sensor.height, sensor.width))
     _refuse_gone(index, task)
+    if stamp is not None:  # fewer than before, where the last of a shard are gone
+        index["count"] = count
     firsts = range(0, count, SHARD)
     for first in firsts if index.pop(MOVED, False) else ():  # a copy has other times
         if (entry := index["shards"].get(_shard(first))) and entry.get("files", [None])[0] == task.files(first)[0]:
@@ -182,7 +185,7 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
         stored = entry["frames"][: len(now)]
         if now != stored:
             old, new = next((old, new) for old, new in zip_longest(stored, now) if old != new)
-            raise ValueError(f"{task.folder}: expected the scan {_path(old)}, as in this cache, found {_path(new)} in "
+            raise ValueError(f"{task.folder}: expected the scan {shown(old)}, as in this cache, found {shown(new)} in "
                              "its place; name another folder")  # fmt: skip
     if "files" in entry and task.stamp is not None and task.files(first) != entry["files"]:
         return False
@@ -200,11 +203,11 @@ def _refuse_gone(index: dict[str, Any], task: _Task) -> None:
     later = range(-(-task.count // SHARD) * SHARD, index["count"], SHARD) if task.stamp is not None else ()
     entries = [entry for first in later if (entry := index["shards"].get(_shard(first)))]
     if frames := [frame for entry in entries for frame in entry.get("frames", [])]:
-        raise ValueError(f"{task.folder}: expected the scan {_path(frames[0])}, as in this cache, found none in its "
+        raise ValueError(f"{task.folder}: expected the scan {shown(frames[0])}, as in this cache, found none in its "
                          "place; name another folder")  # fmt: skip
 
 
-def _path(frame: Sequence[str] | None) -> str:
+def shown(frame: Sequence[str] | None) -> str:
     """[sequence, frame] as one word of a message, without the sequence of files that lie in the folder itself."""
     return "none" if frame is None else "/".join(part for part in frame if part not in ("", "."))
 
@@ -214,7 +217,15 @@ def _refuse_none(index: dict[str, Any], entry: dict[str, Any]) -> None:
     if entry["count"] == 0 and (entry["tried"] == SHARD or not any(e["count"] for e in index["shards"].values())):
         sequence, frame, reason = entry["skipped"][0]
         raise ValueError(f"expected a scan that can be projected among {entry['tried']}, found none; "
-                         f"the first, {sequence}/{frame}: {reason}")  # fmt: skip
+                         f"the first, {shown((sequence, frame))}: {reason}")  # fmt: skip
+
+
+def begins_shard(start: bytes) -> bool:
+    """Whether a file's first 256 bytes are those of a shard, of whichever sensor; by their look, as nobody knows whose
+    file it is."""
+    return bool(
+        re.match(rb"\x93NUMPY\x01\0..{'descr': \[\('range', .*\('reflectance', .*\('label', ", start, re.DOTALL)
+    )
 
 
 def npy_header(dtype: np.dtype, count: int) -> bytes:

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.data.cache_files import cache_files, is_cache
 from lidarsynth.data.frames import Frame, Frames
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import NAMED_ONLY, READERS
+from lidarsynth.files.labels import label_path
 
 # Folders of published data sets, and of ours, whose .bin and .pcd hold a value a point, or a radar's points: no scans.
 BESIDE = ("labels", "rings", "point_times", "lidarseg", "panoptic", "predictions")
@@ -28,27 +30,28 @@ def folder(
     """Every scan under `root`, sorted by path; sequence = the folder below `root`, frame = the file's name.
 
     intensity, transform, rings  as of `Frames`
-    A `.label` file beside a scan, of the same name, gives its SemanticKITTI labels. Raises ValueError without any scan.
+    A `.label` file of the same name beside a scan, or where `write` puts it, gives its SemanticKITTI labels. Raises
+    ValueError without any scan.
     """
     frames = [_frame(path, Path(root)) for path in scan_files(root)]
     return Frames("files", frames, intensity=intensity, transform=transform, rings=rings)
 
 
 def _frame(path: Path, root: Path) -> Frame:
-    labels = path.with_suffix(".label")
-    sequence = path.parent.relative_to(root).as_posix()
-    return Frame(str(path), sequence, path.name, str(labels) if labels.is_file() else None)
+    labels = next((str(at) for at in (path.with_suffix(".label"), label_path(path)) if at.is_file()), None)
+    return Frame(str(path), path.parent.relative_to(root).as_posix(), path.name, labels)
 
 
 def scan_files(root: str | Path) -> list[Path]:
-    """The scan files under a folder, sorted, but those of BESIDE and of radars. Raises ValueError without any."""
+    """The scan files under a folder, sorted, but those of BESIDE, radars and caches. Raises ValueError without any."""
     root = Path(root)
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
     paths = scans_below(root)
     if not paths:
         listed = ", ".join(suffix for suffix in READERS if suffix not in NAMED_ONLY)
-        raise ValueError(f"{root}: expected scans ({listed}; {' and '.join(NAMED_ONLY)} by name), found none")
+        raise ValueError(f"{root}: expected scans ({listed}; {' and '.join(NAMED_ONLY)} by name), found "
+                         f"{'a cache of range images' if is_cache(root) else 'none'}")  # fmt: skip
     return paths
 
 
@@ -65,7 +68,8 @@ def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
 
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Each folder at and under `root` with the names of its folders and of its files, as `os.walk`, which leaves out
-    folders that are taken out of that list; through links to folders elsewhere, too.
+    folders that are taken out of that list; through links to folders elsewhere, too. A cache's own files are not told:
+    what lies below it, is.
 
     A folder comes once, however many links lead to it, and those that lead to what holds `root`, or into it, are not
     gone through: links in a circle end. Raises FileError for a folder that cannot be read.
@@ -83,7 +87,8 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
                 kept.append(path.name)
                 seen.add(real)
         folders[:] = kept
-        yield Path(here), folders, files
+        own = cache_files(Path(here), files)
+        yield Path(here), folders, [name for name in files if name not in own]
 
 
 def check_readable(folder: Path) -> None:

@@ -136,11 +136,17 @@ def _flawless(columns: np.ndarray) -> bool:
 
 
 def list_frames(folder: Path, sequence: str, suffix: str = ".bin", labels: Path | None = None) -> list[Frame]:
-    """The scans of one sequence, sorted by name; none if the folder is not there. `labels`: the folder of `.label`s."""
-    known = set(_names(labels, ".label")) if labels else set()
+    """The scans of one sequence, sorted by name; none if the folder is not there. `labels`: the folder of `.label`s.
+
+    Raises ValueError for nuScenes' `.pcd.bin` where KITTI's `.bin` are expected, whose names end alike.
+    """
+    names, known = _names(folder, suffix), set(_names(labels, ".label")) if labels else set()
+    if alien := [name for name in names if suffix == ".bin" and name.endswith(".pcd")]:
+        raise ValueError(f"{folder}/{alien[0]}.bin: expected a .bin of four floats a point, found a .pcd.bin, as "
+                         "nuScenes writes them: data files takes such scans")  # fmt: skip
     return [
         Frame(f"{folder}/{name}{suffix}", sequence, name, f"{labels}/{name}.label" if name in known else None)
-        for name in _names(folder, suffix)
+        for name in names
     ]
 
 

@@ -15,6 +15,7 @@ from lidarsynth.lidar.stored import RANGE_STEP
 from lidarsynth.lidar.whole_file import sweep, whole_file
 
 INDEX, REPORT = "index.json", "report.json"
+SHARD_NAME = re.compile(r"\d{7}\.npy")
 PLACE = ("root", "missing")  # of a source: where it lies on this disk, not what it is
 MOVED = "moved"  # of an opened index: that the source lies elsewhere than when it was written
 
@@ -100,7 +101,7 @@ def short(value: Any) -> str:
 
 def _begun(path: Path) -> bool:
     """Whether a file is of a cache whose index is not written yet: a shard, its report, or what is hidden."""
-    return path.name[0] == "." or path.name == REPORT or re.fullmatch(r"\d{7}\.npy", path.name) is not None
+    return path.name[0] == "." or path.name == REPORT or SHARD_NAME.fullmatch(path.name) is not None
 
 
 def close_index(folder: Path, index: dict[str, Any]) -> None:
@@ -134,6 +135,11 @@ def report(index: dict[str, Any]) -> dict[str, Any]:
         "missing": index["source"].get("missing", []),
         "skipped": skipped,
     }
+
+
+def done(index: dict[str, Any]) -> int:
+    """How many of the `count` scans of an index are stored, or were skipped: fewer, where it was killed."""
+    return sum(entry["count"] + len(entry.get("skipped", [])) for entry in index["shards"].values())
 
 
 @contextmanager

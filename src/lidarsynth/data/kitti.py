@@ -7,6 +7,7 @@ from pathlib import Path
 from lidarsynth.data.frames import Frame, Frames, choose, gather, list_frames
 
 SPLITS = ("train", "val", "test", "all")
+DRIVES = "*/*_drive_*_sync"  # of the raw data
 
 # Odometry sequence -> drive of the raw data, first and last frame (KITTI's development kit). Sequence 03 is not in the
 # raw data any more; R2DM trains without it: 18,329 scans.
@@ -49,7 +50,7 @@ def kitti(root: str | Path, split: str = "train") -> Frames:
     root = Path(root)
     if _sequences(root).is_dir():
         return kitti_odometry(root, split)
-    if any(root.glob("*/*_drive_*_sync")):
+    if any(root.glob(DRIVES)):
         return kitti_raw(root, split)
     raise ValueError(f"{root}: expected DATE/DATE_drive_NNNN_sync (raw) or sequences/NN (odometry), found neither")
 
@@ -64,7 +65,7 @@ def kitti_raw(root: str | Path, split: str = "train") -> Frames:
     root = Path(root)
     choose("kitti", split, SPLITS)
     if split == "all":
-        wanted = [(path.name, 0, None) for path in sorted(root.glob("*/*_drive_*_sync"))]
+        wanted = [(path.name, 0, None) for path in sorted(root.glob(DRIVES))]
     elif split == "test":
         wanted = [(drive, 0, None) for drive in raw_test_drives()]
     else:
@@ -74,7 +75,10 @@ def kitti_raw(root: str | Path, split: str = "train") -> Frames:
 
 
 def kitti_published(root: str | Path, split: str = "train") -> Frames:
-    """`kitti_raw`, on which published systems learned. Raises ValueError for odometry's layout, of other points."""
+    """`kitti_raw`, on which published systems learned. Raises ValueError for odometry's layout, of other points, and
+    where there is no drive."""
+    if not _sequences(Path(root)).is_dir() and not any(Path(root).glob(DRIVES)):
+        raise ValueError(f"{root}: expected raw drives, DATE/DATE_drive_NNNN_sync, found none")
     if _sequences(Path(root)).is_dir():
         raise ValueError(f"{root}: expected raw drives, DATE/DATE_drive_NNNN_sync, on which published systems learned, "
                          "found odometry's sequences, whose points are motion-compensated and whose splits are others: "

@@ -37,6 +37,8 @@ def _read(root: Path, source: str, split: str, splits: dict[str, tuple[int, ...]
     choose(source, split, tuple(splits))
     inner = root / "data_3d_raw"
     folder = inner if inner.is_dir() else root
+    if not any(folder.glob("*_drive_*_sync")):
+        raise ValueError(f"{root}: expected drives, data_3d_raw/2013_05_28_drive_NNNN_sync, found none")
     frames = {}
     for sequence in splits[split]:
         drives = sorted(folder.glob(f"*_{sequence:04d}_sync"))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsynth.data.cache import write_cache
+from lidarsynth.data.cache import shown, write_cache
 from lidarsynth.data.folder import folder as scan_folder
 from lidarsynth.data.folder import scan_files
 from lidarsynth.data.frames import Frames, Reader, choose, stamped
@@ -39,6 +39,7 @@ class Source:
     sensor    None = recognised from the first scan
     width     columns; None = the sensor's own
     resizing  which columns stay of wider drawings, as in `projection.thin`
+    told      whether the data set says itself which sensor each scan is of; else some are looked at
     """
 
     reader: Callable[[Path, str], Reader]
@@ -47,6 +48,7 @@ class Source:
     projection: str
     width: int | None
     resizing: str = "nearest-exact"
+    told: bool = False
 
 
 SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses the data set
@@ -56,8 +58,10 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
     "kitti-r2dm": Source(kitti_published, "train", "hdl-64e-r2dm", "unfolding", 512),
     "kitti-dusty": Source(kitti_published, "train", "hdl-64e-dusty", "unfolding", 512, "nearest"),
     "kitti360-lidargen": Source(kitti360_lidargen, "train", "hdl-64e-lidargen", "spherical", 1024),
-    "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024),
-    "nuscenes-sweeps": Source(lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024),
+    "nuscenes": Source(nuscenes, "all", "hdl-32e", "auto", 1024, told=True),
+    "nuscenes-sweeps": Source(
+        lambda root, split: nuscenes(root, split, sweeps=True), "all", "hdl-32e", "auto", 1024, told=True
+    ),
     "files": Source(lambda root, split: _files(root, split), "all", None, "auto", None),
 }
 
@@ -150,6 +154,8 @@ def cache_source(
     split, projection = split or own.split, projection or own.projection
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
+    if not Path(root).is_dir():
+        raise ValueError(f"{root}: expected a folder of scans, found {'a file' if Path(root).exists() else 'nothing'}")
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
     reader = _reader(name, Path(root), split, intensity, transform, rings)
@@ -241,21 +247,31 @@ def unfit(
     intensity: str = "auto",
     transform: np.ndarray | None = None,
     rings: tuple[int, int] | None = None,
+    split: str | None = None,
 ) -> str | None:
-    """That files are not in their sensor's frame, or cannot be of the sensor that is named for all, by some scans from
-    everywhere, in one line, or None. What only seems so must seem so of most of them."""
-    if name != "files":
+    """That scans are not in their sensor's frame, or cannot be of the sensor that is named for all, or is the data
+    set's, by some scans from everywhere, in one line, or None. What only seems so must seem so of most files, and does
+    not count of data sets."""
+    if name not in SOURCES or SOURCES[name].told:
         return None
-    reader, named = _files(root, "all", intensity, transform, rings), None if sensor is None else get_sensor(sensor)
+    word = sensor or SOURCES[name].sensor
+    named = None if word is None else get_sensor(word)
+    try:
+        reader = _reader(name, root, split or SOURCES[name].split, intensity, transform, rings)
+    except ValueError:
+        if name == "files":
+            raise
+        return None
     looked, told = 0, []
     for i in range(0, len(reader), -(-len(reader) // CHECKED)):
         with suppress(ValueError):
             text, certain = placement(with_points(reader[i]), named)
             looked += 1
-            told += [] if text is None else [(certain, f"{reader.frames[i].path}: {text}")]
+            where = reader.frames[i].path if isinstance(reader, Frames) else shown(reader.name(i)[1:])
+            told += [] if text is None else [(certain, f"{where}: {text}")]
     sure = [line for certain, line in told if certain]
     lines = sure or [line for _, line in told]
-    if not sure and 2 * len(lines) <= looked:
+    if not sure and (name != "files" or 2 * len(lines) <= looked):
         return None
     which = "it is" if looked == 1 else f"{len(lines)} of {looked} scans that were looked at are so, and"
     return f"{lines[0]}; {which} drawn all the same"
@@ -281,7 +297,7 @@ def _sensors(reader: Reader, numbers: range) -> Iterator[tuple[str | None, str, 
     """`recognise` of those scans that can be read, and their names; others will be skipped, and named in the report."""
     for i in numbers:
         with suppress(ValueError):
-            name = "/".join(reader.name(i)[1:])
+            name = shown(reader.name(i)[1:])
             yield *recognise(reader[i], name), name
 
 

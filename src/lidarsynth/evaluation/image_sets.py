@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.data.cache_files import is_cache
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.data.folder import check_readable, scans_below
 from lidarsynth.evaluation.protocol import Clouds
@@ -137,7 +138,7 @@ def image_set(source: str | Path | Numbered, intensity: str = "auto") -> ImageSe
     path = Path(source)
     if path.is_dir():
         check_readable(path)
-    if (path / INDEX).is_file():
+    if path.is_dir() and is_cache(path):
         cache = CachedImages(path)
         names = tuple("/".join(cache.name(i)[1:]) for i in range(len(cache)))
         return ImageSet(names, cache.__getitem__, str(path), sha256((path / INDEX).read_bytes()).hexdigest())

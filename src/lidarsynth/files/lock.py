@@ -27,23 +27,26 @@ def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]
 
     work    in words, such as "training", for the error
     shared  with others that share it
-    Raises ValueError where another process holds it, or, unless `shared`, any shares it.
+    Raises ValueError where another process holds it, or, unless `shared`, any shares it, OSError of one line where it
+    cannot be written to.
     """
     try:
         import fcntl
     except ImportError:  # Windows
         yield False
         return
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder}: expected a folder to write to, found a file")
+    if not folder.is_dir() and (folder.exists() or folder.is_symlink()):
+        found = "a file" if folder.exists() else "a link to nothing"
+        raise ValueError(f"{folder}: expected a folder to write to, found {found}")
     path, held, locked, tries = folder / LOCK, False, True, TRIES if shared else 1
     made = [at for at in (folder, *folder.parents) if not at.exists()]
     while not held:
-        folder.mkdir(parents=True, exist_ok=True)  # a shard that left nothing in it may have taken it away
-        try:
-            opened = path.open("a+b")  # NFS wants to read what is shared
-        except FileNotFoundError:
-            continue
+        with _writable(folder):
+            folder.mkdir(parents=True, exist_ok=True)  # a shard that left nothing in it may have taken it away
+            try:
+                opened = path.open("a+b")  # NFS wants to read what is shared
+            except FileNotFoundError:
+                continue
         with opened as file:
             try:
                 fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
@@ -70,6 +73,15 @@ def only_writer(folder: Path, work: str, shared: bool = False) -> Iterator[bool]
                         path.unlink(missing_ok=True)
                         for at in made:
                             at.rmdir()  # refused where it holds anything
+
+
+@contextmanager
+def _writable(folder: Path) -> Iterator[None]:
+    """Names the folder, and not a file in it that nobody knows, where it cannot be made or written to."""
+    try:
+        yield
+    except (PermissionError, NotADirectoryError, FileExistsError) as error:
+        raise OSError(f"{folder}: expected a folder to write to, found: {error.strerror}") from None
 
 
 def _inode(path: Path) -> int | None:

@@ -10,6 +10,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from lidarsynth.data.bags import is_bag
+from lidarsynth.data.cache_files import cache_files
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem, walk
 from lidarsynth.files.formats import READERS
@@ -52,6 +53,7 @@ def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], l
     without scans its bags and captures. Beside them, scans as `Inputs.below`."""
     if not path.exists() and any(c in str(path) for c in MAGIC):
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
+        found = _without_caches(found)
         scans, bags = [p for p in found if is_scan(p)], {p for p in found if p.is_dir() and is_bag(p)}
         streams = sorted((p for p in found if is_stream(p) and p.parent not in bags), key=by_number)
         if not (scans or streams):
@@ -73,6 +75,15 @@ def _expanded(path: Path, earlier: EarlierResults | None) -> tuple[list[Path], l
     if not (path.exists() or is_scan(path) or is_stream(path)):
         raise ValueError(f"{path}: expected a file, folder, bag or capture, found nothing of that name")
     return [path], []
+
+
+def _without_caches(found: list[Path]) -> list[Path]:
+    """The paths that are no files of caches."""
+    names: dict[Path, list[str]] = {}
+    for path in found:
+        names.setdefault(path.parent, []).append(path.name)
+    own = {folder: cache_files(folder, of) for folder, of in names.items()}
+    return [path for path in found if path.name not in own[path.parent]]
 
 
 def is_folder(path: Path) -> bool:

@@ -12,10 +12,11 @@ import numpy as np
 from lidarsynth.data.angle_files import is_angles, read_angles
 from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, metadata_from, open_bag
+from lidarsynth.data.cache_files import is_cache
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import check_readable, scan_files, walk
 from lidarsynth.data.frames import moved
-from lidarsynth.data.index import INDEX, read_index, report
+from lidarsynth.data.index import INDEX, done, read_index, report
 from lidarsynth.data.turns import capture_turns, senders, sound_datagrams
 from lidarsynth.experiment.record import RECORD, WEIGHTS
 from lidarsynth.files.fields import WITHOUT, FileError, scan_from_fields
@@ -46,6 +47,7 @@ from lidarsynth.verbs.viewpoint import viewpoint_note
 Lines = dict[str, str]
 NO_INTENSITY = {"reflectance": "none in the file: --intensity none for the other verbs"}
 NAMED = 3  # broken files
+GOES_ON = "the same data command goes on"
 LOOKED_AT = 400  # packets of a capture that are counted
 
 
@@ -74,7 +76,7 @@ def file_lines(path: Path, reading: Reading) -> Lines | None:
             raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found nothing")
         if is_bag(path):
             return _bag(path, reading)
-        if not (path / INDEX).exists():
+        if not is_cache(path):
             return _folder(path, reading)
     if is_angles(path):
         return _angles(path)
@@ -219,9 +221,13 @@ def _angles(path: Path) -> Lines:
 
 
 def _cache(path: Path) -> Lines:
+    if not (path / INDEX).exists():  # killed before it was written
+        return {"kind": f"cache of range images that was begun, still without {INDEX}; {GOES_ON}"}
     index = read_index(path)
     told, sensor = report(index), from_dict(index["sensor"], str(path), "own")
     lines = {"kind": "cache of range images, for training and as a reference", "images": str(told["stored"])}
+    if done(index) < index["count"]:
+        lines["unfinished"] = f"{done(index)} of {plural(index['count'], 'scan')} done; {GOES_ON}"
     lines["sensor"] = f"{sensor.name}, {sensor.height} beams x {sensor.width} columns, to {sensor.max_range:g} m"
     lines |= {"projection": index["source"]["projection"]} if "projection" in index["source"] else {}
     return lines | {key: str(len(told[key])) for key in ("sequences", "skipped", "missing")}
@@ -232,7 +238,8 @@ def _folder(path: Path, reading: Reading) -> Lines:
     files = scan_files(path) if has_scans(path) else []
     streams = streams_below(path)
     if not files and not streams:
-        raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {_counted(path, [])}")
+        found = _counted(path, []) or "only caches or empty folders in it"
+        raise FileError(f"{path}: expected scans, a bag, a cache or a model in the folder, found {found}")
     if not files and reading.moves:
         raise FileError(f"{path}: expected a scan to move or take rings of, found bags and captures: name one of them")
     if not files:

@@ -34,7 +34,7 @@ from lidarsynth.training.loop import DECAYS, Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, silent_threads, stop_signals
 from lidarsynth.training.monitor import Monitor
 from lidarsynth.training.options import Options
-from lidarsynth.verbs.training_start import Start, check_start, start_of, write_start
+from lidarsynth.verbs.training_start import Start, check_start, shared_images, start_of, unfinished, write_start
 from lidarsynth.weights.load import load_parts, shipped
 
 if TYPE_CHECKING:
@@ -150,7 +150,8 @@ def _run(
     monitor = Monitor(experiment, task, data, validation)  # first, as it refuses images before anything is written
     experiment, state, note = _begin(experiment, images, data, out, begun, resume, accelerator)
     if accelerator.is_main_process:
-        yield Progress(state.step, {}, 0.0, 0.0, note=note)
+        told = "; ".join(filter(None, (note, unfinished(data), shared_images(data, validation))))
+        yield Progress(state.step, {}, 0.0, 0.0, note=told)
     with stop_signals() as received, _journal(experiment, out, state.step, options, accelerator) as journal:
         due = state.step and options.sample_every and _due(state.step, options.sample_every, experiment)
         if journal and due and not journal.looked(state.step):  # the run was stopped at this step, before it had looked

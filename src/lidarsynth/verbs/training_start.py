@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from hashlib import sha256
+from os.path import normpath
 from pathlib import Path
 
 from lidarsynth.data.dataset import SeveralCaches
-from lidarsynth.data.index import PLACE, read_index
+from lidarsynth.data.index import PLACE, done, read_index
 from lidarsynth.experiment.record import Card
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import write_whole
-from lidarsynth.training.examples import Streets, TrainingImages, folders_of
+from lidarsynth.training.examples import Streets, TrainingImages, folders_of, words_of
 
 START = "start.json"
 
@@ -47,6 +49,39 @@ def _fingerprint(data: str | Path) -> str:
     shards = [sorted(read_index(folder)["shards"].items()) for folder in folders_of(data)]
     content = [[(entry["count"], entry.get("sha256")) for _, entry in of if entry["count"]] for of in shards]
     return sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def shared_images(data: str | Path, validation: str | Path | None) -> str:
+    """A note where scans of the caches that a run is judged on are among those it learns from, or "": by where they
+    lay, or as whole shards of the same content."""
+    if validation is None or words_of(data) or words_of(validation):
+        return ""
+    learned = set().union(*(marks for folder in folders_of(data) for marks in _marks(folder)))
+    held_out = [marks for folder in folders_of(validation) for marks in _marks(folder)]
+    if not (shared := sum(not learned.isdisjoint(marks) for marks in held_out)):
+        return ""
+    return (f"{validation}: expected scans that are not trained on, found {shared:,} of its {len(held_out):,} "
+            f"in {data}: what they judge says nothing of other scans")  # fmt: skip
+
+
+def unfinished(data: str | Path) -> str:
+    """A note where a cache that is learned from was killed in the making, or ""."""
+    for folder in () if words_of(data) else folders_of(data):
+        index = read_index(folder)
+        if done(index) < index["count"]:
+            return (f"{folder}: expected a finished cache, found {done(index):,} of {index['count']:,} scans done; the "
+                    "same data command goes on, and a run that was begun before does not")  # fmt: skip
+    return ""
+
+
+def _marks(folder: str) -> Iterator[set[str]]:
+    """What tells each image of a cache: its place in a shard of some content, and the path of its scan, if there is."""
+    index = read_index(folder)
+    for entry in index["shards"].values():
+        root, frames = index["source"].get("root"), entry.get("frames")
+        for k in range(entry["count"]):
+            content = {f"{entry['sha256']} {k}"} if "sha256" in entry else set()
+            yield content | ({normpath("/".join([root, *frames[k]]))} if isinstance(root, str) and frames else set())
 
 
 def write_start(out: Path, start: Start) -> None:
