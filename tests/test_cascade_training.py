@@ -327,3 +327,24 @@ def test_what_columns_are_told_of_their_neighbours_is_spoilt_at_times_and_never_
     share = ((wrong.code - grid.code).abs() > 1e-6).float().mean((1, 2))
     assert 3 <= (share == 0).sum() <= 13 and share.max() < 0.12
     assert (wrong.code[~wrong.returned] == 0).all() and not wrong.returned.all()
+
+
+def test_a_share_of_a_batch_without_crops_of_the_most_likely_image_is_learned_from(tmp_path):
+    """Of two samples one is drawn: the pass that has it, and of one sample every second step, has none to complete."""
+    sensor = SENSORS["vlp-16"].resized(width=128)
+    streets = SyntheticStreets(3, 2, sensor)
+    list(write_cache(tmp_path / "cache", streets.image, 2, sensor, {"name": "synthetic"}))
+    for size, accumulate in ((2, 2), (1, 1)):
+        few = with_fields(TINY, {"training.batch_size": size, "data.sensor": "vlp-16", "data.height": 16,
+                                 "data.width": 128, "data.projection": "auto"})  # fmt: skip
+        quiet = Options(workers=0, sample_every=0, accumulate=accumulate)
+        *_, last = run(few, tmp_path / "cache", tmp_path / f"{size}", options=quiet)
+        assert last.step == 2 and np.isfinite(last.losses["loss"]) and np.isfinite(last.grad_norm)
+
+
+def test_no_crops_have_gradients_of_nothing():
+    """As a distributed wrapper expects one for every parameter."""
+    network = torch.nn.Linear(2, 3)
+    losses = cascade_training._of_none(network)
+    torch.cat([losses, network.weight.new_zeros(1)]).mean().backward()
+    assert losses.shape == (0,) and all(not p.grad.any() for p in network.parameters())

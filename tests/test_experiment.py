@@ -140,6 +140,37 @@ def test_experiments_that_cannot_be_built_say_why(changes, message):
         build_denoiser(experiment, build_network(experiment))
 
 
+@pytest.mark.parametrize(
+    ("word", "changes", "message"),
+    [
+        ("r2dm-h", {"model.channel_multipliers": [1]}, r"model.channel_multipliers: expected 4 .*, found \[1\]"),
+        ("r2dm-h", {"model.num_residual_blocks": [0, 0, 0, 0]}, "model.num_residual_blocks: expected 4 .*, found"),
+        ("r2dm-h", {"model.base_channels": 12}, "model.gn_num_groups: expected a divisor of 12, 12, 24, .*, found 8"),
+        ("r2dm-h", {"model.attn_num_heads": 7}, "model.attn_num_heads: expected a divisor of 256, 512 .*, found 7"),
+        ("r2dm-h", {"model.stem": [1, 3]}, "divisible by 24, .*: expected 1008 or 1032, found 1024"),
+        ("kitti-streets", {"model.base_channels": 2, "model.gn_num_groups": 2}, "base_channels: expected an even"),
+        ("lidargen", {"model.base_channels": 1}, "model.base_channels: expected at least 2 for refinenet, found 1"),
+        ("lidargen", {"score.sigma_min": 0}, "score.sigma_min, score.sigma_max: expected .*, found 0 and 50"),
+        ("lidargen", {"score.sigma_max": 0.4}, "score.sigma_min, score.sigma_max: expected .*, found 0.01 and 0.4"),
+        ("dusty-v1", {"data.width": 16}, "dusty-v1: expected images whose sides .*, found 64 x 16"),
+        ("dusty-v2", {"data.width": 40}, "dusty-v2: expected images whose sides .*, found 64 x 40"),
+        ("lidar-sr", {"upsampling.factor": [1, 1]}, r"upsampling.factor: expected .*, found \[1, 1\]"),
+        ("lidar-sr", {"upsampling.factor": [3, 1]}, r"upsampling.factor: expected .*, found \[3, 1\]"),
+        ("lidar-sr", {"upsampling.factor": [64, 1], "data.height": 32}, "64 rows and of 16 columns, found 32 x 1024"),
+        ("iln", {"model.attn_num_heads": 5}, "model.attn_num_heads: expected a divisor of 64 channels, found 5"),
+        ("default", {"model.base_channels": 8}, "model.base_channels: expected a multiple of 16, found 8"),
+        ("default", {"model.column_channels": 33}, "model.column_channels: expected a multiple of 4, found 33"),
+        ("default", {"model.guide_channels": 9}, "model.guide_channels: expected a multiple of 8, found 9"),
+        ("default", {"model.judge_channels": 1}, "model.judge_channels: expected a multiple of 8, found 1"),
+        ("default", {"model.classes": 5}, "model.classes: expected 0 or 20, found 5"),
+    ],
+)
+def test_numbers_that_networks_cannot_be_built_of_are_refused_by_their_fields(word, changes, message):
+    experiment = with_fields(preset(word), changes)
+    with torch.device("meta"), pytest.raises(ValueError, match=message):
+        build_network(experiment)
+
+
 # ---------------------------------------------------------------- folders
 
 

@@ -403,6 +403,15 @@ def test_fine_tuning_refuses_other_networks_and_meanings():
     assert "found model.base_channels=16, data.codec=metric, diffusion.kind=eps" in str(refusal.value)
 
 
+def test_a_refinenet_and_a_unet_start_from_neither():
+    """All fields that count are alike: nothing but the network differs, and no tensor of one is in the other."""
+    alike = {"model.base_channels": 16, "model.attn_num_heads": 8}
+    both = [with_fields(preset(word), alike) for word in ("r2dm-h", "r2dm-refinenet")]
+    for one, other in (both, both[::-1]):
+        with pytest.raises(ValueError, match=f"^x: expected weights of {one.model.network}, found those of "):
+            transfer(filled(one), one, filled(other), other, "x")
+
+
 def test_from_weights_starts_there_and_keeps_their_history(cache: Path, tmp_path: Path):
     list(run(tiny(2), cache, tmp_path / "first", options=QUIET))
     experiment = tiny(1, **{"training.warmup": 1})  # one step at rate 0
@@ -472,7 +481,8 @@ def test_images_in_which_nothing_returned_are_not_looked_at(tmp_path: Path):
 @pytest.mark.parametrize(
     "change",
     ["training.decay=linear", "diffusion.schedule=cos", "diffusion.kind=noise", "diffusion.loss=l3", "data.codec=cm",
-     "data.projection=flat", "model.network=unet", "training.steps=0", "training.learning_rate=1e38"],
+     "data.projection=flat", "model.network=unet", "model.coords_encoding=sine", "training.steps=0",
+     "training.learning_rate=1e38"],
 )  # fmt: skip
 def test_words_that_no_table_has_are_refused_before_anything_is_done(change: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit, match="2"):
@@ -525,6 +535,23 @@ def test_a_run_that_is_refused_leaves_nothing(cache: Path, tmp_path: Path):
         with pytest.raises(ValueError, match=r"expected (the sensor|a cache folder|images of 16 x 64, found 8 x 64)"):
             list(run(tiny(2), data, tmp_path / "out", validation=tmp_path / validation, options=QUIET))
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "batch", "accumulate", "said"),
+    [
+        ("tiny", 4, 3, "expected a batch size that 3 processes x passes share equally, found 4"),
+        ("tiny-gan", 6, 1, "training.batch_size: expected a multiple of 4, or fewer, .* found 6"),
+        ("tiny-gan", 12, 2, "training.batch_size: expected a multiple of 4, or fewer, .* found 6"),
+    ],
+)
+def test_batches_that_cannot_be_shared_are_refused_before_anything_is_written(
+    cache: Path, tmp_path: Path, word: str, batch: int, accumulate: int, said: str
+):
+    experiment = with_fields(preset(word), {"training.batch_size": batch, "data.height": 16})
+    with pytest.raises(ValueError, match=said):
+        list(run(experiment, cache, tmp_path / "new", options=replace(QUIET, accumulate=accumulate)))
+    assert not (tmp_path / "new").exists() or not list((tmp_path / "new").iterdir())
 
 
 def test_a_run_that_was_stopped_before_it_had_looked_looks_where_it_goes_on(cache: Path, tmp_path: Path):

@@ -148,6 +148,14 @@ def batch_indices(training: Training, step: int, images: TrainingImages) -> list
     return [int(epoch_order(training.seed, p // length, length)[p % length]) for p in positions]
 
 
+def share_of(experiment: Experiment, parts: int) -> int:
+    """Samples of each of `parts` equal parts of a batch. Raises ValueError unless there are such."""
+    size = experiment.training.batch_size
+    if size % parts:
+        raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")
+    return size // parts
+
+
 class Examples(Dataset):
     """`examples[step, part] -> a batch`: part of `parts` equal parts of a step's global batch, interleaved.
 
@@ -155,9 +163,7 @@ class Examples(Dataset):
     """
 
     def __init__(self, experiment: Experiment, images: TrainingImages, parts: int, draw: Draw):
-        size = experiment.training.batch_size
-        if size % parts:
-            raise ValueError(f"expected a batch size that {parts} processes x passes share equally, found {size}")
+        share_of(experiment, parts)
         self.experiment = experiment
         self.images = images
         self.parts = parts

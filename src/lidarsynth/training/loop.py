@@ -235,7 +235,7 @@ def _gradients(
     limit = math.inf if clip_norm is None else clip_norm
     norm = float(accelerator.clip_grad_norm_(parameters, limit))  # type: ignore[arg-type]
     parts = {name: (float(part[0]), float(part[1])) for name, part in zip(sums, total, strict=True)}
-    mean = sum(value for value, _ in parts.values()) / sum(count for _, count in parts.values())
+    mean = sum(value for value, _ in parts.values()) / max(1, sum(count for _, count in parts.values()))
     return {"loss": mean, **{name: value / count for name, (value, count) in parts.items() if count}}, norm
 
 

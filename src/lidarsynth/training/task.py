@@ -90,6 +90,10 @@ def itself(experiment: Experiment, network: nn.Module) -> nn.Module:
     return network
 
 
+def any_share(experiment: Experiment, samples: int) -> None:
+    """A network can learn from any number of samples at once."""
+
+
 def nothing(experiment: Experiment, network: nn.Module, step: int, accelerator: Accelerator) -> None:
     """No more to do after a step."""
 
@@ -108,6 +112,7 @@ class Task:
     average     after a step, counted from 1: how much of the average stays, or None = left as it is
     buffers     whether floating buffers are averaged like parameters, or copied
     after       what else changes after a step, counted from 1; must be the same in all processes
+    share       raises ValueError for a number of samples at once, in a process's pass, that cannot be learned from
     """
 
     parts: tuple[str, ...]
@@ -120,3 +125,4 @@ class Task:
     average: Callable[[Training, int], float | None] = average
     buffers: bool = True
     after: Callable[[Experiment, nn.Module, int, Accelerator], None] = nothing
+    share: Callable[[Experiment, int], None] = any_share

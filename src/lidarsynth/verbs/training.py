@@ -25,10 +25,20 @@ from lidarsynth.lidar.depth import CODECS
 from lidarsynth.lidar.projection import PROJECTIONS
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import WORDS
+from lidarsynth.networks.coordinates import ENCODINGS
 from lidarsynth.pictures.figure import compare
 from lidarsynth.systems.table import SYSTEMS, build_network, system_of, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
-from lidarsynth.training.examples import OF_ANY, SYNTHETIC, Streets, TrainingImages, folders_of, open_images, words_of
+from lidarsynth.training.examples import (
+    OF_ANY,
+    SYNTHETIC,
+    Streets,
+    TrainingImages,
+    folders_of,
+    open_images,
+    share_of,
+    words_of,
+)
 from lidarsynth.training.journal import Journal
 from lidarsynth.training.loop import DECAYS, Progress, Run, start, train
 from lidarsynth.training.machine import accelerator_of, any_process, fixed_randomness, silent_threads, stop_signals
@@ -72,14 +82,15 @@ def check_words(experiment: Experiment) -> None:
     """Raises ValueError by name for a word that its table does not have, for no steps, and for no known rows."""
     tables = {
         "data": {"codec": CODECS, "projection": PROJECTIONS},
-        "model": {"network": SYSTEMS},
+        "model": {"network": SYSTEMS, "coords_encoding": ENCODINGS},
         "diffusion": {"schedule": SCHEDULES, "kind": KINDS, "loss": LOSSES},
         "training": {"decay": DECAYS},
     }
     for group, words in tables.items():
         for name, table in words.items():
             if (word := getattr(getattr(experiment, group), name)) not in table:
-                raise ValueError(f"{group}.{name}: expected one of {', '.join(table)}, found {word!r}")
+                choices = ", ".join("null" if choice is None else choice for choice in table)
+                raise ValueError(f"{group}.{name}: expected one of {choices}, found {word!r}")
     if experiment.training.steps < 1:
         raise ValueError("training.steps: expected at least 1, found 0")
     if (group := experiment.upsampling) and group.first >= group.factor[0]:
@@ -146,6 +157,7 @@ def _run(
     accelerator: Accelerator,
 ) -> Iterator[Progress]:
     task = task_of(experiment)
+    task.share(experiment, share_of(experiment, accelerator.num_processes * accelerator.gradient_accumulation_steps))
     task = replace(task, pictures=completions) if experiment.base else task  # which a base generates
     monitor = Monitor(experiment, task, data, validation)  # first, as it refuses images before anything is written
     experiment, state, note = _begin(experiment, images, data, out, begun, resume, accelerator)

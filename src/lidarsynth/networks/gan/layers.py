@@ -13,6 +13,7 @@ from torch.nn import functional as F
 BINOMIAL_3 = (1, 2, 1)
 BINOMIAL_4 = (1, 3, 3, 1)
 HEIGHT, WIDTH = 2, 3  # dimensions of (B,C,H,W)
+GROUP = 4  # images whose deviation a discriminator is told
 
 
 class Pad(nn.Module):
@@ -143,7 +144,7 @@ class MinibatchStdDev(nn.Module):
     Raises ValueError if the group does not divide the batch. Progressive GAN section 3.
     """
 
-    def __init__(self, group: int = 4):
+    def __init__(self, group: int = GROUP):
         super().__init__()
         self.group = group
 

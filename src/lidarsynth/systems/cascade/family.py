@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
-from lidarsynth.experiment.record import Experiment
+from lidarsynth.experiment.record import Experiment, Model
 from lidarsynth.experiment.sensor import build_sensor
+from lidarsynth.lidar.semantic_kitti import CLASSES
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
@@ -21,6 +24,7 @@ from lidarsynth.systems.cascade.description import DESCRIPTION
 from lidarsynth.systems.cascade.graph import fill_graph
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.training import CASCADE as TASK
+from lidarsynth.systems.sizes import check_multiples, check_unet
 from lidarsynth.systems.system import System
 
 
@@ -31,6 +35,7 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     likeliest fill, and for slopes of openness other than six.
     """
     model, width = experiment.model, experiment.model.base_channels
+    _check(model)
     if len(set(model.num_residual_blocks)) > 1:
         raise ValueError(f"model.num_residual_blocks: expected as many at each level of a cascade, found "
                          f"{model.num_residual_blocks}")  # fmt: skip
@@ -53,6 +58,19 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     inside = ClassUNet(model.inside_channels) if model.classes and model.inside_channels else None
     drawn = ClassUNet(model.drawn_channels, classes=model.classes) if model.classes and model.drawn_channels else None
     return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside, drawn)
+
+
+def _check(model: Model) -> None:
+    """Raises ValueError by the field for numbers that the networks cannot be built of, or learn by."""
+    check_multiples({
+        "model.base_channels": (model.base_channels, 16),  # a fill's widths are half as much again
+        "model.guide_channels": (model.guide_channels, 8),
+        "model.column_channels": (model.column_channels, 4),  # heads of attention
+        "model.judge_channels": (model.judge_channels, 8),
+    })  # fmt: skip
+    check_unet(replace(model, gn_num_groups=8, attn_num_heads=8))  # the coarse stage has its own
+    if model.classes not in (0, len(CLASSES)):
+        raise ValueError(f"model.classes: expected 0 or {len(CLASSES)}, found {model.classes}")
 
 
 def _widths(first: int) -> tuple[int, int, int, int]:

@@ -1,4 +1,9 @@
-"""How the cascade learns: the fill by absolute errors and by energy scores, the coarse stage by flow matching."""
+"""How the cascade learns: the fill by absolute errors and by energy scores, the coarse stage by flow matching.
+
+What a process draws for its share of a batch as a whole, the columns that are judged and spoilt and the pixels that
+classes overlap in, depends on how the batch is shared; lessons are of every second image of each share. All else is a
+function of (seed, step, position), as with `tuned`, which learns nothing of these.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +66,7 @@ class FillObjective(nn.Module):
 
     def _sample(self, crops: Crops, n: int) -> Tensor:
         if n == 0:
-            return crops.metres[:0, 0, 0, 0]
+            return _of_none(self.network)
         known, rays, metres, reflectance, _ = _part(crops, slice(None, n))
         shape = (1, metres.shape[2], metres.shape[3])
         draws = [draw_noise(shape, sample_rng(s, 0, k)) for k in (0, 1) for s in crops.seeds[:n]]
@@ -76,7 +81,7 @@ class FillObjective(nn.Module):
         known, rays, metres, reflectance, classes = _part(crops, slice(n, None))
         noise = metres.new_zeros(len(metres), 3, *metres.shape[2:])
         if not len(metres):
-            return metres[:, 0, 0, 0]
+            return _of_none(self.network)
         learns = self.network.classes is not None
         filled = self.network(known, rays, noise, classify=learns)
         errors = absolute_errors(filled, known, rays, metres, reflectance)
@@ -93,10 +98,16 @@ class LikeliestObjective(nn.Module):
     def forward(self, batch: CascadeBatch) -> dict[str, Tensor]:
         known, rays, metres, reflectance, _ = _part(batch.crops, slice(batch.crops.samples, None))
         if not len(metres):
-            return {"likeliest": metres[:, 0, 0, 0]}
+            return {"likeliest": _of_none(self.network)}
         known = known._replace(reflectance=calmed(known.reflectance, known.metres, known.lit))
         filled = self.network(known, rays, metres.new_zeros(len(metres), NOISES, *metres.shape[2:]))
         return {"likeliest": expected_errors(filled, known, rays, metres, reflectance)}
+
+
+def _of_none(network: nn.Module) -> Tensor:
+    """The losses (0,) of no crops, whose gradients are 0: a share of a batch may have none of a kind, and a distributed
+    wrapper waits for the gradient of every parameter."""
+    return torch.stack([parameter.sum() for parameter in network.parameters()]).sum().expand(0)
 
 
 class CoarseObjective(nn.Module):

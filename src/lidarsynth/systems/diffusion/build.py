@@ -12,6 +12,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.conditional import CANDIDATES, ConditionalUNet
 from lidarsynth.networks.efficient_unet import EfficientUNet
 from lidarsynth.networks.refinenet import RefineNet, geometric_sigmas
+from lidarsynth.systems.sizes import check_stem, check_unet
 
 
 def efficient_unet(
@@ -19,6 +20,8 @@ def efficient_unet(
 ) -> EfficientUNet:
     """R2DM's U-Net with the sensor's ray angles."""
     model = experiment.model
+    check_unet(model)
+    check_stem(model, sensor)
     unet = EfficientUNet(
         in_channels=in_channels,
         out_channels=out_channels,
@@ -41,11 +44,20 @@ def efficient_unet(
 
 def refinenet(experiment: Experiment, sensor: Sensor) -> RefineNet:
     """For images in [-1, 1]: with a score group the published score network, else a noise predictor."""
-    score = experiment.score or Score()
+    score, width = experiment.score or Score(), experiment.model.base_channels
+    _check_score(score)
+    if width < 2:  # channels are normalised by how their means differ
+        raise ValueError(f"model.base_channels: expected at least 2 for refinenet, found {width}")
     divide = experiment.diffusion.kind == "score"
-    network = RefineNet(2, experiment.model.base_channels, score.levels, unit_range=False, divide=divide)
+    network = RefineNet(2, width, score.levels, unit_range=False, divide=divide)
     network.sigmas.copy_(geometric_sigmas(score.levels, score.sigma_max, score.sigma_min))
     return network
+
+
+def _check_score(score: Score) -> None:
+    if not 0 < score.sigma_min < 0.5 <= score.sigma_max:  # of data in [0, 1], which the noise has to cover
+        raise ValueError("score.sigma_min, score.sigma_max: expected 0 < sigma_min < 0.5 <= sigma_max, found "
+                         f"{score.sigma_min:g} and {score.sigma_max:g}")  # fmt: skip
 
 
 def conditional_unet(experiment: Experiment, sensor: Sensor) -> ConditionalUNet:
@@ -70,4 +82,5 @@ def _schedule(experiment: Experiment) -> Schedule:
         return SCHEDULES[experiment.diffusion.schedule]()
     if experiment.diffusion.schedule != "ve":
         raise ValueError(f"diffusion.schedule: expected ve beside a score group, found {experiment.diffusion.schedule}")
+    _check_score(experiment.score)
     return ve(2 * experiment.score.sigma_min, 2 * experiment.score.sigma_max)

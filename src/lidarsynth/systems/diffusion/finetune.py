@@ -16,6 +16,7 @@ FREE = ("model.network", "model.ring", "model.dropout", "model.candidates", "mod
 MEANING = ("data.codec", "diffusion.kind", "diffusion.schedule")  # fields outside the model that do
 FIRST = "in_conv.weight"
 LAST = "out_conv."
+REFINENET = "refinenet"  # has nothing in common with the others, which differ by what they are told
 CHANNELS = 2  # range and reflectance
 
 
@@ -26,6 +27,9 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     position encoding start at zero. A network that is not told the known pixels may become one that is, and back: their
     channels start at zero. Everything else must be equal. Raises ValueError that lists the fields that differ.
     """
+    words = [e.model.network for e in (experiment, source)]
+    if words[0] != words[1] and REFINENET in words:
+        raise ValueError(f"{name}: expected weights of {words[0]}, found those of {words[1]}, another network")
     different = differences(experiment, source)
     if different:
         wanted = "--set " + " ".join(f"{field}={_word(theirs)}" for field, _, theirs in different)

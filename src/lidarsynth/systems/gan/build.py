@@ -11,6 +11,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.gan import dcgan as gan
 from lidarsynth.networks.gan import dusty2
 from lidarsynth.networks.gan.scan_generator import ScanGenerator
+from lidarsynth.systems.sizes import check_gan
 
 
 def generator(experiment: Experiment, sensor: Sensor) -> ScanGenerator:
@@ -20,6 +21,7 @@ def generator(experiment: Experiment, sensor: Sensor) -> ScanGenerator:
         raise ValueError(f"data.codec: expected inverse or inverse-minmax for {model.network}, found {codec!r}")
     if group.image_mask and model.network != "dusty-v1":
         raise ValueError(f"adversarial.image_mask: expected false for {model.network}, which has none, found true")
+    check_gan(model.network, sensor)
     size, widths = (sensor.height, sensor.width), (model.base_channels, group.max_channels)
     if model.network == "dusty-v2":
         latents = (group.latent_channels, group.style_channels)

@@ -23,6 +23,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.bev import BevCounts
 from lidarsynth.metrics.distributions import jensen_shannon_distance
 from lidarsynth.networks.gan.adaptive_augmentation import AdaptiveAugmentation
+from lidarsynth.networks.gan.layers import GROUP
 from lidarsynth.networks.gan.losses import (
     discriminator_loss,
     generator_loss,
@@ -195,6 +196,13 @@ def optimizers(experiment: Experiment, networks: nn.Module) -> dict[str, torch.o
     return made
 
 
+def share(experiment: Experiment, samples: int) -> None:
+    """Raises ValueError for samples that DUSty v2's discriminator cannot compare in groups of four."""
+    if experiment.model.network == "dusty-v2" and samples > GROUP and samples % GROUP:
+        raise ValueError(f"training.batch_size: expected a multiple of {GROUP}, or fewer, in a process's pass, as "
+                         f"dusty-v2 compares groups of {GROUP}, found {samples}")  # fmt: skip
+
+
 def average(training: Training, step: int) -> float:
     """Share of the old average that stays: half of it after `ema_half_life` images, sooner in the beginning."""
     half_life = min(training.ema_half_life, RAMP * step * training.batch_size)
@@ -264,4 +272,5 @@ ADVERSARIAL = Task(
     average=average,
     buffers=False,
     after=after,
+    share=share,
 )

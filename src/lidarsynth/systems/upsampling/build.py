@@ -6,11 +6,13 @@ from lidarsynth.experiment.record import Experiment, Upsampling
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.iln import ILN, LIIF
 from lidarsynth.networks.lidar_sr import LidarSR
+from lidarsynth.systems.sizes import check_divisor, check_lidar_sr
 
 
 def lidar_sr(experiment: Experiment, sensor: Sensor) -> LidarSR:
     """LiDAR-SR, as wide as the experiment says."""
     model, group = experiment.model, experiment.upsampling or Upsampling()
+    check_lidar_sr(group, sensor)
     return LidarSR(group.factor, model.base_channels, model.dropout, group.keras)
 
 
@@ -18,6 +20,7 @@ def iln(experiment: Experiment, sensor: Sensor) -> ILN:
     """ILN of the experiment's layers and heads."""
     model, group = experiment.model, experiment.upsampling or Upsampling()
     blocks = sum(model.num_residual_blocks)
+    check_divisor("model.attn_num_heads", model.attn_num_heads, [model.base_channels])
     return ILN(group.depth, model.attn_num_heads, model.base_channels, blocks, model.dropout)
 
 
