@@ -325,8 +325,8 @@ def test_shards_are_the_whole(scans: Path, tmp_path: Path):
     arrays = [name for name in names(tmp_path / "whole") if name.endswith(".npz")]
     assert [name for name in names(tmp_path / "parts") if name.endswith(".npz")] == arrays
     for name in arrays:
-        one, other = (np.load(tmp_path / folder / name) for folder in ("parts", "whole"))
-        np.testing.assert_array_equal(one["range"], other["range"])
+        with np.load(tmp_path / "parts" / name) as one, np.load(tmp_path / "whole" / name) as other:
+            np.testing.assert_array_equal(one["range"], other["range"])
     merged, whole = told(tmp_path / "parts"), told(tmp_path / "whole")
     assert merged["settings"]["shards"] == 2
     assert [(r["name"], r.get("points")) for r in merged["scans"]] == [

@@ -56,13 +56,11 @@ def generate(
     picture: Picture = True,
 ) -> None:
     """New scans: a file and a picture per scan. Stopped, the same command goes on where it was."""
-    from lidarsynth.data.workers import begin_early
     from lidarsynth.files.lock import only_writer
 
     at_least(1, {"count": count, "steps": steps, "batch-size": batch_size, "workers": workers, "layouts": layouts})
     at_least(0, {"seed": seed})
-    if count > FEW and (workers or os.cpu_count() or 1) > 1 and device == "cpu":
-        begin_early("lidarsynth.verbs.generation", "lidarsynth.weights.load")
+    _begin_early(count, workers, device)
     from lidarsynth.systems.fingerprint import fingerprint
     from lidarsynth.verbs import generation
 
@@ -70,13 +68,11 @@ def generate(
     endings = generation.endings_of(format, labels, picture, boxes)
     source = generation.Drawing(model, device, sensor, labels, layouts, precision)
     loaded = source.of(load_with_bar(model, device))
-    calls = loaded.generation_steps(steps, sampler)
-    used = loaded.sampler_used(steps, sampler)
+    calls, used = loaded.generation_steps(steps, sampler), loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format} | generation.steps_of(loaded, steps, sampler)
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
-    settings |= ({"labels": True} if labels else {}) | ({"boxes": True} if boxes else {})
-    settings |= {} if layouts is None else {"layouts": layouts}
-    settings |= generation.precision_of(loaded)
+    said = {"labels": labels or None, "boxes": boxes or None, "layouts": layouts} | generation.precision_of(loaded)
+    settings |= {key: value for key, value in said.items() if value is not None}
     with only_writer(out, "generation"):
         generation.claim(out, settings, loaded.sampler_used(steps))
         if sampler is None and used != loaded.sampler_used():
@@ -92,6 +88,14 @@ def generate(
                 new = sum(1 for _ in make(on_step=on_scan, workers=workers, source=source))
     made = f"{out}/ has {plural(count, 'scan')}, {new} of them new: 000000.{format} ... {count - 1:06d}.{format}"
     _tell(made, loaded.sensor if boxes else None)
+
+
+def _begin_early(count: int, workers: int | None, device: str) -> None:
+    """Where several processes are likely to draw, they begin while this one reads the model."""
+    if count > FEW and (workers or os.cpu_count() or 1) > 1 and device == "cpu":
+        from lidarsynth.data.workers import begin_early
+
+        begin_early("lidarsynth.verbs.generation", "lidarsynth.weights.load")
 
 
 def _tell(made: str, of_boxes: Sensor | None) -> None:

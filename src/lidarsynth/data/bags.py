@@ -121,6 +121,8 @@ def _ros2(path: Path) -> tuple[Any, tuple[str, ...]]:
         found = read_database(path)
     words = Mended(path, b"", 0, b"", found.message_count if found else 0, 0).words()
     if found is None or not found.rows:
+        if found is not None:
+            found.close()
         raise FileError(words)
     return found, (words,)
 
