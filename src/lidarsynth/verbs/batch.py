@@ -19,6 +19,7 @@ from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import BARE, BESIDE, write, write_labels
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.columns import columns_note, usual_at_most
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
@@ -297,7 +298,9 @@ def _made(
     if job.verb == "project":
         image = project(scan, named_sensor(scan, path, "--sensor", job.sensor), job.projection, job.width)
         image = check_seen(image, len(scan))
-        done = f"{len(scan)} points, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
+        done = (
+            f"{plural(len(scan), 'point')}, {image.sensor.name}, {image.mask.mean():.1%} of {image.shape} pixels filled"
+        )
         return image, done if job.width else done + _columns(image.sensor, job, "; ")
     assert model is not None
     if job.verb == "complete":
@@ -323,7 +326,7 @@ def _made(
         return named, found(named.points, sensor) + _columns(sensor, job, "; ")
     sensor = named_sensor(scan, path, "--from", job.sensor, model.sensor if model.any_sensor else None)
     filled = upsample_scan(model, scan, sensor, job.how, on_step, job.times, job.least)
-    done = f"{len(scan)} points of {sensor.name} became {_count(filled, work)}"
+    done = f"{plural(len(scan), 'point')} of {sensor.name} became {_count(filled, work)}"
     own = filled.image.sensor.width == sensor.width  # else the image is another sensor's
     return filled, done + _columns(sensor, job, "; ") if own else done
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarsynth.files.fields import PLACE, Fields
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.lidar.sensor import Sensor
@@ -35,7 +36,7 @@ def found(points: Scan, sensor: Sensor) -> str:
     most = [k for k in np.argsort(-count) if k and count[k]][:MOST]
     named = "".join(f"{CLASSES[k][0]} {count[k] / len(points):.0%}, " for k in most)
     inside = ", as furniture is inside a building" if count[CLASS_NUMBER["other-ground"]] else ""  # a floor
-    return f"{len(points)} points of {sensor.name}: {named}{count[0]} without a class{inside}"
+    return f"{plural(len(points), 'point')} of {sensor.name}: {named}{count[0]} without a class{inside}"
 
 
 def labelled_fields(named: Scan, loaded: Loaded) -> Fields:
