@@ -145,7 +145,11 @@ def test_experiments_that_cannot_be_built_say_why(changes, message):
     [
         ("r2dm-h", {"model.channel_multipliers": [1]}, r"model.channel_multipliers: expected 4 .*, found \[1\]"),
         ("r2dm-h", {"model.num_residual_blocks": [0, 0, 0, 0]}, "model.num_residual_blocks: expected 4 .*, found"),
-        ("r2dm-h", {"model.base_channels": 12}, "model.gn_num_groups: expected a divisor of 12, 12, 24, .*, found 8"),
+        (
+            "r2dm-h",
+            {"model.base_channels": 12},
+            r"model.gn_num_groups must divide all level widths \[12, 12, 24, .*\], got 8",
+        ),
         ("r2dm-h", {"model.attn_num_heads": 7}, "model.attn_num_heads: expected a divisor of 256, 512 .*, found 7"),
         ("r2dm-h", {"model.stem": [1, 3]}, "divisible by 24, .*: expected 1008 or 1032, found 1024"),
         ("kitti-streets", {"model.base_channels": 2, "model.gn_num_groups": 2}, "base_channels: expected an even"),

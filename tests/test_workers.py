@@ -33,6 +33,27 @@ def test_early_ones_have_imported_it_and_answer_in_order(length: int, tmp_path: 
     assert done.stdout == f"{[(length == 1, str(tmp_path), i) for i in range(5)]}\n"
 
 
+FORKED = """
+import os
+from lidarsynth.data.workers import begin_early, in_order
+if __name__ == "__main__":
+    begin_early("lidarsynth.lidar.plural")
+    if not (child := os.fork()):
+        begin_early("lidarsynth.lidar.plural")
+        print(list(in_order(abs, range(5), 2)), flush=True)
+        os._exit(0)
+    os.waitpid(child, 0)
+    print(list(in_order(abs, range(3), 2)))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers begin by themselves")
+def test_a_process_that_is_forked_from_one_that_has_begun_has_its_own(tmp_path: Path):
+    (tmp_path / "forked.py").write_text(FORKED)
+    done = subprocess.run([sys.executable, tmp_path / "forked.py"], capture_output=True, text=True, timeout=100)
+    assert (done.stdout, done.stderr) == ("[0, 1, 2, 3, 4]\n[0, 1, 2]\n", "")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers begin by themselves")
 @pytest.mark.parametrize("seconds", [0.4, 1.2, 2.5])
 def test_ctrl_c_in_a_terminal_is_one_line_while_workers_begin(seconds: float, tmp_path: Path):

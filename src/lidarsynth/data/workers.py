@@ -24,7 +24,7 @@ AHEAD = 16  # items of each process that are begun or wait for it: there may be 
 
 Item = TypeVar("Item")
 _make: list[Callable[[Any], Any]] = []  # of this worker process; sent once, not with every item
-_begun: list[str] = []  # what `begin_early` has begun
+_begun: set[int] = set()  # processes that have called `begin_early`; those that are forked from them begin others
 
 
 def in_order(make: Callable[[Item], Any], items: Iterable[Item], workers: int) -> Generator[Any, None, None]:
@@ -54,10 +54,10 @@ def begin_early(*modules: str) -> None:
     """
     if sys.platform == "linux":
         resource_tracker.ensure_running()  # which lets Ctrl-C through where it begins
-        with _uninterrupted(), suppress(OSError):  # there is none where TMPDIR is too long for the name of a socket
+        with _uninterrupted(), suppress(OSError):  # none where TMPDIR is too long for a socket, or after a fork
             forkserver.set_forkserver_preload([*modules])
             forkserver.ensure_running()
-            _begun.extend(modules)
+            _begun.add(os.getpid())
 
 
 @contextmanager
@@ -70,7 +70,7 @@ def pool_of(
     Raises OSError when one is gone.
     """
     # Not fork: threads of torch in this process would be copied in whatever state they are.
-    context = multiprocessing.get_context("forkserver" if _begun else "spawn")
+    context = multiprocessing.get_context("forkserver" if os.getpid() in _begun else "spawn")
     others, done = set(multiprocessing.active_children()), False
     pool = ProcessPoolExecutor(workers, context, start, (make,))
 

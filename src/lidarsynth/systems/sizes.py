@@ -19,7 +19,8 @@ def check_unet(model: Model) -> None:
         if len(values) != LEVELS or min(values) < 1:
             raise ValueError(f"model.{name}: expected {LEVELS} numbers of at least 1, found {list(values)}")
     widths = [model.base_channels, *(model.base_channels * factor for factor in model.channel_multipliers)]
-    check_divisor("model.gn_num_groups", model.gn_num_groups, widths)
+    if any(width % model.gn_num_groups for width in widths):
+        raise ValueError(f"model.gn_num_groups must divide all level widths {widths}, got {model.gn_num_groups}")
     check_divisor("model.attn_num_heads", model.attn_num_heads, widths[-2:])
     if model.base_channels < 4 or model.base_channels % 2:
         raise ValueError(f"model.base_channels: expected an even number of at least 4, found {model.base_channels}")
