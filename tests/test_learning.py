@@ -240,6 +240,19 @@ def test_sky_at_the_end_of_a_street_is_no_carrier():
     assert (3, 500, 519) not in blocked_runs(seen, np.array([-8.0, -9.0, -10.0, -11.0]), (8.0, 0.0)), "not if tilted"
 
 
+def test_a_sector_without_any_return_is_out_of_the_view_of_all_beams():
+    down = np.array([-1.0, -9.0, -10.0, -11.0])
+    seen = np.random.default_rng(0).random((5, 4, 1000)) < np.array([0.6, 0.9, 0.9, 0.9])[:, None]
+    seen[:, :, 900:] = seen[:, :, :100] = False
+    assert blocked_runs(seen, down) == tuple((row, 900, 99) for row in range(4)), "the highest alone would not tell"
+    assert blocked_runs(seen[:, [0, 0, 0, 0]], down) == (), "of which none is sure"
+    seen[2, 0, 900::40] = seen[2, 0, :100:40] = True
+    assert 0 not in {row for row, _, _ in blocked_runs(seen, down)}, "it looks over what hides the others"
+    narrow = np.random.default_rng(0).random((5, 4, 1000)) < np.array([0.6, 0.9, 0.9, 0.9])[:, None]
+    narrow[:, :, 40:80] = False
+    assert 0 not in {row for row, _, _ in blocked_runs(narrow, down)}, "there may be sky over what hides the others"
+
+
 def test_a_sensor_that_looks_ahead_is_learned_so():
     elevations = tuple(np.linspace(8.0, -16.0, 16).tolist())
     sensor = Sensor("ahead", elevations, 600, 0.3, 100.0, mount=1.1, tilt=(-3.0, 2.0))

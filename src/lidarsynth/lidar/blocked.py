@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 SCANS = 5  # what never returned in fewer scans may have looked at the sky
@@ -11,6 +13,7 @@ CHANCE = 1e-3  # that what is not blocked never returned in so many places
 # Degrees: rays that look higher may meet nothing wherever a street leads; of these only runs whose edges stand still
 # are believed, where in this share of a turn beside them returns are at least half of what is usual for the row.
 LEVEL, BESIDE, USUAL = -5.0, 0.002, 0.5
+SECTOR = 1 / 12  # of a turn: where no beam at all returned in as much, and some are blocked, the sensor does not look
 
 
 def blocked_runs(
@@ -23,12 +26,13 @@ def blocked_runs(
     tilt        degrees of the sensor against the ground, which may raise a row by as much
 
     None where there are too few scans to tell, or all are of nearly one place. Rays that look up need the more of them,
-    and sharp edges: above the end of a street there is always sky.
+    and sharp edges: above the end of a street there is always sky. A wide sector without any return, of which some rows
+    are blocked, is none of the view of the others, either.
     """
     if len(seen) < SCANS:
         return ()
     returned, width = seen.mean(axis=0), seen.shape[2]
-    view = seen.any(axis=(0, 1))  # of a sensor that looks ahead only, columns behind it never return
+    view = np.asarray(seen.any(axis=(0, 1)))  # of a sensor that looks ahead only, columns behind it never return
     many, raised = places(seen[:, :, view]), float(np.hypot(*tilt))
     near = np.arange(1, max(round(BESIDE * width), 3) + 1)
     runs = []
@@ -42,7 +46,17 @@ def blocked_runs(
             beside = [share[(edge + steps) % width].mean() for edge, steps in ((first, -near), (last, near))]
             if (last - first) % width + 1 >= RUN * width and (not high or min(beside) >= USUAL * usual):
                 runs.append((int(row), first, last))
-    return tuple(runs)
+    return tuple(sorted({*runs, *_unseen_sectors(view, len(elevations), runs)}))
+
+
+def _unseen_sectors(view: np.ndarray, rows: int, runs: list[tuple[int, int, int]]) -> Iterator[tuple[int, int, int]]:
+    """As `blocked_runs`, of the other rows, of which nothing is said there: sectors without any return, view (W,)."""
+    width = len(view)
+    for first, last in _empty_runs(~view):
+        if (size := (last - first) % width + 1) < SECTOR * width:
+            continue
+        known = {row for row, start, end in runs if (first - start) % width + size <= (end - start) % width + 1}
+        yield from ((row, first, last) for row in range(rows) if known and row not in known)
 
 
 def _empty_runs(empty: np.ndarray) -> list[tuple[int, int]]:

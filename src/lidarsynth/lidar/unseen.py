@@ -17,17 +17,21 @@ SPARSE = 200  # points: of so few of an XT32 less than half of the new ones are 
 FEW = 0.15  # share of the usual points of a degree that are hardly any
 
 
-def caution(scan: Scan, sensor: Sensor | None = None, alone: bool = True) -> str | None:
+def caution(
+    scan: Scan, sensor: Sensor | None = None, alone: bool = True, image: Sensor | None = None, around: bool = True
+) -> str | None:
     """What must be said of the completion of a scan, in one line, or None.
 
     sensor  that it is said to be of; of one that was recognised, beams are taken where the scan has them
     alone   False = something else is said of its sensor or frame already: only what was filled in, and what lacks
+    image   in whose image points are put, None = `sensor`
+    around  False = they are put between the beams of the scan alone, so none where a part of the turn has none
     """
     said = [] if (before := filled_before(scan)) is None else [before]
     if 0 < len(scan) < SPARSE:
         said.append(f"expected a turn of a sensor, found {plural(len(scan), 'point')}: most of what is put between is "
                     "a guess; of default's a least confidence of 0.5 leaves most out")  # fmt: skip
-    elif len(scan) and (wide := widest_gap(scan.xyz)) > WIDE + _never_seen(sensor):
+    elif around and len(scan) and (wide := widest_gap(scan.xyz)) > WIDE + _never_seen(image or sensor):
         said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there is "
                     "a guess; of default's a least confidence of 0.8 leaves most out, repaint draws one")  # fmt: skip
     if not alone:

@@ -33,11 +33,14 @@ def taken(points: Points) -> Scan:
     return as_scan(as_array(points))
 
 
-def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: bool = False) -> Any:
+def noted(
+    model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: bool = False, beams: bool = False
+) -> Any:
     """The scan or image, or an array or tensor as a scan, with a warning of what should be known of the result.
 
     sensor   that made the scan, None = recognised
     filling  whether points are to be added
+    beams    whether these are of beams more, as of `upsample`
     """
     scan = scan if isinstance(scan, RangeImage) else taken(scan)
     if isinstance(scan, RangeImage):
@@ -47,17 +50,22 @@ def noted(model: Knows, scan: Any, sensor: Sensor | str | None = None, filling: 
             warnings.warn(f'{model.experiment.name} {text}; use load("default")', stacklevel=3)
         if (text := displaced(model, scan, sensor)) is not None:
             warnings.warn(text, stacklevel=3)
-        if filling and (text := caution(scan, None if sensor is None else get_sensor(sensor))) is not None:
+        known = None if sensor is None else get_sensor(sensor)
+        image = model.sensor if bound(model) else None
+        if filling and (text := caution(scan, known, image=image, around=not beams or bound(model))) is not None:
             warnings.warn(text, stacklevel=3)
     return scan
+
+
+def bound(model: Knows) -> bool:
+    """Whether images are of the model's sensor, whatever made the scans, as after `into` or of a model of one alone."""
+    return not model.any_sensor or model.experiment.data.fixed
 
 
 def beyond_image(model: Knows, scan: Scan) -> str | None:
     """That points are above or below the view of the sensor in whose image a model draws a scan of any, and how many;
     or None, as until `into`, where it is the scan's own."""
-    if model.any_sensor and not model.experiment.data.fixed:
-        return None
-    return beyond_beams(scan.xyz, model.sensor)
+    return beyond_beams(scan.xyz, model.sensor) if bound(model) else None
 
 
 def displaced(model: Knows, scan: Scan, sensor: Sensor | str | None = None) -> str | None:

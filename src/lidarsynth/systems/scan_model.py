@@ -174,7 +174,7 @@ class ScanModel(ABC):
         beams of a model that cannot make them.
         """
         if self.any_sensor:  # others are made to take another's
-            scan = noted(self, scan, sensor_in, filling=True)
+            scan = noted(self, scan, sensor_in, filling=True, beams=True)
         how = Filling(method, steps, resamples, sampler, checked_seed(seed), precision)
         with usual_torch():
             return self.upsampled(scan, how, sensor_in, on_step, times)

@@ -30,7 +30,7 @@ from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.streets.wanted import wanted
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.notes import IN_PYTHON, beyond_image
+from lidarsynth.systems.notes import IN_PYTHON, beyond_image, bound
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, taken_away, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
@@ -194,7 +194,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         warning = warning or _viewpoint_warning(job, work)
         beyond = _view_warning(loaded.scan, job, work, model)
         done, note = _made(job, model, work, loaded.scan, on_step)
-        more = loaded.left_out, beyond, _caution(loaded.scan, job, work, alone=warning is None)
+        more = loaded.left_out, beyond, _caution(loaded.scan, job, work, model, alone=warning is None)
         warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside, picture, other = None, (), None, None
         if work.target is None:
@@ -272,14 +272,16 @@ def _viewpoint_warning(job: Job, work: Work) -> str | None:
     return text and f"{work.item.path}: {text}"
 
 
-def _caution(scan: Scan, job: Job, work: Work, alone: bool) -> str | None:
+def _caution(scan: Scan, job: Job, work: Work, model: ScanModel | None, alone: bool) -> str | None:
     """What must be said of the points that are to be completed: of each scan, how many were filled in before; of those
     that are looked at, what lacks, and where nothing else is said (`alone`) all that there is to say."""
-    if job.verb not in ("complete", "upsample"):
+    if job.verb not in ("complete", "upsample") or model is None:
         return None
     if not work.check or job.how.removed is not None:  # then nothing is filled where the scan has gaps of its own
         return filled_before(scan)
-    return caution(scan, None if job.sensor is None else get_sensor(job.sensor), alone)
+    sensor = None if job.sensor is None else get_sensor(job.sensor)
+    around = job.verb == "complete" or bound(model)
+    return caution(scan, sensor, alone, model.sensor if job.into else None, around)
 
 
 def _in_one_line(path: Path, warning: str | None, *more: str | None) -> str | None:
