@@ -197,3 +197,14 @@ def test_bicyclists_are_named_so_by_a_network_of_streets_alone(monkeypatch: pyte
     assert (named[new] == CLASS_NUMBER["bicyclist"]).mean() > 0.5  # hardly any without a logit more
     ls.load("kitti").label(SyntheticStreets(991, 64, "hdl-64e-kitti")[3])
     assert asked == [{"bicyclist": 1.0}, None], "scans that one has learned from tell for themselves"
+
+
+def test_a_ray_of_two_returns_brings_back_one_from_what_stands_before_both(model: ScanModel):
+    scan = flat_scan(wall=25)
+    far = scan[np.linalg.norm(scan.xyz, axis=1) > 14]
+    both = Scan(*(np.concatenate([getattr(one, name) for one in (scan, replace(far, xyz=far.xyz * np.float32(0.95)))])
+                  for name in ("xyz", "reflectance", "ring", "time", "label")))  # fmt: skip
+    one, two = (own_of(model.insert(each, "car@9/0/90", sensor=FLAT).scan) for each in (scan, both))
+    ways = np.round(two.xyz / np.linalg.norm(two.xyz, axis=1, keepdims=True) * 2000)
+    assert len(np.unique(ways, axis=0)) == len(two) > 100
+    assert abs(len(two) / len(one) - 1) < 0.05

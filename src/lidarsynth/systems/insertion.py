@@ -45,6 +45,7 @@ SHOWN, LEAST = 0.4, 8  # of the rays that would meet a thing where there is room
 # those that it leaves of others that were put
 INSIDE = 5  # measured points that may be in a thing for which somebody names a place: noise
 INSTANCE = "instance"  # field of the numbers of boxes
+SAME = 2e-4  # radians between two returns of a ray, at most
 BESIDE = np.radians(10)  # from one point of a ring to the next, if any of these is to tell how the sensor turns
 RINGS = ("ring", "file_ring")  # further fields that tell of a ray, whatever it meets
 
@@ -187,6 +188,7 @@ def _put(
         met = np.isfinite(found.surface) & (found.face >= 0)
         seen = met & (rays.ends[at] >= found.surface - OCCLUDED)
         returned = np.where(found.distance >= sensor.min_range, found.distance, 0) * seen
+        returned[np.flatnonzero(seen)[_again(rays, at[seen])]] = 0
         left = _left(rays, at[seen], number)
         if thing.place is None and (
             seen.sum() < SHOWN * met.sum() or np.count_nonzero(returned) < LEAST or (left < LEAST).any()
@@ -204,6 +206,15 @@ def _put(
         raise ValueError(f"expected a place for {thing.kind} that the scan's rays reach, found "
                          f"{_where(thing.place)}, of which none returns")  # fmt: skip
     return None
+
+
+def _again(rays: Rays, at: np.ndarray) -> np.ndarray:
+    """(n,) bool: which of rays `at` (n,) look where another of their row does, as those of a second return do."""
+    azimuth, elevation, row = rays.azimuth[at], rays.elevation[at], rays.row[at]
+    order, again = np.lexsort((azimuth, row)), np.zeros(len(at), bool)
+    steps = (np.abs(np.diff(part[order])) for part in (azimuth, elevation, row))
+    again[order[1:]] = np.logical_and.reduce([step < SAME for step in steps])
+    return again
 
 
 def _left(rays: Rays, at: np.ndarray, number: int) -> np.ndarray:
