@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 from lidarsynth.experiment.record import Model, Upsampling
 from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.networks.gan.dcgan import LEVELS as GAN_LEVELS
 
 LEVELS = 4  # of R2DM's U-Net, which halves the image at three of them
-GAN_STEP = 16  # rows and columns of an image for one at the coarsest map of a GAN
+GAN_STEP = 2**GAN_LEVELS  # rows and columns of an image for one at the coarsest map of a GAN, of DUSty v2's, too
 SR_STEP = 16  # and of LiDAR-SR
 
 

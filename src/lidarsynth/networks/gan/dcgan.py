@@ -14,7 +14,7 @@ from lidarsynth.networks.gan.layers import BlurVH, EqualLR, FusedLeakyReLU, Pad
 from lidarsynth.networks.gan.raydrop import GeneratedImages, RayDrop, measured
 
 W_AVG_DECAY = 0.995
-_LEVELS = 4  # the image is 2^4 times as large as the coarsest map
+LEVELS = 4  # the image is 2^4 times as large as the coarsest map
 
 
 class _Heads(nn.Module):
@@ -41,9 +41,9 @@ def _double(in_channels: int, out_channels: int, bias: bool) -> EqualLR:
 
 def _coarsest(resolution: tuple[int, int]) -> tuple[int, int]:
     height, width = resolution
-    if height % 2**_LEVELS or width % 2**_LEVELS or min(resolution) < 2 ** (_LEVELS + 1):
-        raise ValueError(f"resolution must be multiples of {2**_LEVELS}, at least twice that, got {resolution}")
-    return height >> _LEVELS, width >> _LEVELS
+    if height % 2**LEVELS or width % 2**LEVELS or min(resolution) < 2 ** (LEVELS + 1):
+        raise ValueError(f"resolution must be multiples of {2**LEVELS}, at least twice that, got {resolution}")
+    return height >> LEVELS, width >> LEVELS
 
 
 class Generator(nn.Module):
@@ -70,7 +70,7 @@ class Generator(nn.Module):
         if image_mask and not raydrop:
             raise ValueError("image_mask must be off without raydrop, got True")
         kernel = _coarsest(resolution)
-        widths = [min(base_channels << i, max_channels) for i in reversed(range(_LEVELS))]
+        widths = [min(base_channels << i, max_channels) for i in reversed(range(LEVELS))]
         first = EqualLR(nn.ConvTranspose2d(latent_channels, widths[0], kernel, bias=False))
         blocks = [nn.Sequential(nn.Identity(), first, FusedLeakyReLU(widths[0]))]
         for before, after in pairwise(widths):
@@ -112,7 +112,7 @@ class Discriminator(nn.Sequential):
         vertical: str = "replicate",  # padding of the first blur, "reflect": the IROS 2021 release
     ):
         kernel = _coarsest(resolution)
-        widths = [2, *(min(base_channels << i, max_channels) for i in range(_LEVELS))]
+        widths = [2, *(min(base_channels << i, max_channels) for i in range(LEVELS))]
         blocks = [
             nn.Sequential(
                 Pad(1, "reflect"),
