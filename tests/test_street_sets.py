@@ -306,6 +306,25 @@ def test_other_settings_and_other_folders_are_refused(tmp_path: Path):
         list(write_streets(tmp_path / "mine", LabelledStreets(0, 1, SENSOR), "pcd"))
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_disk_that_is_full_at_the_first_file_leaves_the_folder_to_the_same_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str
+):
+    put = street_sets._put
+
+    def full(path: Path, content: object) -> None:
+        if path.name == street_sets.RECORD:
+            return put(path, content)  # type: ignore[arg-type]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        raise OSError("expected room; the same command goes on")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(street_sets, "_put", full)
+        with pytest.raises(OSError, match="the same command goes on"):
+            written(tmp_path / "set", layout)
+    written(tmp_path / "set", layout)
+
+
 def test_sets_and_caches_have_one_edition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     line = LabelledStreets(0, 1, Sensor("line", (-10.0,), 32, 1.0, 30.0))
     written(tmp_path / "set", "pcd", line)

@@ -172,7 +172,7 @@ def _claim(folder: Path, settings: dict[str, Any]) -> bool:
             asked, was = _differing(settings, found), _differing(found, settings)
             raise ValueError(f"{folder}: expected a folder of streets made with {_told(asked)}, found {_told(was)}; "
                              "use another --out")  # fmt: skip
-    elif folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+    elif folder.exists() and _holds_more(folder):  # folders alone are of a disk that was full at the first file
         raise ValueError(f"{folder}: expected an empty folder, or one with {RECORD}; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
     _put(path, (json.dumps(settings, indent=1) + "\n").encode())
