@@ -17,6 +17,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems import removal
 from lidarsynth.systems.interpolation.model import interpolated
 from lidarsynth.weights.load import load
 
@@ -240,6 +241,21 @@ def test_the_verb_takes_away_and_says_how_much_and_who_said_so(place: Path, caps
     write("bare.ply", replace(labelled(), label=None))
     main(["complete", "bare.ply", "--without", "traffic", "--out", "b.ply", *WORDS])
     assert "points, traffic as model names them" in capsys.readouterr().out
+
+
+def test_what_was_filled_in_before_is_counted_where_it_goes(place: Path, capsys: pytest.CaptureFixture[str],
+                                                            monkeypatch: pytest.MonkeyPatch):  # fmt: skip
+    scan = labelled()
+    new = np.arange(len(scan)) % 2
+    write("again.ply", replace(scan, extra={"new": new.astype(np.uint8)}))
+    cars = np.count_nonzero(scan.label == CAR)
+    main(["complete", "again.ply", "--without", "car", "--out", "a.ply", *WORDS])
+    assert f"took away {cars} of {len(scan)} points, car as its labels name them" in capsys.readouterr().out
+    write("again.ply", replace(scan, label=None, extra={"new": new.astype(np.uint8)}))
+    monkeypatch.setattr(removal, "_going", lambda model, scan, gone: np.arange(len(scan)) % 97 < 9)
+    main(["complete", "again.ply", "--without", "car", "--out", "b.ply", *WORDS])
+    told = capsys.readouterr().out.split("took away ")[1].split()
+    assert cars - 20 < int(told[0]) <= cars, "but for those that were filled in again where they were"
 
 
 def test_labels_beside_a_bin_are_its_own(place: Path, capsys: pytest.CaptureFixture[str]):

@@ -17,6 +17,7 @@ from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.removal import in_words, own_classes
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.pictures.portrait import before_and_after, portrait
 from lidarsynth.systems.filling import Filling
@@ -120,12 +121,20 @@ def hidden_part(truth: RangeImage, recipe: str, seed: int) -> tuple[np.ndarray, 
 
 
 def taken_away(scan: Scan, filled: RangeImage, how: Filling, model: str) -> str:
-    """How many of the measured points of a scan were taken away, of which classes, and who said so, in words; '' where
-    nothing was to be."""
+    """How many points of a scan were taken away, of which classes, and who said so, in words; '' where nothing was to
+    be."""
     if how.removed is None:
         return ""
-    gone = np.count_nonzero(were_new(scan) == 0) - np.count_nonzero(were_new(filled.to_scan()) == 0)
-    who = f"{model} names" if own_classes(scan) is None else "its labels name"
+    left, label = filled.to_scan(), own_classes(scan)
+    earlier, now = (part.xyz[were_new(part) > 0] for part in (scan, left))  # no number tells these from what was filled
+    gone = len(scan) - len(earlier) - (len(left) - len(now))
+    if label is None:
+        there = {point.tobytes() for point in now}
+        gone += sum(point.tobytes() not in there for point in earlier)
+    else:
+        words = [CLASS_NUMBER[word] for word in how.removed]
+        gone += int(np.isin(label[were_new(scan) > 0], words).sum())
+    who = f"{model} names" if label is None else "its labels name"
     return f"took away {gone} of {len(scan)} points, {in_words(how.removed)} as {who} them"
 
 
