@@ -22,6 +22,7 @@ from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.streets.wanted import wanted
 from lidarsynth.systems.cascade.canvas import levelled
 from lidarsynth.systems.scan_model import ScanModel
@@ -151,6 +152,39 @@ def test_boxes_are_those_of_the_file_that_they_lie_beside(place: Path, ending: s
     own = own_of(found)
     assert count == len(found) and len(own) == box.points and box.holds(own.xyz).all()
     assert (box.centre[0] > 5) == (ending == "npz"), "an image is in its sensor's frame"
+
+
+def test_beside_points_that_stand_level_boxes_of_a_tilted_sensor_do_so(place: Path, capsys: pytest.CaptureFixture[str]):
+    tilted = replace(FLAT, tilt=(18.0, -20.0))
+    level = sensor_pose(tilted, np.zeros(6))
+    scan, words = road_scan(tilted), ["--add", "bus@10/3/-33", "--sensor", "tilted.json", "--no-picture"]
+    Path("tilted.json").write_text(json.dumps(tilted.to_dict()))
+    np.savetxt("level.txt", level.T)
+    write("level.ply", replace(scan, xyz=(scan.xyz @ level[:3, :3].T).astype(np.float32)))
+    write("scan.ply", scan)
+    for name, told in ("scan", "flat is tilted by 27 degrees"), ("level", ""):
+        more = ["--transform", "level.txt"] if name == "level" else []
+        main(["insert", f"{name}.ply", "--out", f"{name}.pcd", *words, *more])
+        assert told in (said := capsys.readouterr().out) and ("lack points" in said) == (name == "scan")
+        own, (box,) = own_of(read(f"{name}.pcd")), boxes_of(f"{name}.json")[1]
+        assert box.holds(own.xyz).all() == (name == "level") and box.points > 500
+
+
+def test_beside_points_that_lie_on_their_side_no_boxes_stand(place: Path, capsys: pytest.CaptureFixture[str]):
+    scan = flat_scan()
+    write("camera.ply", replace(scan, xyz=np.stack([-scan.xyz[:, 1], -scan.xyz[:, 2], scan.xyz[:, 0]], 1)))
+    words = ["--add", "car@10/3/20", "--axes", "rdf", *WORDS]
+    with pytest.raises(SystemExit) as stopped:
+        main(["insert", "camera.ply", "--out", "b.ply", *words])
+    assert stopped.value.code == 2 and "expected points whose z is up or down" in capsys.readouterr().err
+    assert not Path("b.ply").exists() and not Path("b.json").exists()
+    main(["insert", "camera.ply", "--out", "b.npz", *words])
+    (box,) = boxes_of("b.json")[1]
+    assert box.holds(own_of(read("b.npz")).xyz).all() and box.centre[0] == pytest.approx(10, abs=0.5)
+    write("leans.ply", replace(scan, xyz=(scan.xyz @ sensor_pose(TILTED, np.zeros(6))[:3, :3]).astype(np.float32)))
+    np.savetxt("up.txt", sensor_pose(TILTED, np.zeros(6)))
+    main(["insert", "leans.ply", "--add", "car@10/3/20", "--transform", "up.txt", "--out", "c.ply", *WORDS])
+    assert "z of the points is 11 degrees off, and boxes, upright in their frame, lack" in capsys.readouterr().out
 
 
 def test_boxes_of_the_scan_itself_are_not_replaced(place: Path, capsys: pytest.CaptureFixture[str]):

@@ -34,7 +34,15 @@ from lidarsynth.systems.notes import IN_PYTHON, beyond_image, bound
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, taken_away, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
-from lidarsynth.verbs.insertion import BOXES, check_boxes, check_numbers, insert_scan, told_of, write_boxes
+from lidarsynth.verbs.insertion import (
+    BOXES,
+    check_boxes,
+    check_numbers,
+    check_upright,
+    insert_scan,
+    told_of,
+    write_boxes,
+)
 from lidarsynth.verbs.labelling import found, label_scan, labelled_fields
 from lidarsynth.verbs.realisation import realise_scan, realised_fields
 from lidarsynth.verbs.viewpoint import viewpoint_note
@@ -319,8 +327,11 @@ def _made(
         return filled, f"{done}; {note}" if note else done
     if job.things is not None:
         sensor, things = named_sensor(scan, path, "--sensor", job.sensor, model.sensor), wanted(job.things)
+        check_upright(work.target, sensor, job.transform)
         filled = insert_scan(model, scan, things, sensor, job.how.seed + work.number)
-        return filled, told_of(filled, scan, things) + _columns(sensor, job, "; ")
+        in_image = work.target is not None and work.target.suffix.lower() == ".npz"
+        said = told_of(filled, scan, things, None if in_image else job.transform)
+        return filled, said + _columns(sensor, job, "; ")
     if job.verb == "label":
         sensor = named_sensor(scan, path, "--sensor", job.sensor, model.sensor)
         sensor = usual_at_most(sensor) if job.sensor is None else sensor
