@@ -25,6 +25,7 @@ from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.turn import sensor_pose
 from lidarsynth.streets.wanted import wanted
 from lidarsynth.systems.cascade.canvas import levelled
+from lidarsynth.systems.free_places import Surroundings
 from lidarsynth.systems.scan_model import ScanModel
 
 TILTED = replace(FLAT, tilt=(10.0, 5.0))
@@ -122,6 +123,17 @@ def test_images_are_taken_as_their_points(model: ScanModel):
     )
     np.testing.assert_array_equal(one.scan.xyz, two.scan.xyz)
     assert one.boxes == two.boxes
+
+
+def test_a_ring_alone_does_not_tell_how_the_ground_rises():
+    rng, few = np.random.default_rng(0), Sensor("few", tuple(np.linspace(15, -15, 16)), 900, max_range=100.0, mount=1.8)
+    scan = flat_scan(few)
+    points = scan.xyz + rng.normal(0, 0.02, scan.xyz.shape).astype(np.float32)
+    ground = Surroundings(points, scan.label, None)
+    spots = [ground.spot(away * np.cos(way), away * np.sin(way), 0.0)
+             for away in (9, 11, 14, 20) for way in np.linspace(0, 6, 40)]  # fmt: skip
+    slopes = np.array([spot.slope for spot in spots if spot is not None])
+    assert len(slopes) > 100 and np.hypot(*slopes.T).max() < 0.02
 
 
 def test_nothing_that_is_put_hides_what_was_put_before(model: ScanModel):

@@ -39,6 +39,7 @@ NEAR = 3.0  # metres between the sensor and whatever is put: its carrier's own
 CELL, TRIES = 0.5, 300  # metres: places are drawn evenly from such cells of ground that was seen; so many are looked at
 SIDE = 1 << 16  # cells to each side, from the first to the last
 WIDE, FEW = (4.0, 8.0), 12  # metres around a place whose ground tells its plane, the nearer if it has so many returns
+SPREAD = 1.0  # and these spread as far in every direction, metres: those of a single ring hardly tell how it rises
 STEEP = 0.3  # of a plane: what is steeper is no ground
 LOW, OVER = 0.3, 0.2  # metres above the ground, and above a thing, between which nothing may return
 GAP, SEEN, MOST = 0.3, 0.8, 0.2  # metres around a thing that are free; that must show ground; of it, of another kind
@@ -82,7 +83,7 @@ class Surroundings:
         away, flat = dx * dx + dy * dy, np.isin(self.label, _numbers(GROUND))
         for wide in WIDE:
             at = flat & (away < wide * wide)
-            if at.sum() >= FEW:
+            if at.sum() >= FEW and (wide == WIDE[-1] or _spread(dx[at], dy[at]) >= SPREAD):
                 z, ahead, aside = _plane(dx[at], dy[at], self.points[at, 2])
                 return Spot(x, y, z, yaw, (ahead, aside)) if np.hypot(ahead, aside) < STEEP else None
         return None
@@ -159,6 +160,11 @@ def _cells(places: np.ndarray) -> np.ndarray:
 
 def _numbers(words: tuple[str, ...]) -> list[int]:
     return [CLASS_NUMBER[word] for word in words]
+
+
+def _spread(x: np.ndarray, y: np.ndarray) -> float:
+    """Metres, the standard deviation of the points (n,) in the direction in which it is least."""
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(x, y))[0].clip(0)))
 
 
 def _plane(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
