@@ -94,6 +94,10 @@ def test_poses_are_those_of_the_drive(tmp_path: Path, frames: list[Frame]):
     whole[:, :3] = poses
     truth = np.linalg.inv(frames[0].to_world) @ np.stack([frame.to_world for frame in frames])
     np.testing.assert_allclose(np.linalg.inv(tr) @ whole @ tr, truth, atol=2e-5)
+    told = [json.loads(path.read_text())["pose"] for path in (sequence / "boxes").glob("*.json")]
+    turns = np.concatenate([poses[:, :, :3], np.array(told)[:, :3, :3]])
+    off = turns.transpose(0, 2, 1) @ turns - np.eye(3)
+    assert len(off) == 14 and np.abs(off).max() < 1e-7, "pytransform3d, and others, take 1e-6 for a rotation"
 
 
 def test_places_are_split_by_world(tmp_path: Path):

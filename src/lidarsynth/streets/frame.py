@@ -107,7 +107,7 @@ class Frame:
             "frame": self.number,
             "stamp": round(self.stamp, 6),
             "points": len(self.scan),
-            "pose": [[round(v, 6) for v in row] for row in self.to_world.tolist()],
+            "pose": [[round(v, 9) for v in row] for row in self.to_world.tolist()],  # rotations that readers check
             "boxes": [box.record() for box in self.boxes],
         }
 
