@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.distributions import Array, as_tensor, check_least
+from lidarsynth.metrics.distributions import Array, as_numpy, as_tensor, check_least
 
 
 def distance_matrix(a: Sequence | np.ndarray, b: Sequence | np.ndarray, distance: Callable[..., float]) -> np.ndarray:
@@ -62,7 +62,7 @@ def nearest_neighbour_accuracy(generated: Array, between: Array, real: Array) ->
 
 
 def _matrix(distances: Array) -> np.ndarray:
-    matrix = distances.cpu().numpy() if isinstance(distances, Tensor) else distances
+    matrix = as_numpy(distances)
     if matrix.ndim != 2 or not matrix.size or np.isnan(matrix).any():
         raise ValueError(f"expected a matrix of distances without NaN, found {matrix.shape}")
     return matrix
