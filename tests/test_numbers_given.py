@@ -170,3 +170,13 @@ def test_parts_and_sides_that_are_none_are_refused(tmp_path: Path):
 def test_views_from_above_take_points_with_gradients():
     points = torch.tensor(POSITIVE[None], requires_grad=True)
     assert bev_histograms(points).equal(bev_histograms(POSITIVE[None]))
+
+
+@pytest.mark.parametrize("stack", [False, True])
+@pytest.mark.parametrize("channels", [5, 2])
+def test_samples_in_a_npy_are_told_which_files_are_judged(channels: int, stack: bool, tmp_path: Path):
+    made = tensors()[:, :channels]
+    np.save(tmp_path / "0.npy", made if stack else made[0])
+    judged = r"samples \(5, H, W\) and \(2, H, W\) are judged as .pth, which torch.save writes$"
+    with pytest.raises(ValueError, match=judged):
+        ls.evaluate(tmp_path, tensors(), sensor="vlp-16")
