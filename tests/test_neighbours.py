@@ -102,6 +102,17 @@ def test_fidelity_of_equal_sets_of_duplicates_is_not_one():
     assert fidelity(x, x, k=4).precision == 1
 
 
+@pytest.mark.parametrize("shift", [0.0, 3.0, 1000.0])
+@pytest.mark.parametrize("k", [1, 5])
+def test_each_score_of_equal_sets_is_one_wherever_they_lie(k: int, shift: float):
+    """A feature's k-th neighbour lies on the edge of its ball, also where its distance is computed once more."""
+    for seed in range(3):
+        x = np.random.default_rng(seed).normal(size=(300, 16)) + shift
+        assert fidelity(x, x, k=k) == fidelity(x, x, k=k, block=64) == Fidelity(1, 1, 1, 1)
+        doubled = np.repeat(x, k + 1, axis=0)
+        assert fidelity(doubled, doubled, k=k) == Fidelity(0, 0, 0, 0)
+
+
 def test_precision_falls_with_noise_and_recall_with_missing_modes():
     real = np.concatenate([normal(60, 1), normal(60, 2, shift=20)])
     noisy = fidelity(real + 5 * normal(120, 3), real)

@@ -307,7 +307,11 @@ def gather_part(
     """
     batch_size = _whole("batch_size", batch_size, 1)
     check_device(device)
-    record, out = get_protocol(protocol) if isinstance(protocol, str) else protocol, Path(out)
+    if side not in ("samples", "reference"):
+        raise ValueError(f"expected a side of samples, reference, found {side!r:.60}")
+    if not isinstance(part, str):
+        raise ValueError(f"expected a part such as '1/2', found {part!r:.60}")
+    record, out = protocol if isinstance(protocol, EvaluationProtocol) else get_protocol(protocol), Path(out)
     samples = _single(samples)
     if out.suffix != ENDING or record.pairs:
         raise ValueError(f"{out}: expected a name that ends in {ENDING} and a protocol of sets, "

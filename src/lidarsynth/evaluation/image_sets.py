@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from lidarsynth.data.cache_files import is_cache
@@ -29,6 +28,7 @@ from lidarsynth.lidar.projection import project_thinned, thin
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, no_metres
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import check_regular
+from lidarsynth.metrics.distributions import as_numbers
 from lidarsynth.networks.device import usual_torch
 from lidarsynth.networks.tensors import as_array, read_pickle, saved_shape
 
@@ -162,16 +162,12 @@ def _taken(given: object, name: str) -> Item:
     """One of `Numbered` as it is stored elsewhere. Raises ValueError that begins with its name."""
     if isinstance(given, RangeImage):
         return given
-    if isinstance(given, Tensor):
-        given = given.detach().cpu() if given.ndim == 3 else as_array(given)
-    elif isinstance(given, np.ndarray) and given.ndim == 3:
-        given = torch.from_numpy(np.ascontiguousarray(given))
-    if isinstance(given, Tensor):
-        return given
-    if not isinstance(given, np.ndarray | Scan):
+    if not isinstance(given, Tensor | np.ndarray | Scan):
         raise ValueError(f"{name}: expected {HELD}, or one folder for all, found {' '.join(repr(given).split()):.80}")
     try:
-        return as_scan(given)
+        if not isinstance(given, Scan) and given.ndim == 3:
+            return as_numbers(given).cpu()
+        return as_scan(as_array(given))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 

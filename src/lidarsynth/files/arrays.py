@@ -101,7 +101,9 @@ def fields_of(array: np.ndarray) -> Fields:
         looks = array.ndim > 1 and sorted(array.shape)[-2] >= LOWEST
         raise FileError(f"expected an (N, 3) to (N, 10) array of points, found {array.shape} of {array.dtype}"
                         + (", which looks like an image: its file is an npz of range, reflectance, mask and sensor"
-                           if looks else ""))  # fmt: skip
+                           if looks else "")
+                        + ("; published samples (5, H, W) and (2, H, W) are judged as .pth, which torch.save writes"
+                           if looks and array.ndim > 2 and array.shape[-3] in (2, 5) else ""))  # fmt: skip
     fields = dict(zip(COLUMNS, array.T, strict=False))
     ring = fields.get("ring")
     if ring is not None and not (

@@ -13,29 +13,56 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsynth.lidar.scan import ODD
+
 Array: TypeAlias = np.ndarray | Tensor
 Random: TypeAlias = np.random.Generator | np.random.RandomState
 
 
 def as_tensor(values: Array) -> Tensor:
-    """The values as a tensor on their own device, as float32 unless they are float64.
+    """The values as a tensor on their own device without gradients, as float32 unless they are float64.
 
-    Read-only arrays (memory maps) are copied. Raises ValueError for NaN or infinity.
+    Read-only arrays (memory maps) are copied. Raises ValueError for NaN or infinity, and as `check_numbers`.
     """
-    tensor = _tensor(values)
+    tensor = as_numbers(values)
     tensor = tensor if tensor.dtype == torch.float64 else tensor.float()
     if not torch.isfinite(tensor.sum(dtype=torch.float64)):  # a fifth of the time of looking at each
         raise ValueError(f"expected finite values, found NaN or infinity among {tuple(tensor.shape)}")
     return tensor
 
 
-def _tensor(values: Array) -> Tensor:
-    """The values where they are, but for types that torch cannot sum: unsigned of many bytes, other byte orders."""
+def check_numbers(values: object) -> None:
+    """Raises ValueError for what is no array or tensor of plain numbers: lists, masked, complex and sparse ones."""
     if isinstance(values, Tensor):
-        return values
+        odd = values.is_meta or values.is_quantized or values.is_nested or values.is_complex()
+        plain = values.layout == torch.strided and not odd
+        found = f"a tensor of {values.layout}, {values.dtype} on {values.device}"
+    elif isinstance(values, np.ndarray):
+        plain = values.dtype.kind in "fiub" and not isinstance(values, ODD)
+        found = f"a {type(values).__name__} of {values.dtype}"
+    else:
+        plain, found = False, f"a {type(values).__name__}"
+    if not plain:
+        raise ValueError(f"expected an array or tensor of plain numbers, found {found}")
+
+
+def as_numbers(values: Array) -> Tensor:
+    """The values where they are, without gradients, and of types that torch knows and can sum: not unsigned of many
+    bytes, longer than float64 or of another byte order. Raises ValueError as `check_numbers`."""
+    check_numbers(values)
+    if isinstance(values, Tensor):
+        return values.detach()
     if values.dtype.kind == "u" and values.dtype.itemsize > 1:
         values = values.astype(np.int32 if values.dtype.itemsize == 2 else np.int64)
+    if values.dtype.kind == "f" and values.dtype.itemsize > 8:
+        values = values.astype(np.float64)
     return torch.from_numpy(np.require(values, values.dtype.newbyteorder("="), requirements=["C", "W"]))
+
+
+def as_numpy(values: Array) -> np.ndarray:
+    """The values as `as_numbers` has them, as an array; bfloat16, which numpy has not, as float32."""
+    tensor = as_numbers(values).cpu()
+    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
 
 
 def check_least(name: str, number: float, least: float) -> None:
@@ -120,6 +147,7 @@ class Moments:
 
 def moments(features: Array) -> Moments:
     """Moments of one array (N, D), on its device. Raises ValueError for another shape, NaN or infinity."""
+    check_numbers(features)
     if features.ndim != 2:
         raise ValueError(f"features must be (N, D), got {tuple(features.shape)}")
     result = Moments(features.shape[1], features.device if isinstance(features, Tensor) else "cpu")
@@ -131,8 +159,12 @@ def frechet_distance(a: Moments, b: Moments) -> float:
     """|mu_a - mu_b|^2 + tr(S_a + S_b - 2 (S_a S_b)^(1/2)); symmetric, 0 for equal moments (Heusel et al. 2017).
 
     FRD, FPD and FID by the features. With no more samples than dimensions the covariances are singular; the value is
-    then exact for these samples, but larger than that of many. Raises ValueError for different dimensions.
+    then exact for these samples, but larger than that of many. Raises ValueError for different dimensions, and for
+    features, of which `moments` makes what is expected.
     """
+    for given in (a, b):
+        if not isinstance(given, Moments):
+            raise ValueError(f"expected Moments, found a {type(given).__name__}; moments(features) makes them")
     if len(a.mean) != len(b.mean):
         raise ValueError(f"expected moments of {len(a.mean)} dimensions, found {len(b.mean)}")
     first, second = a.covariance(), b.covariance().to(a.mean)
@@ -167,8 +199,12 @@ def kernel_distance(generated: Array, real: Array, rng: Random, subsets: int = 1
 
     The mean over `subsets` pairs of subsets of min(N, M, size) features without replacement; `rng` draws the generated
     ones first. Features may be memory maps: only the drawn ones are read. Raises ValueError for fewer than two, other
-    shapes, NaN or infinity, no subset.
+    shapes, NaN or infinity, no subset, a seed in place of `rng`.
     """
+    if not isinstance(rng, Random) and rng is not np.random:
+        raise ValueError(f"expected a generator such as numpy.random.default_rng(0), found a {type(rng).__name__}")
+    check_numbers(generated)
+    check_numbers(real)
     check_least("a number of subsets", subsets, 1)
     check_least("a size", size, 2)
     if generated.ndim != 2 or real.ndim != 2 or generated.shape[1] != real.shape[1]:
@@ -209,7 +245,10 @@ def gaussian_mmd(x: Array, y: Array, width: float = 0.5, block: int = 1024) -> f
 
 
 def _rows(values: Array) -> Tensor:
-    return _tensor(values).flatten(1)
+    numbers = as_numbers(values)
+    if numbers.ndim < 2:
+        raise ValueError(f"expected histograms (N, ...), found {tuple(numbers.shape)}")
+    return numbers.flatten(1)
 
 
 class _Blocks:
@@ -252,7 +291,7 @@ def jensen_shannon_distance(p: Array, q: Array) -> float:
     p, q are counts of one shape, pooled over all scans; each is divided by its sum. Square the value for the divergence
     (nats). Raises ValueError for other shapes, negative or infinite counts, or none.
     """
-    counts = [_rows(values[None]).double()[0].cpu() for values in (p, q)]
+    counts = [as_numbers(values).flatten().double().cpu() for values in (p, q)]
     if p.shape != q.shape or any(not 0 < c.sum() < math.inf or c.min() < 0 for c in counts):
         found = [(tuple(v.shape), float(c.sum())) for v, c in zip((p, q), counts, strict=True)]
         raise ValueError(f"expected counts of one shape, found shapes and sums {found}")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.distributions import Array, as_tensor, check_least
+from lidarsynth.metrics.distributions import Array, as_numpy, as_tensor, check_least
 
 
 def distance_matrix(a: Sequence | np.ndarray, b: Sequence | np.ndarray, distance: Callable[..., float]) -> np.ndarray:
@@ -62,7 +62,7 @@ def nearest_neighbour_accuracy(generated: Array, between: Array, real: Array) ->
 
 
 def _matrix(distances: Array) -> np.ndarray:
-    matrix = distances.cpu().numpy() if isinstance(distances, Tensor) else distances
+    matrix = as_numpy(distances)
     if matrix.ndim != 2 or not matrix.size or np.isnan(matrix).any():
         raise ValueError(f"expected a matrix of distances without NaN, found {matrix.shape}")
     return matrix
@@ -95,12 +95,14 @@ def fidelity(generated: Array, real: Array, k: int = 5, block: int = 1024) -> Fi
         raise ValueError(f"expected features (N, D) and (M, D) of more than k = {k}, "
                          f"found {tuple(fake.shape)} and {tuple(true.shape)}")  # fmt: skip
     true = true.to(fake.device)
+    middle = true.mean(0)  # far from 0 matrix products lose digits
+    fake, true = fake - middle, true - middle
     true_radius, fake_radius = _radii(true, k, block), _radii(fake, k, block)
     inside = precise = 0
     recalled = torch.zeros(len(true), dtype=torch.bool, device=fake.device)
     covered = recalled.clone()
     for rows, radius in zip(fake.split(block), fake_radius.split(block), strict=True):
-        distance = torch.cdist(rows, true)
+        distance = _distances(rows, true)
         hit = distance < true_radius
         inside += int(hit.sum())
         precise += int(hit.any(1).sum())
@@ -111,6 +113,14 @@ def fidelity(generated: Array, real: Array, k: int = 5, block: int = 1024) -> Fi
 
 
 def _radii(features: Tensor, k: int, block: int) -> Tensor:
-    """(N,) distance of each feature to its k-th neighbour among the others."""
+    """(N,) distance of each feature to its k-th neighbour among the others, less what one pair differs by when it is
+    computed twice: open balls leave that neighbour out."""
     # the nearest of k + 1 is the feature itself
-    return torch.cat([torch.cdist(rows, features).kthvalue(k + 1).values for rows in features.split(block)])
+    return torch.cat([_distances(rows, features).kthvalue(k + 1).values for rows in features.split(block)]) * (1 - 1e-9)
+
+
+def _distances(rows: Tensor, features: Tensor) -> Tensor:
+    """(B, N) distances; 0 where no more is left than a matrix product leaves of equal features."""
+    distance = torch.cdist(rows, features)
+    least = 1e-7 * (rows.norm(dim=1)[:, None] + features.norm(dim=1))
+    return torch.where(distance < least, 0.0, distance)

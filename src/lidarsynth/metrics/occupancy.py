@@ -5,13 +5,14 @@ A cell counts once per scan, however many points lie in it. The ground is -exten
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.metrics.distributions import Array, as_tensor
+from lidarsynth.metrics.distributions import Array, as_tensor, check_above_0
 
 EXTENT = 50.0  # metres
 
@@ -19,8 +20,9 @@ EXTENT = 50.0  # metres
 def occupied_cells(points: Array, cell: float = 0.05, extent: float = EXTENT) -> np.ndarray:
     """(n,) int32, rising: numbers x * size + y of the cells of points (N, 3) in metres, size = 2 extent / cell a side.
 
-    Cell = floor(p / cell) in float32, as published. Raises ValueError for another shape, NaN.
+    Cell = floor(p / cell) in float32, as published. Raises ValueError for another shape, NaN, a cell of 0.
     """
+    check_above_0("a cell", cell)
     xy = as_tensor(points).cpu().numpy().astype(np.float32)
     if xy.ndim != 2 or xy.shape[1] != 3:
         raise ValueError(f"points must be (N, 3), got {xy.shape}")
@@ -31,8 +33,8 @@ def occupied_cells(points: Array, cell: float = 0.05, extent: float = EXTENT) ->
 
 
 def cells_along(cell: float, extent: float = EXTENT) -> int:
-    """Cells along one side of the square."""
-    return 2 * round(extent / cell)
+    """Cells along one side of the square, those that its edge cuts too."""
+    return 2 * math.ceil(round(extent / cell, 9))
 
 
 class Occupancy:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from torch import Tensor
 
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.metrics.distributions import Array, check_above_0, check_least
+from lidarsynth.metrics.distributions import Array, as_numpy, check_above_0, check_least
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ def nearest_distances(points: Array, others: Array) -> np.ndarray:
 
 
 def _points(values: Array) -> np.ndarray:
-    points = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, np.float64)
+    points = as_numpy(np.asarray(values) if isinstance(values, list | tuple) else values).astype(np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
         raise ValueError(f"expected finite points (N, 3), at least one, found {points.shape}")
     return points
@@ -137,7 +136,7 @@ def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.nd
 
     Labels of one shape, whole numbers 0 to classes - 1. Raises ValueError for other shapes or labels.
     """
-    rows, columns = (v.cpu().numpy() if isinstance(v, Tensor) else np.asarray(v) for v in (truth, predicted))
+    rows, columns = (as_numpy(np.asarray(v) if isinstance(v, list | tuple) else v) for v in (truth, predicted))
     both = np.concatenate([rows.ravel(), columns.ravel()])
     if rows.shape != columns.shape or not rows.size:
         raise ValueError(f"expected two images of one shape, found {rows.shape} and {columns.shape}")
@@ -150,12 +149,21 @@ def confusion_matrix(truth: Array, predicted: Array, classes: int = 20) -> np.nd
     return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
 
 
+def _square(confusion: np.ndarray) -> np.ndarray:
+    """The table (C, C). Raises ValueError for another shape, such as labels, or what is no array of numbers."""
+    counts = as_numpy(confusion)
+    if counts.ndim != 2 or counts.shape[0] != counts.shape[1] or not counts.size:
+        raise ValueError(f"expected a confusion matrix (C, C), found {counts.shape}; confusion_matrix makes it")
+    return counts
+
+
 def class_iou(confusion: np.ndarray, without: tuple[int, ...] = ()) -> np.ndarray:
     """(C,) float64 intersection over union of each class, 0 for classes that do not occur.
 
     without  classes whose pixels do not count, in the truth or as predicted, as in the RangeNet repository's (0,)
+    Raises ValueError for what is no confusion matrix.
     """
-    counts = confusion.astype(np.float64)
+    counts = _square(confusion).astype(np.float64)
     counts[list(without)] = 0
     counts[:, list(without)] = 0
     hit = counts.diagonal()
@@ -172,12 +180,12 @@ def weighted_iou(confusion: np.ndarray) -> float:
 
     Raises ValueError for a confusion of no pixels.
     """
-    if not confusion.any():
+    if not _square(confusion).any():
         raise ValueError("expected a confusion of at least one pixel, found none")
     return float(np.average(class_iou(confusion), weights=confusion.sum(1)))
 
 
 def accuracy(confusion: np.ndarray, without: tuple[int, ...] = (0,)) -> float:
     """Share of the pixels predicted right, pixels of the classes `without` left out on both sides."""
-    left = np.delete(np.delete(confusion, list(without), 0), list(without), 1)
+    left = np.delete(np.delete(_square(confusion), list(without), 0), list(without), 1)
     return float(left.trace() / max(left.sum(), 1))

@@ -8,7 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from lidarsynth.lidar.beams import same_beams
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.metrics.distributions import as_numpy, check_above_0
 
 
 class BeamCounts:
@@ -22,18 +23,18 @@ class BeamCounts:
     """
 
     def __init__(self, sensor: Sensor, step: float = 0.5):
-        if step <= 0:
-            raise ValueError(f"expected a step above 0 m, found {step}")
-        self.sensor, self.step = sensor, step
-        self.pixels = np.zeros(sensor.height, np.int64)
-        self.histogram = np.zeros((sensor.height, int(np.ceil(sensor.max_range / step))), np.int64)
+        check_above_0("a step", step)
+        self.sensor, self.step = get_sensor(sensor), step
+        self.pixels = np.zeros(self.sensor.height, np.int64)
+        self.histogram = np.zeros((self.sensor.height, int(np.ceil(self.sensor.max_range / step))), np.int64)
 
     def update(self, distance: np.ndarray | Tensor, mask: np.ndarray | Tensor) -> None:
         """Take in images (B, H, W) or (H, W): range in metres and mask, True where measured, of any width.
 
-        Raises ValueError for another shape, or ranges that are NaN, infinite or negative where measured.
+        Raises ValueError for another shape, what is no array or tensor of numbers, or ranges that are NaN, infinite or
+        negative where measured.
         """
-        ranges, measured = (v.cpu().numpy() if isinstance(v, Tensor) else v for v in (distance, mask))
+        ranges, measured = (as_numpy(v) for v in (distance, mask))
         height, bins = self.histogram.shape
         if ranges.shape != measured.shape or ranges.ndim not in (2, 3) or ranges.shape[-2] != height:
             raise ValueError(f"expected range and mask (B, {height}, W), found {ranges.shape} and {measured.shape}")
