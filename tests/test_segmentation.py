@@ -36,6 +36,7 @@ from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.options import Options
 from lidarsynth.training.randomness import sample_rng
+from lidarsynth.verbs.training import run
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 CLASSES_THERE = (1, 9, 13, 15)
@@ -264,6 +265,21 @@ def test_the_command_line_trains_and_describes_it(cache: Path, tmp_path: Path, c
     main(["info", str(tmp_path)])
     text = capsys.readouterr().out
     assert "RangeNet-21" in text and "98,220" in text and "schedule" not in text
+
+
+def test_what_cannot_be_learned_from_or_judged_is_refused_before_anything_is_written(cache: Path, tmp_path: Path):
+    """A cache without labels, as of scans that nobody has labelled, and cuts wider than the images."""
+    bare = tmp_path / "bare"
+    list(write_cache(bare, lambda i: replace(scene(i), label=None), 4, SENSOR, {"name": "bare"}))
+    for data, validation, columns, said in (
+        (bare, None, 32, "^expected images with labels, .*, found one without$"),
+        (cache, bare, 32, f"^{bare}: expected images with labels, .*, found one without$"),
+        (cache, None, 96, "^segmentation.columns: expected a multiple of 32 up to 64, found 96$"),
+    ):
+        experiment = small(2, **{"segmentation.columns": columns})
+        with pytest.raises(ValueError, match=said):
+            list(run(experiment, data, tmp_path / "run", validation=validation, options=Options(workers=0)))
+        assert not (tmp_path / "run").exists()
 
 
 def test_an_adapted_network_has_the_statistics_of_the_images():

@@ -159,6 +159,7 @@ def _run(
     task = task_of(experiment)
     task.share(experiment, share_of(experiment, accelerator.num_processes * accelerator.gradient_accumulation_steps))
     task = replace(task, pictures=completions) if experiment.base else task  # which a base generates
+    task.suits(experiment, images, True)
     monitor = Monitor(experiment, task, data, validation)  # first, as it refuses images before anything is written
     experiment, state, note = _begin(experiment, images, data, out, begun, resume, accelerator)
     if accelerator.is_main_process:
