@@ -267,6 +267,19 @@ def test_the_command_line_trains_and_describes_it(cache: Path, tmp_path: Path, c
     assert "RangeNet-21" in text and "98,220" in text and "schedule" not in text
 
 
+def test_a_turn_of_any_number_of_columns_is_judged():
+    """As a Pandar64's of 1,800: cuts of 32 columns are learned from, and the whole is seen on into the next turn."""
+    image, net = scene(0), network(small(), 3).eval()
+    order = np.arange(80) % 64
+    parts = (part[:, order] for part in (image.range, image.reflectance, image.mask))
+    wide = RangeImage(*parts, SENSORS["hdl-64e-kitti"].resized(16, 80), image.label[:, order])
+    assert classify(net, wide).label.shape == (16, 80)
+    assert 0 <= judge(small(), net, [wide])["accuracy"] <= 1
+    values = torch.from_numpy(pixels(image))[None]
+    expected = net(net.network_input(values, values[:, :1] > 0))[0, 1:].argmax(0).numpy() + 1
+    np.testing.assert_array_equal(classify(net, image).label, np.where(image.mask, expected, 0))
+
+
 def test_what_cannot_be_learned_from_or_judged_is_refused_before_anything_is_written(cache: Path, tmp_path: Path):
     """A cache without labels, as of scans that nobody has labelled, and cuts wider than the images."""
     bare = tmp_path / "bare"

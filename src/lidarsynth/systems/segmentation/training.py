@@ -146,10 +146,15 @@ def class_weights(shares: np.ndarray) -> Tensor:
 
 @torch.no_grad()
 def classify(network: RangeNet, image: RangeImage) -> RangeImage:
-    """The image with the network's classes 1-19 as its label, 0 where not measured; 0 itself is never learned."""
-    values = torch.from_numpy(pixels(image))[None].to(network.means)
+    """The image with the network's classes 1-19 as its label, 0 where not measured; 0 itself is never learned.
+
+    A turn of other than a multiple of 32 columns is seen on into its next one.
+    """
+    width = image.shape[1]
+    columns = np.arange(width + -width % 32) % width
+    values = torch.from_numpy(pixels(image)[:, :, columns])[None].to(network.means)
     logits = network(network.network_input(values, values[:, :1] > 0))
-    label = logits[0, 1:].argmax(0).cpu().numpy() + 1
+    label = logits[0, 1:, :, :width].argmax(0).cpu().numpy() + 1
     return replace(image, label=np.where(image.mask, label, UNLABELED))
 
 
