@@ -133,7 +133,8 @@ class SeveralCaches:
                 raise ValueError(
                     f"{folder}: expected the sensor and the projection of {folders[0]}, {first.sensor.name} of "
                     f"{first.sensor.height} x {first.sensor.width} and {projection or ANY}, found "
-                    f"{part.sensor.name} of {part.sensor.height} x {part.sensor.width} and {part.source.get('projection') or ANY}"
+                    f"{part.sensor.name} of {part.sensor.height} x {part.sensor.width} and "
+                    f"{part.source.get('projection') or ANY}"
                 )
         self.sensor = first.sensor
         places = [Path(folder).resolve() for folder in folders]
