@@ -296,6 +296,9 @@ def test_classes_are_not_learned_from_scans_that_nobody_has_labelled(tmp_path):
     for words in ("bare", "zero"):
         with pytest.raises(ValueError, match=r"expected images with labels, as model\.own_classes .*, found none; "):
             draw(tuned, CachedImages(tmp_path / words), [0], 0, [0])
+        with pytest.raises(ValueError, match=r"expected images with labels, as model\.own_classes"):
+            list(run(tuned, tmp_path / words, tmp_path / "run", options=Options(workers=0)))
+        assert not (tmp_path / "run").exists()
     draw(tuned, SeveralCaches([tmp_path / "bare", tmp_path / "named"]), [0], 0, [0])
 
 
@@ -340,6 +343,23 @@ def test_a_share_of_a_batch_without_crops_of_the_most_likely_image_is_learned_fr
         quiet = Options(workers=0, sample_every=0, accumulate=accumulate)
         *_, last = run(few, tmp_path / "cache", tmp_path / f"{size}", options=quiet)
         assert last.step == 2 and np.isfinite(last.losses["loss"]) and np.isfinite(last.grad_norm)
+
+
+def test_the_most_likely_image_learns_from_all_crops_alike_however_a_batch_is_shared(tmp_path):
+    """Of three samples one is drawn: one pass of three has no crop to complete, the others one each."""
+    sensor = SENSORS["vlp-16"].resized(width=128)
+    list(write_cache(tmp_path / "cache", SyntheticStreets(3, 3, sensor).image, 3, sensor, {"name": "synthetic"}))
+    few = with_fields(TINY, {"training.batch_size": 3, "training.steps": 1, "training.clip_norm": None,
+                             "data.sensor": "vlp-16", "data.height": 16, "data.width": 128,
+                             "data.projection": "auto"})  # fmt: skip
+    moments = []
+    for passes in (1, 3):
+        quiet = Options(workers=0, sample_every=0, accumulate=passes)
+        list(run(few, tmp_path / "cache", tmp_path / f"{passes}", options=quiet))
+        state = torch.load(tmp_path / f"{passes}" / "checkpoints" / "step-00000001" / "state.pt", weights_only=True)
+        moments.append([m["exp_avg"] for m in state["optimizers"]["likeliest"]["state"].values()])
+    for one, three in zip(*moments, strict=True):
+        assert_close(three, one, rtol=1e-3, atol=1e-6)
 
 
 def test_no_crops_have_gradients_of_nothing():

@@ -130,6 +130,10 @@ def test_several_caches_are_one_of_which_each_is_seen_equally_often(tmp_path: Pa
     list(write_cache(tmp_path / "streets", image, 2, SENSOR, {"name": "synthetic", "seed": 1}))
     for order in ([folders[0], tmp_path / "streets"], [tmp_path / "streets", folders[0]]):
         assert SeveralCaches(order).source["projection"] == "auto" and len(SeveralCaches(order)) == 10
+    far = replace(SENSOR, max_range=70.0)
+    list(write_cache(tmp_path / "far", lambda i: replace(image(i), sensor=far), 1, far, {"name": "synthetic"}))
+    with pytest.raises(ValueError, match=r"8 x 32 and any projection, found eight of 8 x 32 and any projection$"):
+        SeveralCaches([tmp_path / "streets", tmp_path / "far"])
     for other, source in ((replace(SENSOR, max_range=70.0), "auto"), (SENSOR, "unfolding")):
         write = write_cache(tmp_path / "o", lambda i, s=other: replace(image(i), sensor=s), 1, other,
                             {"name": "o", "projection": source})  # fmt: skip

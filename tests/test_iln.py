@@ -1,6 +1,7 @@
 """ILN and LIIF: parity at the published width, and what an interpolation by weights guarantees."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from oracle import assert_close, largest
 from procedural_weights import upsampling_weights
 from torch import Tensor
 
-from lidarsynth.networks.iln import ILN, LIIF, SHIFTS, angle_queries, from_official, neighbours, pixel_centres
+from lidarsynth.networks.iln import ILN, LIIF, SHIFTS, RingConv, angle_queries, from_official, neighbours, pixel_centres
 
 DEPTHS = {"iln_0d_full": 0, "iln_1d_full": 1}
 FIXTURES = [*DEPTHS, "iln_liif_full"]
@@ -194,6 +195,22 @@ def test_official_checkpoints_load(fixture_tensors, network_of):
         checkpoint = {"epoch": 400, "model": {"name": model, "args": {}, "state_dict": network.state_dict()}}
         asked = expected["input"], expected["random.queries"]
         assert torch.equal(from_official(checkpoint, model)(*asked), network(*asked))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of modules that torch.compile brings
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
+def test_convolutions_can_be_compiled_for_training():
+    """Torch 2.13 expects another layout of the gradient of its own padding that repeats rows."""
+    torch.manual_seed(0)
+    block, x = torch.nn.Sequential(RingConv(1, 8), RingConv(8, 8)), torch.randn(2, 1, 4, 64)
+    block(x).square().sum().backward()
+    expected = [parameter.grad for parameter in block.parameters()]
+    block.zero_grad()
+    torch.compile(block)(x).square().sum().backward()
+    for parameter, gradient in zip(block.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-3)
 
 
 def test_errors_say_both_sides():

@@ -36,6 +36,7 @@ from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training.loop import start, train
 from lidarsynth.training.options import Options
 from lidarsynth.training.randomness import sample_rng
+from lidarsynth.verbs.training import run
 
 SENSOR = SENSORS["hdl-64e-kitti"].resized(16, 64)
 CLASSES_THERE = (1, 9, 13, 15)
@@ -264,6 +265,34 @@ def test_the_command_line_trains_and_describes_it(cache: Path, tmp_path: Path, c
     main(["info", str(tmp_path)])
     text = capsys.readouterr().out
     assert "RangeNet-21" in text and "98,220" in text and "schedule" not in text
+
+
+def test_a_turn_of_any_number_of_columns_is_judged():
+    """As a Pandar64's of 1,800: cuts of 32 columns are learned from, and the whole is seen on into the next turn."""
+    image, net = scene(0), network(small(), 3).eval()
+    order = np.arange(80) % 64
+    parts = (part[:, order] for part in (image.range, image.reflectance, image.mask))
+    wide = RangeImage(*parts, SENSORS["hdl-64e-kitti"].resized(16, 80), image.label[:, order])
+    assert classify(net, wide).label.shape == (16, 80)
+    assert 0 <= judge(small(), net, [wide])["accuracy"] <= 1
+    values = torch.from_numpy(pixels(image))[None]
+    expected = net(net.network_input(values, values[:, :1] > 0))[0, 1:].argmax(0).numpy() + 1
+    np.testing.assert_array_equal(classify(net, image).label, np.where(image.mask, expected, 0))
+
+
+def test_what_cannot_be_learned_from_or_judged_is_refused_before_anything_is_written(cache: Path, tmp_path: Path):
+    """A cache without labels, as of scans that nobody has labelled, and cuts wider than the images."""
+    bare = tmp_path / "bare"
+    list(write_cache(bare, lambda i: replace(scene(i), label=None), 4, SENSOR, {"name": "bare"}))
+    for data, validation, columns, said in (
+        (bare, None, 32, "^expected images with labels, .*, found one without$"),
+        (cache, bare, 32, f"^{bare}: expected images with labels, .*, found one without$"),
+        (cache, None, 96, "^segmentation.columns: expected a multiple of 32 up to 64, found 96$"),
+    ):
+        experiment = small(2, **{"segmentation.columns": columns})
+        with pytest.raises(ValueError, match=said):
+            list(run(experiment, data, tmp_path / "run", validation=validation, options=Options(workers=0)))
+        assert not (tmp_path / "run").exists()
 
 
 def test_an_adapted_network_has_the_statistics_of_the_images():

@@ -554,6 +554,13 @@ def test_batches_that_cannot_be_shared_are_refused_before_anything_is_written(
     assert not (tmp_path / "new").exists() or not list((tmp_path / "new").iterdir())
 
 
+def test_nothing_of_a_cascade_is_compiled_and_that_is_said(cache: Path, tmp_path: Path):
+    with pytest.raises(ValueError, match=r"^expected no --compile for a cascade, .* found it$"):
+        list(run(with_fields(preset("tuned"), {"training.steps": 1}), cache, tmp_path / "new",
+                 options=replace(QUIET, compile=True)))  # fmt: skip
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_run_that_was_stopped_before_it_had_looked_looks_where_it_goes_on(cache: Path, tmp_path: Path):
     options = Options(sample_every=2, save_every=1, workers=0)
     list(run(tiny(3), cache, tmp_path / "whole", options=options, validation=cache))

@@ -269,6 +269,8 @@ def test_another_sensor_is_for_models_of_any_sensor():
         model_of("lidar-sr").into("pandar64")
     with pytest.raises(ValueError, match=r"tiny: expected a model of any sensor, .* for os1-64, found one of hdl"):
         assemble(preset("tiny"), build_network(preset("tiny"))).into("os1-64")
+    with pytest.raises(ValueError, match=r"for hdl-64e-kitti, found one of hdl-64e-kitti/16 with 16 x 64 only$"):
+        assemble(preset("tiny"), build_network(preset("tiny"))).into("hdl-64e-kitti")
 
 
 def test_completion_of_a_scan_is_judged_against_interpolation(model, image):

@@ -258,6 +258,24 @@ def test_a_run_in_a_folder_learns_from_a_cache_and_starts_another(tmp_path):
         transfer(build_network(ours), ours, build_network(theirs), theirs, "iln")
 
 
+@pytest.mark.parametrize(
+    ("word", "factor", "said"),
+    [
+        ("iln-tiny", (16, 1), "two known beams at least, and others between them, found 1 known of 16"),
+        ("lidar-sr-tiny", (16, 1), "two known beams at least, and others between them, found 1 known of 16"),
+        ("iln-tiny", (1, 2), "two known beams at least, and others between them, found 16 known of 16"),
+        ("iln-tiny", (4, 3), "a divisor of 64 columns, found 3"),
+    ],
+)
+def test_what_leaves_nothing_to_put_between_is_refused_before_anything_is_written(tmp_path, word, factor, said):
+    """With columns that do not divide the turn, the last gap was narrower, and queries were off by part of a column."""
+    list(write_cache(tmp_path / "cache", scan, 2, SENSOR, {"name": "walls"}))
+    experiment = with_fields(preset(word), {"upsampling.factor": factor, "training.steps": 1})
+    with pytest.raises(ValueError, match=f"^upsampling.factor: expected {said}$"):
+        list(run_in(experiment, tmp_path / "cache", tmp_path / "run", options=Options(workers=0, sample_every=0)))
+    assert not (tmp_path / "run").exists()
+
+
 def test_one_known_beam_is_too_few_to_learn_what_lies_between():
     with pytest.raises(ValueError, match="expected two known beams at least to put others between, found 1"):
         places([3.0], [3.0])

@@ -26,6 +26,8 @@ from lidarsynth.lidar import sensor as sensors
 from lidarsynth.lidar.depth import encode
 from lidarsynth.lidar.scan import RangeImage
 
+ANY = "any projection"  # of streets, which need none
+
 __all__ = [
     "INDEX", "REPORT", "SHARD", "CachedImages", "SeveralCaches", "pack", "read_index", "record_type",
     "verify", "write_cache",
@@ -130,8 +132,9 @@ class SeveralCaches:
             if part.sensor != first.sensor or part.source.get("projection") not in (projection, None):
                 raise ValueError(
                     f"{folder}: expected the sensor and the projection of {folders[0]}, {first.sensor.name} of "
-                    f"{first.sensor.height} x {first.sensor.width} and {projection}, found {part.sensor.name} of "
-                    f"{part.sensor.height} x {part.sensor.width} and {part.source.get('projection')}"
+                    f"{first.sensor.height} x {first.sensor.width} and {projection or ANY}, found "
+                    f"{part.sensor.name} of {part.sensor.height} x {part.sensor.width} and "
+                    f"{part.source.get('projection') or ANY}"
                 )
         self.sensor = first.sensor
         places = [Path(folder).resolve() for folder in folders]

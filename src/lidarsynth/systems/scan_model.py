@@ -330,9 +330,9 @@ class ScanModel(ABC):
 
     def into(self, sensor: Sensor | str) -> ScanModel:
         """The same model with images of another sensor. Raises ValueError for one that knows its own rays only."""
-        name = get_sensor(sensor).name
+        name, own = get_sensor(sensor).name, self.sensor
         raise ValueError(f"{self.experiment.name}: expected a model of any sensor, such as default, for {name}, "
-                         f"found one of {self.sensor.name} only")  # fmt: skip
+                         f"found one of {own.name} with {own.height} x {own.width} only")  # fmt: skip
 
     def suited_to(self, scan: Scan, sensor: Sensor | str | None = None) -> ScanModel:
         """The model that completes this scan in its own sensor's image; here itself, which knows one sensor.

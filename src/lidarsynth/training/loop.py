@@ -169,6 +169,7 @@ class _PreparedPhase(NamedTuple):
     objective: nn.Module
     optimizer: torch.optim.Optimizer
     every: int
+    count: Callable[[Any], int] | None
 
 
 def _prepare(
@@ -177,7 +178,7 @@ def _prepare(
     prepared = accelerator.prepare(*(phase.objective for phase in phases), *optimizers.values())
     wrapped = dict(zip(optimizers, prepared[len(phases) :], strict=True))
     return [
-        _PreparedPhase(objective, wrapped[phase.optimizer], phase.every)
+        _PreparedPhase(objective, wrapped[phase.optimizer], phase.every, phase.count)
         for phase, objective in zip(phases, prepared[: len(phases)], strict=True)
     ]
 
@@ -222,10 +223,10 @@ def _gradients(
     for group in phase.optimizer.param_groups:
         group["lr"] = rate * group.get("factor", 1.0)
     phase.optimizer.zero_grad()
-    for batch in passes:
+    for batch, weight in zip(passes, _weights(accelerator, phase, passes), strict=True):
         with accelerator.accumulate(phase.objective):
             losses = phase.objective(batch)
-            accelerator.backward(torch.cat([*losses.values()]).mean())
+            accelerator.backward(weight * torch.cat([*losses.values()]).mean())
         for name, values in losses.items():
             part = torch.stack([values.detach().sum(), values.new_tensor(float(len(values)))])
             sums[name] = sums.get(name, 0) + part
@@ -237,6 +238,17 @@ def _gradients(
     parts = {name: (float(part[0]), float(part[1])) for name, part in zip(sums, total, strict=True)}
     mean = sum(value for value, _ in parts.values()) / max(1, sum(count for _, count in parts.values()))
     return {"loss": mean, **{name: value / count for name, (value, count) in parts.items() if count}}, norm
+
+
+def _weights(accelerator: Accelerator, phase: _PreparedPhase, passes: list[Any]) -> list[float]:
+    """What the mean of each pass counts for, so that the mean of all shares' is that of the global batch's losses."""
+    if phase.count is None:
+        return [1.0] * len(passes)
+    counts = [phase.count(batch) for batch in passes]
+    total = accelerator.reduce(torch.tensor(float(sum(counts)), device=accelerator.device), reduction="sum")
+    assert isinstance(total, Tensor)
+    shares = len(passes) * accelerator.num_processes
+    return [count * shares / max(1.0, float(total)) for count in counts]
 
 
 def _check(step: int, loss: float, norm: float, accelerator: Accelerator, examples: Examples) -> None:

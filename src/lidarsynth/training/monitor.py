@@ -34,13 +34,17 @@ class Monitor:
         self._name = "validation" if held_out else "training_images"
         self._images: list[RangeImage] = []
         if validation is not None:  # now, and not in 5,000 steps
-            sensors = open_images(validation, experiment, VALIDATION_SEED).sensor, build_sensor(experiment)
-            found, expected = ((sensor.height, sensor.width) for sensor in sensors)
+            images = open_images(validation, experiment, VALIDATION_SEED)
+            found, expected = ((s.height, s.width) for s in (images.sensor, build_sensor(experiment)))
             if not words_of(data) and not words_of(validation):
                 SeveralCaches([*folders_of(data), *folders_of(validation)])  # refuses another sensor's
             elif experiment.model.network != CASCADE and found != expected:
                 raise ValueError(f"{validation}: expected images of {expected[0]} x {expected[1]}, "
                                  f"found {found[0]} x {found[1]}")  # fmt: skip
+            try:
+                task.suits(experiment, images, False)
+            except ValueError as error:
+                raise ValueError(f"{validation}: {error}") from None
 
     def look(self, network: nn.Module, step: int, journal: Journal) -> dict[str, float]:
         """The task's numbers and pictures of the averaged weights, into the journal; and the numbers."""

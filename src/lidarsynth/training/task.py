@@ -45,11 +45,13 @@ class Phase:
                registered in it, so that a distributed wrapper of it is told all of its gradients
     optimizer  the key of the task's optimisers
     every      steps from one to the next, the first at step 0
+    count      batch -> how many losses it gives, where equal shares of one batch may give unequal numbers of them
     """
 
     objective: nn.Module
     optimizer: str = "network"
     every: int = 1
+    count: Callable[[Any], int] | None = None
 
 
 Draw = Callable[[Experiment, Images, list[int], int, list[int]], Any]
@@ -94,6 +96,10 @@ def any_share(experiment: Experiment, samples: int) -> None:
     """A network can learn from any number of samples at once."""
 
 
+def any_images(experiment: Experiment, images: Images, learned: bool) -> None:
+    """A network can learn from any images, and be judged on any."""
+
+
 def nothing(experiment: Experiment, network: nn.Module, step: int, accelerator: Accelerator) -> None:
     """No more to do after a step."""
 
@@ -113,6 +119,8 @@ class Task:
     buffers     whether floating buffers are averaged like parameters, or copied
     after       what else changes after a step, counted from 1; must be the same in all processes
     share       raises ValueError for a number of samples at once, in a process's pass, that cannot be learned from
+    suits       (experiment, images, whether they are learned from, else judged on): raises ValueError for images that
+                cannot be
     """
 
     parts: tuple[str, ...]
@@ -126,3 +134,4 @@ class Task:
     buffers: bool = True
     after: Callable[[Experiment, nn.Module, int, Accelerator], None] = nothing
     share: Callable[[Experiment, int], None] = any_share
+    suits: Callable[[Experiment, Images, bool], None] = any_images

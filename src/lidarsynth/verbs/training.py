@@ -30,6 +30,7 @@ from lidarsynth.pictures.figure import compare
 from lidarsynth.systems.table import SYSTEMS, build_network, system_of, task_of, transfer
 from lidarsynth.training.checkpoint import STATE, checkpoints, load_run, newest_whole, save_checkpoint, sweep
 from lidarsynth.training.examples import (
+    CASCADE,
     OF_ANY,
     SYNTHETIC,
     Streets,
@@ -157,8 +158,11 @@ def _run(
     accelerator: Accelerator,
 ) -> Iterator[Progress]:
     task = task_of(experiment)
+    if options.compile and experiment.model.network == CASCADE:
+        raise ValueError("expected no --compile for a cascade, nothing of which is compiled, found it")
     task.share(experiment, share_of(experiment, accelerator.num_processes * accelerator.gradient_accumulation_steps))
     task = replace(task, pictures=completions) if experiment.base else task  # which a base generates
+    task.suits(experiment, images, True)
     monitor = Monitor(experiment, task, data, validation)  # first, as it refuses images before anything is written
     experiment, state, note = _begin(experiment, images, data, out, begun, resume, accelerator)
     if accelerator.is_main_process:

@@ -27,7 +27,7 @@ from lidarsynth.networks.drafts import LEARNED, drafted
 from lidarsynth.networks.fill_unet import NOISES, Filled, FillUNet, Known, draw_noise
 from lidarsynth.networks.rays import Rays, encode_range
 from lidarsynth.streets.virtual import VirtualStreets
-from lidarsynth.systems.cascade.examples import EVERY, CascadeBatch, Crops, draw, grid
+from lidarsynth.systems.cascade.examples import EVERY, CascadeBatch, Crops, check_labelled, draw, grid
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.naming import NamingObjective
 from lidarsynth.systems.cascade.observing import ObserverObjective
@@ -43,7 +43,7 @@ from lidarsynth.systems.cascade.scores import (
 from lidarsynth.systems.cascade.speckle import calmed
 from lidarsynth.systems.diffusion.validation import strips
 from lidarsynth.training.randomness import sample_rng
-from lidarsynth.training.task import Phase, Task
+from lidarsynth.training.task import Images, Phase, Task
 
 PARTS = ("sample", "median", "likeliest", "layout", "guide", "columns", "between", "beams", "observed", "named",
          "inside")  # fmt: skip
@@ -102,6 +102,11 @@ class LikeliestObjective(nn.Module):
         known = known._replace(reflectance=calmed(known.reflectance, known.metres, known.lit))
         filled = self.network(known, rays, metres.new_zeros(len(metres), NOISES, *metres.shape[2:]))
         return {"likeliest": expected_errors(filled, known, rays, metres, reflectance)}
+
+
+def _completed(batch: CascadeBatch) -> int:
+    """How many crops learn the most likely image."""
+    return len(batch.crops.seeds) - batch.crops.samples
 
 
 def _of_none(network: nn.Module) -> Tensor:
@@ -202,7 +207,9 @@ def phases(experiment: Experiment, network: nn.Module) -> tuple[Phase, ...]:
     With a base, the part alone of what is not shared with it.
     """
     assert isinstance(network, Cascade)
-    likeliest = () if network.likeliest is None else (Phase(LikeliestObjective(network.likeliest), "likeliest"),)
+    likeliest: tuple[Phase, ...] = ()
+    if network.likeliest is not None:
+        likeliest = (Phase(LikeliestObjective(network.likeliest), "likeliest", count=_completed),)
     own = likeliest
     if network.observer is not None:
         objective = ObserverObjective(network.observer, network.surest, shining=not experiment.base)
@@ -283,6 +290,12 @@ def pictures(
     return [strips(model.generate(1, seed=i)[0]) for i, model in enumerate(models)]
 
 
+def _suits(experiment: Experiment, images: Images, learned: bool) -> None:
+    """Raises ValueError where classes are to be learned from images that have none."""
+    if learned and experiment.model.own_classes:
+        check_labelled(images)
+
+
 CASCADE = Task(
     parts=PARTS,
     draw=draw,
@@ -291,4 +304,5 @@ CASCADE = Task(
     pictures=pictures,
     optimizers=optimizers,
     buffers=False,
+    suits=_suits,
 )

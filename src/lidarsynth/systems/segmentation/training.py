@@ -74,9 +74,7 @@ def draw(
 def augment(experiment: Experiment, image: RangeImage, rng: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
     """(5, H, W') float32 and (H, W') int64: the scan turned, mirrored, thinned and cut as the experiment says."""
     data, options, width = experiment.data, segmentation_of(experiment), image.shape[1]
-    columns = options.columns or width
-    if columns > width or columns % 32:
-        raise ValueError(f"segmentation.columns: expected a multiple of 32 up to {width}, found {columns}")
+    columns = _columns(options, width)
     shift, first = (int(torch.randint(n, (), generator=rng)) for n in (width, width - columns + 1))
     flip, share = torch.rand(2, generator=rng).tolist()
     kept = torch.rand(image.shape, generator=rng).numpy() >= share * options.drop
@@ -92,6 +90,14 @@ def augment(experiment: Experiment, image: RangeImage, rng: torch.Generator) -> 
     ).keep(kept)
     part = slice(first, first + columns)
     return pixels(turned)[:, :, part], _label(turned)[:, part]
+
+
+def _columns(options: Segmentation, width: int) -> int:
+    """How many columns of images of `width` are learned from at once. Raises ValueError unless they have so many."""
+    columns = options.columns or width
+    if columns > width or columns % 32:
+        raise ValueError(f"segmentation.columns: expected a multiple of 32 up to {width}, found {columns}")
+    return columns
 
 
 def pixels(image: RangeImage) -> np.ndarray:
@@ -124,6 +130,14 @@ def class_shares(images: Images) -> np.ndarray:
     return counts / counts.sum()
 
 
+def suits(experiment: Experiment, images: Images, learned: bool) -> None:
+    """Raises ValueError for images of a cache without labels, and for such that are too narrow to learn from."""
+    if learned:
+        _columns(segmentation_of(experiment), experiment.data.width)
+    if isinstance(images, CachedImages | SeveralCaches):  # streets have labels
+        class_shares(images)
+
+
 def class_weights(shares: np.ndarray) -> Tensor:
     """(classes,) float32: 1 / ln(1.02 + share) (Paszke et al. 2016), so that labelled pixels weigh 1 on average."""
     weights = 1 / np.log(1.02 + shares)
@@ -132,10 +146,15 @@ def class_weights(shares: np.ndarray) -> Tensor:
 
 @torch.no_grad()
 def classify(network: RangeNet, image: RangeImage) -> RangeImage:
-    """The image with the network's classes 1-19 as its label, 0 where not measured; 0 itself is never learned."""
-    values = torch.from_numpy(pixels(image))[None].to(network.means)
+    """The image with the network's classes 1-19 as its label, 0 where not measured; 0 itself is never learned.
+
+    A turn of other than a multiple of 32 columns is seen on into its next one.
+    """
+    width = image.shape[1]
+    columns = np.arange(width + -width % 32) % width
+    values = torch.from_numpy(pixels(image)[:, :, columns])[None].to(network.means)
     logits = network(network.network_input(values, values[:, :1] > 0))
-    label = logits[0, 1:].argmax(0).cpu().numpy() + 1
+    label = logits[0, 1:, :, :width].argmax(0).cpu().numpy() + 1
     return replace(image, label=np.where(image.mask, label, UNLABELED))
 
 
@@ -189,4 +208,5 @@ SEGMENTATION = Task(
     phases=_phases,
     judge=judge,
     pictures=pictures,
+    suits=suits,
 )

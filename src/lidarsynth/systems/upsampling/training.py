@@ -152,6 +152,18 @@ def _known(experiment: Experiment) -> np.ndarray:
     return known
 
 
+def suits(experiment: Experiment, images: Images, learned: bool) -> None:
+    """Raises ValueError for a factor that leaves fewer than two known rows, none between them, or columns that are not
+    equally far apart all around."""
+    known, across = _known(experiment), _group(experiment).factor[1]
+    rows, (height, width) = int(known.any(axis=1).sum()), known.shape
+    if not 2 <= rows < height:
+        raise ValueError(f"upsampling.factor: expected two known beams at least, and others between them, found {rows} "
+                         f"known of {height}")  # fmt: skip
+    if width % across:
+        raise ValueError(f"upsampling.factor: expected a divisor of {width} columns, found {across}")
+
+
 def _group(experiment: Experiment) -> Upsampling:
     return experiment.upsampling or Upsampling()
 
@@ -163,5 +175,5 @@ def _phases(experiment: Experiment, network: nn.Module) -> tuple[Phase]:
     return (Phase(QueryObjective(network)),)
 
 
-LIDAR_SR = Task(parts=("range",), draw=draw_pairs, phases=_phases, judge=judge, pictures=pictures)
-QUERIES = Task(parts=("range",), draw=draw_queries, phases=_phases, judge=judge, pictures=pictures)
+LIDAR_SR = Task(("range",), draw_pairs, _phases, judge, pictures, suits=suits)
+QUERIES = Task(("range",), draw_queries, _phases, judge, pictures, suits=suits)
