@@ -44,11 +44,16 @@ def _printable(text: str) -> str:
 
 
 def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
-    """Raises ValueError by the option's name unless each number is None or from `least` to 2^62."""
+    """Raises ValueError by the option's name unless each number is None or from `least` to 2^62, or of workers to as
+    many as a machine can begin."""
+    from lidarsynth.data.workers import check_workers
+
     for name, number in numbers.items():
         if number is not None and not least <= number < 2**62:
             limit = f"at least {least}" if number < least else "at most 2^62 - 1"
             raise ValueError(f"expected --{name} of {limit}, found {number}")
+        if name == "workers" and number is not None:
+            check_workers(number)
 
 
 @contextmanager
