@@ -9,9 +9,11 @@ import pytest
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, get_sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
+from lidarsynth.lidar.unseen import few_beams
 from lidarsynth.lidar.view import misfit, placement
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.weights.load import load
 
 
 def street(name: str) -> Scan:
@@ -49,3 +51,36 @@ def test_whole_and_thinned_scans_are_no_few_beams(name: str):
     for kept in (scan.ring >= 0, scan.ring % 4 == 0, low, low & (scan.ring % 4 == 0)):
         assert "of its" not in str(misfit(scan.xyz[kept], sensor, scan.ring[kept]))
     assert placement(scan, sensor)[0] is None
+
+
+SAID = "points on many beams, found nearly all at {}: nothing tells what is above and below, so that the result is a"
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_scans_of_a_street_have_many_beams_and_two_or_three_are_few(name: str):
+    scan = street(name)
+    for kept in (scan.ring >= 0, scan.ring % 4 == 0, np.abs(scan.xyz[:, 1]) < 0.2 * scan.xyz[:, 0]):
+        assert few_beams(scan.xyz[kept]) is None
+    low = scan.ring.max() * 3 // 4
+    two = scan.xyz[np.isin(scan.ring, [low // 2, low])]
+    assert SAID.format("2 elevations") in str(few_beams(two, get_sensor(name)))
+    assert few_beams(scan.xyz[scan.ring == low], Sensor("few", (0.0, -3.0, -6.0))) is None
+    assert few_beams(scan.xyz[:0]) is None
+
+
+@pytest.mark.parametrize("verb", ["complete", "label", "upsample --times 2"])
+def test_few_beams_are_told_of_whichever_scan_of_a_folder(verb: str, tmp_path: Path, capsys):
+    """Of many scans only some are looked at; a laser's among them was completed without a word."""
+    scan, words = street("vlp-16"), ["--no-picture", "--out", str(tmp_path / "out")]
+    for i in range(5):
+        write(tmp_path / f"{i}.ply", scan[scan.ring % 5 == 3] if i == 4 else scan)
+    words += ["--from" if verb.startswith("up") else "--sensor", "vlp-16"]
+    main([*verb.split(), str(tmp_path / "[0-4].ply"), *words])
+    told = [line for line in capsys.readouterr().err.splitlines() if "many beams" in line]
+    assert len(told) == 1 and f"{tmp_path / '4.ply'}: expected {SAID.format('3 elevations')}" in told[0]
+
+
+def test_a_model_in_python_warns_of_few_beams():
+    scan, model = street("vlp-16"), load("nearest").into("vlp-16")
+    with pytest.warns(UserWarning, match="nearly all at 1 elevation: nothing tells"):
+        model.complete(scan[scan.ring == 12])

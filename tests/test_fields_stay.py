@@ -226,7 +226,7 @@ def test_bad_arrays_are_told_by_the_library():
         ls.get_sensor("vlp-16").denser(2.5)  # type: ignore[arg-type]
 
 
-@pytest.mark.filterwarnings("ignore:expected a turn of a sensor")
+@pytest.mark.filterwarnings("ignore:expected a turn of a sensor", "ignore:expected points on many beams")
 def test_what_python_lacks_is_asked_for_by_its_name_there():
     few, model = Scan(np.ones((50, 3), np.float32)), ls.load("default").into("vlp-16")
     with pytest.raises(ValueError, match=r"^expected at least 100 points.*: name it with --from, or sensor_in$"):
@@ -256,3 +256,21 @@ def test_labels_of_bare_files_stand_beside_them(suffix: str, street: Scan, tmp_p
         assert [p.suffix for p in (tmp_path / labels).iterdir() if p.suffix == ".label"] == [".label"]
         again = read(path, labels=tmp_path / labels / "x.label")
         np.testing.assert_array_equal(again.label, classes)
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz"])
+def test_fields_of_several_numbers_of_a_structured_array_are_kept_as_of_a_pcd(kind: str, tmp_path: Path):
+    """They were left out without a word."""
+    points = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4")]
+    table = np.zeros(6, [*points, ("normal", "f4", 3), ("cell", "u2", (1,)), ("none", "f4", (0,)), ("m", "f8", (2, 2))])
+    for name in table.dtype.names or ():
+        table[name] = np.arange(1, 1 + table[name].size).reshape(table[name].shape)
+    table["intensity"] /= 10
+    np.save(tmp_path / "a.npy", table)
+    np.savez(tmp_path / "a.npz", points=table)
+    scan = read(tmp_path / f"a.{kind}")
+    assert sorted(scan.extra) == ["cell", "m_0", "m_1", "m_2", "m_3", *(f"normal_{i}" for i in range(3))]
+    np.testing.assert_array_equal(np.stack([scan.extra[f"normal_{i}"] for i in range(3)], 1), table["normal"])
+    np.testing.assert_array_equal(scan.extra["m_2"], table["m"][:, 1, 0])
+    write(tmp_path / "b.ply", scan)
+    np.testing.assert_array_equal(read(tmp_path / "b.ply").extra["normal_2"], table["normal"][:, 2])

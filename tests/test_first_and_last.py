@@ -2,9 +2,11 @@
 
 import io
 import os
+import signal
 import sys
 import time
 from hashlib import sha256
+from importlib import import_module
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import tqdm.std
 from lidarsynth.__main__ import command
 from lidarsynth.cli import terminal
 from lidarsynth.cli.main import main
+from lidarsynth.cli.terminal import answer
 from lidarsynth.data.cache import write_cache
 from lidarsynth.data.frames import read_velodyne
 from lidarsynth.data.ouster import read_metadata
@@ -158,6 +161,24 @@ def test_ctrl_c_while_the_program_is_read_ends_quietly(monkeypatch, capsys):
     assert end.value.code == 130 and capsys.readouterr().err == "lidarsynth: stopped\n"
     scripts = (Path(__file__).parents[1] / "pyproject.toml").read_text()
     assert 'lidarsynth = "lidarsynth.__main__:command"' in scripts, "the installed command begins there, too"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_waits_until_a_module_is_imported(number: int, code: int, tmp_path: Path, monkeypatch, capsys):
+    """Into that of torch it ended the process in torch's words (pybind11, code -6), or was lost."""
+    twice = f"[os.kill(os.getpid(), {int(number)}) for _ in range(2)]"
+    (tmp_path / "slow_to_import.py").write_text(f"import os, time\n{twice}\ntime.sleep(0.3)\nimported = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    former = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as end:
+            answer(lambda: (import_module("slow_to_import"), time.sleep(20)))
+    finally:
+        for one, handler in zip((signal.SIGINT, signal.SIGTERM), former, strict=True):
+            signal.signal(one, handler)
+    assert end.value.code == code and capsys.readouterr().err.startswith("lidarsynth: stopped")
+    assert vars(sys.modules.pop("slow_to_import"))["imported"]
 
 
 def test_sums_beside_the_downloads_are_kept(tmp_path: Path):

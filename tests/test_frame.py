@@ -252,6 +252,17 @@ def test_points_on_no_beams_have_no_stand():
     assert stand_of_beams(np.random.default_rng(0).normal(0, 10, (9000, 3))) is None
 
 
+@pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-64e"])
+@pytest.mark.parametrize("pose", ["0:0:0:180:10:0", "0:0:0:175:12:0"])
+def test_a_tilted_sensor_that_hangs_is_upside_down_too(name: str, pose: str):
+    """The side was judged as the points came: on the tilted ground, by beams that are none of a known sensor's then."""
+    streets = SyntheticStreets(4711, 64, get_sensor(name))
+    for k in range(0, 64, 16):
+        frame = check_frame(moved(streets.image(k).to_scan(), parse_transform(pose)))
+        assert frame.faults[0] == "upside down" and "tilted by" in frame.faults[1]
+        np.testing.assert_allclose((frame.transform @ parse_transform(pose))[:3, 2], [0, 0, 1], atol=0.01)
+
+
 def test_a_scan_whose_ground_is_at_zero_is_not_upside_down():
     frame = check_frame(moved(street("hdl-64e-kitti"), parse_transform("0:0:1.9:0:0:0")))
     assert frame.faults == ("with the sensor 1.90 m above the origin",)

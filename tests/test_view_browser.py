@@ -110,6 +110,19 @@ def test_points_are_on_the_screen(page: Page, alone: str, who: str):
     assert page.errors == []
 
 
+def test_sizes_are_not_cut_off_on_a_screen_of_fine_pixels(page: Page, alone: str):
+    """Two pixels for one of the page's: a point was at most 6 of them, wherever the slider stood."""
+    page.open(f"{alone}#card")
+    shares = []
+    for fine in (1, 2):
+        page.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, deviceScaleFactor=fine, mobile=False)
+        page.settle()
+        page.run("$('size').value = 4, camera.distance = 10")
+        shares.append(drawn(page).mean())
+    page.shown = ("", 0, 0)
+    assert shares[1] == pytest.approx(shares[0], rel=0.1)
+
+
 def test_both_ways_of_drawing_draw_the_same(page: Page, alone: str):
     views = []
     for who in ("card", "splat"):

@@ -8,11 +8,16 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lidarsynth.cli.generate import FEW
+from lidarsynth.cli.main import main
+from lidarsynth.files.formats import write
+from lidarsynth.lidar.scan import Scan
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block
 
+Caps = pytest.CaptureFixture[str]
 EARLY = """
 from lidarsynth.data.workers import begin_early, in_order
 if __name__ == "__main__":
@@ -67,6 +72,22 @@ def test_ctrl_c_in_a_terminal_tells_nothing_of_processes_that_begin(seconds: flo
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=100)
     assert process.returncode != 0 and out == "" and "Traceback" not in err
+
+
+VERBS = ("complete", "upsample --times 2", "label", "realise", "project", "insert --add car:1")
+WORDS = [*(f"{verb} scans --out o" for verb in VERBS), "generate --out o", "streets --out o",
+         "data files scans o --sensor vlp-16", "data synthetic o"]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", WORDS)
+def test_a_million_is_refused_by_every_verb(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Caps):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scans").mkdir()
+    write(Path("scans", "a.ply"), Scan(np.ones((5, 3), np.float32)))
+    with pytest.raises(SystemExit, match="2"):
+        main([*words.split(), "--workers", "1000000"])
+    assert capsys.readouterr().err == "lidarsynth: expected --workers of at most 1,024, found 1,000,000\n"
+    assert not Path("o").exists()
 
 
 def early_one_of(group: int) -> bool:

@@ -71,13 +71,12 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     """Do the job with every scan, say what came of it, and return the results, after those of scans that were there
     already, as far as reports tell them. Raises ValueError where all failed."""
     from lidarsynth.data.bag_writer import FORMATS
-    from lidarsynth.data.workers import begin_early
+    from lidarsynth.data.workers import begin_early, check_workers
     from lidarsynth.verbs.expansion import is_stream
     from lidarsynth.verbs.inputs import Reading, inputs_of
     from lidarsynth.verbs.placement import parse_rings, read_transform
 
-    if many.workers < 0:
-        raise ValueError(f"expected --workers of at least 0, found {many.workers}")
+    check_workers(many.workers)
     transform = read_transform(many.transform, many.mount, many.axes)
     rings = parse_rings(many.rings)
     reading = Reading(intensity, many.topic, many.metadata, transform, job.reads_labels, rings)

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 from lidarsynth.lidar.plural import plural
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 NARROWEST = 40  # columns
 MOST = 1200  # characters of a refusal
 REFUSED, STOPPED, UNHEARD = 2, 130, 141  # exit codes; the last two as shells have them for Ctrl-C and a closed pipe
+SOON, PATIENCE = 0.05, 5.0  # seconds until a signal comes again, and for how long it does
 TERMINATED, MOMENT = 143, 1.0  # likewise for SIGTERM; seconds, in which a second one is the same: timeout(1) sends two
 
 
@@ -44,11 +46,16 @@ def _printable(text: str) -> str:
 
 
 def at_least(least: int, numbers: Mapping[str, int | None]) -> None:
-    """Raises ValueError by the option's name unless each number is None or from `least` to 2^62."""
+    """Raises ValueError by the option's name unless each number is None or from `least` to 2^62, or of workers to as
+    many as a machine can begin."""
+    from lidarsynth.data.workers import check_workers
+
     for name, number in numbers.items():
         if number is not None and not least <= number < 2**62:
             limit = f"at least {least}" if number < least else "at most 2^62 - 1"
             raise ValueError(f"expected --{name} of {limit}, found {number}")
+        if name == "workers" and number is not None:
+            check_workers(number)
 
 
 @contextmanager
@@ -183,7 +190,7 @@ def answer(verb: Callable[[], object]) -> None:
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)  # the help of a narrower terminal would never be laid out
     try:
-        with _terminable(), _warned():
+        with _interruptible(), _terminable(), _warned():
             verb()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
@@ -224,6 +231,60 @@ def _warned() -> Iterator[None]:
         warnings.formatwarning = former
 
 
+Handler = Callable[[int, FrameType | None], None]
+
+
+def _once_imported(stop: Handler) -> Handler:
+    """A handler of a signal that comes again and again until no module is being imported, for PATIENCE seconds: where
+    that is interrupted, torch ends the process in words of its own, and Python may lose what was to stop it."""
+    until, waits = -math.inf, False
+
+    def again(number: int) -> None:
+        nonlocal waits
+        waits = False
+        if sys.platform == "win32":
+            signal.raise_signal(number)
+        else:
+            os.kill(os.getpid(), number)  # which wakes the first thread, whatever it waits for
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal until, waits
+        if waits:
+            return
+        until = time.monotonic() + PATIENCE if until == -math.inf else until
+        waits = time.monotonic() < until and _importing(frame)
+        if waits:
+            timer = threading.Timer(SOON, again, (number,))
+            timer.daemon = True
+            timer.start()
+        else:
+            until = -math.inf
+            stop(number, frame)
+
+    return handle
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported there."""
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        frame = frame.f_back
+    return frame is not None
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C raises KeyboardInterrupt, but not into the import of a module."""
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGINT) != signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, _once_imported(signal.default_int_handler))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @contextmanager
 def _terminable() -> Iterator[None]:
     """SIGTERM (of timeout, Slurm, a machine that goes down) raises KeyboardInterrupt(SIGTERM): what ends well by Ctrl-C
@@ -240,7 +301,7 @@ def _terminable() -> Iterator[None]:
         if last - former >= MOMENT:
             raise KeyboardInterrupt(number)
 
-    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGTERM, _once_imported(stop))
     try:
         yield
     finally:

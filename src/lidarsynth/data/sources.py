@@ -21,6 +21,7 @@ from lidarsynth.data.kitti import kitti, kitti_published
 from lidarsynth.data.kitti360 import kitti360, kitti360_lidargen
 from lidarsynth.data.nuscenes import NuScenes, nuscenes
 from lidarsynth.data.street_caches import begins_alike
+from lidarsynth.data.workers import check_workers
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import PROJECTIONS, columns_of, project_thinned
 from lidarsynth.lidar.recognition import recognise, same_kind
@@ -308,9 +309,10 @@ def _sensor(name: str, width: int) -> Sensor:
 
 
 def _processes(workers: int | None) -> int:
-    if workers is not None and workers < 0:
-        raise ValueError(f"expected --workers of at least 0, found {workers}")
-    return (os.cpu_count() or 1) if workers is None else workers
+    if workers is None:
+        return os.cpu_count() or 1
+    check_workers(workers)
+    return workers
 
 
 def shards(folder: str | Path) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 TRIM, MMAP = -1, -3  # of mallopt(3): memory above the one goes back to the system, above the other it comes apart
 LARGEST = 1 << 25  # bytes, of MMAP; what glibc allows at most
+MOST = 1024  # processes or threads: a machine that is asked for a million stands still
 AHEAD = 16  # items of each process that are begun or wait for it: there may be more in all than memory holds
 
 Item = TypeVar("Item")
@@ -44,6 +45,13 @@ def in_order(make: Callable[[Item], Any], items: Iterable[Item], workers: int) -
         while begun:
             yield begun.popleft().result()
             begun.extend(submit(_work, item) for item in islice(items, 1))
+
+
+def check_workers(workers: int) -> None:
+    """Raises ValueError unless they are from 0 to MOST."""
+    if not 0 <= workers <= MOST:
+        limit = "at least 0" if workers < 0 else f"at most {MOST:,}"
+        raise ValueError(f"expected --workers of {limit}, found {workers:,}")
 
 
 def begin_early(*modules: str) -> None:

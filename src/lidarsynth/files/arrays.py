@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import lzma
+import math
 import struct
 import zipfile
 import zlib
@@ -25,6 +26,7 @@ from lidarsynth.files.fields import (
     written_names,
 )
 from lidarsynth.files.labels import MOST_INSTANCES
+from lidarsynth.files.several import numbered
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, from_dict
 
@@ -91,10 +93,18 @@ def read_npy(data: bytes) -> Fields:
     return fields_of(read_array(BytesIO(data), len(data)))
 
 
+def _columns(table: np.ndarray) -> Fields:
+    """The columns of a structured array (N,); of a field of several numbers one each, as of a `.pcd`."""
+    names = [name for name in table.dtype.names or () if 0 not in table.dtype[name].shape]
+    counts = [math.prod(table.dtype[name].shape) for name in names]
+    parts = zip(names, counts, numbered(names, counts), strict=True)
+    return {word: table[name].reshape(-1, count)[:, i] for name, count, own in parts for i, word in enumerate(own)}
+
+
 def fields_of(array: np.ndarray) -> Fields:
     """Columns of an array of points, see `read_npy`. Raises FileError for any other shape or type."""
     if array.dtype.names:
-        return {name: array[name].reshape(-1) for name in array.dtype.names if array[name].ndim == array.ndim}
+        return _columns(array.reshape(-1))
     if array.ndim == 3 and 3 <= array.shape[2] <= 10:
         array = array.reshape(-1, array.shape[2])
     if array.ndim != 2 or not 3 <= array.shape[1] <= 10 or array.dtype.kind not in "fiu":

@@ -133,15 +133,17 @@ def _sees_ground(scan: Scan, axis: str) -> bool:
 
 
 def _side(scan: Scan, axis: str, points: Turned) -> str:
-    """+axis or -axis: where the ground is below the sensor, wherever the origin; where both sides look alike, where the
-    beams are a known sensor's, unless one of that kind hangs at times: then where there is more of the ground; and of
-    beams that are so either way, as an OS1's, from where they turn to the right.
+    """+axis or -axis: where the ground is below the sensor, wherever the origin, however tilted; where both sides look
+    alike, where the beams are a known sensor's, unless one of that kind hangs at times: then where there is more of the
+    ground; and of beams that are so either way, as an OS1's, from where they turn to the right.
 
     points  of the scan, turned so that +axis is up
     """
     rotation, seen = np.array(AXES["+" + axis][0]), scan
     if points.told and points.cones is not None:
-        seen = replace(scan, xyz=(scan.xyz - points.cones.origin @ rotation).astype(np.float32))
+        level = onto_z(points.cones.axis) if points.cones.tilt > TILTED else np.eye(3)
+        upright = (points.xyz - points.cones.origin) @ level.T
+        seen = replace(scan, xyz=(upright @ rotation).astype(np.float32))
     upper, lower = _shares(seen, "+" + axis), _shares(seen, "-" + axis)
     if upper > GROUND and upper > UPSIDE * lower:
         return "+" + axis

@@ -8,6 +8,7 @@ from lidarsynth.lidar.columns import own_columns
 from lidarsynth.lidar.marks import were_new
 from lidarsynth.lidar.own_beams import stray_rings
 from lidarsynth.lidar.plural import plural
+from lidarsynth.lidar.recognition import elevations_of
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.turns import several_turns
@@ -15,6 +16,9 @@ from lidarsynth.lidar.turns import several_turns
 WIDE = 45  # degrees: confidences were fitted on wider holes, too, but what stands there is anyone's guess
 SPARSE = 200  # points: of so few of an XT32 less than half of the new ones are right, of 4,000 four fifths
 FEW = 0.15  # share of the usual points of a degree that are hardly any
+# Elevations that tell hardly anything, tenths of a degree that are one, and the share of points there: of real scans,
+# their near and far parts too, at most 0.76 are, of every fourth beam of a VLP-16 0.79.
+BEAMS, TENTHS, NEARLY = 3, 10, 0.9
 
 
 def caution(
@@ -52,6 +56,25 @@ def filled_before(scan: Scan) -> str | None:
         return None
     return (f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): they are "
             "taken as they are, and stay marked")  # fmt: skip
+
+
+def few_beams(xyz: np.ndarray, sensor: Sensor | None = None) -> str | None:
+    """That points (N, 3) lie on so few beams that whatever is made of them is a guess, in one line; or None, as of a
+    sensor that has no more."""
+    if not len(xyz) or (sensor is not None and sensor.height <= BEAMS + 1):
+        return None
+    lift = np.array([0, 0, np.mean(sensor.offsets) if sensor is not None and sensor.offsets else 0], np.float32)
+    tenth = (10 * (90 + elevations_of(xyz - lift))).astype(int)
+    count, within = np.bincount(tenth, minlength=1801), 0
+    for found in range(1, BEAMS + 1):
+        windows = np.convolve(count, np.ones(TENTHS, int), "valid")
+        at = int(windows.argmax())
+        within += int(windows[at])
+        count[at : at + TENTHS] = 0
+        if within >= NEARLY * len(xyz):
+            return (f"expected points on many beams, found nearly all at {plural(found, 'elevation')}: nothing tells "
+                    "what is above and below, so that the result is a guess")  # fmt: skip
+    return None
 
 
 def _never_seen(sensor: Sensor | None) -> float:

@@ -12,7 +12,7 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution
+from lidarsynth.lidar.unseen import caution, few_beams
 from lidarsynth.lidar.view import beyond_beams, out_of_view
 from lidarsynth.networks.tensors import as_array
 
@@ -52,6 +52,8 @@ def noted(
             warnings.warn(text, stacklevel=3)
         known = None if sensor is None else get_sensor(sensor)
         image = model.sensor if bound(model) else None
+        if (text := few_beams(scan.xyz, known or image)) is not None:
+            warnings.warn(text, stacklevel=3)
         if filling and (text := caution(scan, known, image=image, around=not beams or bound(model))) is not None:
             warnings.warn(text, stacklevel=3)
     return scan

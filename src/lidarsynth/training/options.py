@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-MOST = 1024  # threads or processes: a machine that is asked for a million stands still
+from lidarsynth.data.workers import MOST
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution, filled_before
+from lidarsynth.lidar.unseen import caution, few_beams, filled_before
 from lidarsynth.lidar.view import placement
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
@@ -203,6 +203,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         beyond = _view_warning(loaded.scan, job, work, model)
         done, note = _made(job, model, work, loaded.scan, on_step)
         more = loaded.left_out, beyond, _caution(loaded.scan, job, work, model, alone=warning is None)
+        more = (*more, _few_beams(loaded.scan, job, model))
         warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside, picture, other = None, (), None, None
         if work.target is None:
@@ -290,6 +291,14 @@ def _caution(scan: Scan, job: Job, work: Work, model: ScanModel | None, alone: b
     sensor = None if job.sensor is None else get_sensor(job.sensor)
     around = job.verb == "complete" or bound(model)
     return caution(scan, sensor, alone, model.sensor if job.into else None, around)
+
+
+def _few_beams(scan: Scan, job: Job, model: ScanModel | None) -> str | None:
+    """That a scan, whichever of many, has so few beams that the result is a guess; a range image of it is none."""
+    if model is None:
+        return None
+    own = model.sensor if bound(model) else None
+    return few_beams(scan.xyz, own if job.sensor is None else get_sensor(job.sensor))
 
 
 def _in_one_line(path: Path, warning: str | None, *more: str | None) -> str | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from lidarsynth.files.fields import find
 from lidarsynth.files.whole_numbers import stray
+from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.removal import own_classes
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.semantic_kitti import CLASSES
@@ -51,7 +52,7 @@ def packed(shown: Shown) -> bytes:
         "blocks": [{"name": name, "type": values.dtype.str[1:], "count": values.size}
                    for name, values in blocks.items()],
         "boxes": list(shown.boxes),
-        "notes": [*shown.notes, *_classes_left_out(scan), *_confidence_left_out(scan),
+        "notes": [*shown.notes, *_classes_left_out(scan), *_confidence_left_out(scan), *_no_numbers(scan),
                   *([] if len(scan) else ["no point in this scan"])],
         "name": shown.name,
     }  # fmt: skip
@@ -100,6 +101,17 @@ def _confidence_left_out(scan: Scan) -> list[str]:
     if confidence is None or not len(scan) or np.isfinite(confidence).any():
         return []
     return ["confidence left out: expected numbers from 0 to 1, found none"]
+
+
+def _no_numbers(scan: Scan) -> list[str]:
+    """What is to be said of points whose `new` or confidence is no number, though others' are, a line each."""
+    notes = []
+    for name, shown in (("new", "measured"), ("confidence", "0")):
+        values = scan.extra.get(name)
+        lost = 0 if values is None else len(values) - int(np.isfinite(values).sum())
+        if lost and (name == "new" or lost < len(scan)):
+            notes.append(f"{name} is no number at {plural(lost, 'point')}; shown as {shown}")
+    return notes
 
 
 def _in_255(values: np.ndarray) -> np.ndarray:

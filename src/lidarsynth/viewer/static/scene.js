@@ -1,7 +1,7 @@
 // The graphics card draws: WebGL 2. `Splat` (splat.js) has the same methods, for machines without a card.
 
 const BACKGROUND = [11, 13, 17];
-const LARGEST = 6; // pixels of a point
+const LARGEST = 6; // pixels of a point, on a view of up to 720 pixels
 const DISTANCE = 16; // metres at which a point has the chosen size, on a view 720 pixels tall
 
 // What makes a point's size in pixels when divided by the root of its distance: near points grow, but not over all.
@@ -9,15 +9,20 @@ function pointScale(pixels, height, share) {
   return (pixels * Math.sqrt(DISTANCE / share) * height) / 720;
 }
 
+// Pixels of the largest point: as many more as the view has, so that screens of fine pixels do not cut sizes off.
+function largestOf(height) {
+  return LARGEST * Math.max(height / 720, 1);
+}
+
 const POINT_SHADER = `#version 300 es
 layout(location = 0) in vec3 place;
 layout(location = 1) in vec3 colour;
 uniform mat4 matrix;
-uniform float size;
+uniform float size, largest;
 flat out vec3 shade;
 void main() {
   gl_Position = matrix * vec4(place, 1);
-  gl_PointSize = clamp(size * inversesqrt(gl_Position.w), 1.0, ${LARGEST}.0);
+  gl_PointSize = clamp(size * inversesqrt(gl_Position.w), 1.0, largest);
   shade = colour;
 }`;
 const PAINT_SHADER = `#version 300 es
@@ -34,6 +39,7 @@ class Card {
     this.program = linked(gl, POINT_SHADER, PAINT_SHADER);
     this.matrix = gl.getUniformLocation(this.program, "matrix");
     this.size = gl.getUniformLocation(this.program, "size");
+    this.largest = gl.getUniformLocation(this.program, "largest");
     this.points = this.layer(Float32Array.of(), Uint8Array.of());
     this.lines = [];
     gl.useProgram(this.program);
@@ -89,6 +95,7 @@ class Card {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.uniformMatrix4fv(this.matrix, false, camera.matrix(width / height));
     gl.uniform1f(this.size, pointScale(pixels, height, share));
+    gl.uniform1f(this.largest, largestOf(height));
     gl.bindVertexArray(this.points.array);
     gl.drawArrays(gl.POINTS, 0, Math.ceil(this.points.n * share));
     for (const layer of this.lines) {

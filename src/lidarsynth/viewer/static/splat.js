@@ -38,7 +38,7 @@ function word([r, g, b]) { return (255 << 24 | b << 16 | g << 8 | r) >>> 0; }
 function splatPoints({ image, depth, out, xyz, colours }, m, scale, count) {
   const { width, height } = image, halfWidth = width / 2, halfHeight = height / 2;
   const [a0, a1, , a3, b0, b1, , b3, c0, c1, , c3, d0, d1, , d3] = m; // constants of the loop
-  const single = (1.5 / scale) ** 2; // one over the distance from which on a point is one pixel
+  const largest = largestOf(height), single = (1.5 / scale) ** 2; // one over the distance from which on a point is one pixel
   for (let i = 0, k = 0; i < count; i++, k += 3) {
     const x = xyz[k], y = xyz[k + 1], z = xyz[k + 2];
     const w = a3 * x + b3 * y + c3 * z + d3;
@@ -53,7 +53,7 @@ function splatPoints({ image, depth, out, xyz, colours }, m, scale, count) {
       if (near > depth[at]) { depth[at] = near; out[at] = colour; }
       continue;
     }
-    const side = Math.min((scale * Math.sqrt(near) + 0.5) | 0, LARGEST);
+    const side = Math.min((scale * Math.sqrt(near) + 0.5) | 0, largest | 0);
     const left = Math.max((px - side / 2 + 0.5) | 0, 0), top = Math.max((py - side / 2 + 0.5) | 0, 0);
     const right = Math.min(left + side, width), bottom = Math.min(top + side, height);
     for (let row = top * width; row < bottom * width; row += width) {
