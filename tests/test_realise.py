@@ -193,9 +193,7 @@ def test_the_scale_of_a_message_is_that_which_it_was_read_by(full: int):
     assert back[0] == 0 and back[1] == full
 
 
-@pytest.mark.parametrize(
-    ("intensity", "full"), [("auto", 255), ("percent", 100), ("byte", 255), ("uint16", 65535), ("none", 255)]
-)
+@pytest.mark.parametrize(("intensity", "full"), [("auto", 255), ("byte", 255), ("uint16", 65535), ("none", 255)])
 def test_a_bag_of_a_forced_scale_is_written_in_it(intensity: str, full: float, place: Path):
     """Intensities of 100: of 255, unless someone knows that the sensor counts to 65535."""
     pytest.importorskip("rosbags")

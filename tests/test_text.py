@@ -101,15 +101,3 @@ def test_true_and_false_in_a_named_column_are_1_and_0():
 def test_what_is_no_text_of_points_is_one_line(data: bytes, words: str):
     with pytest.raises(FileError, match=words):
         read_text(data)
-
-
-def test_percents_are_read_where_they_are_named(tmp_path):
-    """Nothing tells them from 0-255, as which they are read else."""
-    light = np.float32([0, 12.5, 40, 100])
-    np.save(tmp_path / "p.npy", np.column_stack([np.eye(4, 3) + 1, light]).astype(np.float32))
-    for intensity, full in (("percent", 100), ("auto", 255)):
-        np.testing.assert_allclose(read(tmp_path / "p.npy", intensity).reflectance, light / full, rtol=1e-6)
-    light[3] = 101
-    np.save(tmp_path / "p.npy", np.column_stack([np.eye(4, 3) + 1, light]).astype(np.float32))
-    with pytest.raises(FileError, match=r"expected an intensity of 0-100 \(percent\), found 0 to 101"):
-        read(tmp_path / "p.npy", "percent")

@@ -63,8 +63,8 @@ Least = Annotated[
     arg(metavar="P", help="leave out new points less likely right than this, 0 to 1; see docs/confidence.md."),
 ]
 Intensity = Annotated[
-    Literal["auto", "unit", "percent", "byte", "uint16", "none"],
-    arg(help="scale of the file's intensity: 0-1, 0-100, 0-255, 0-65535, or none for a file without."),
+    Literal["auto", "unit", "byte", "uint16", "none"],
+    arg(help="scale of the file's intensity: 0-1, 0-255, 0-65535, or none for a file without."),
 ]
 Rings = Annotated[
     str | None, arg(metavar="A-B", help="of a file of several sensors, such as 32-63; all others are left out.")

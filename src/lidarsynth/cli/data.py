@@ -23,7 +23,7 @@ def data(
     count: Annotated[int | None, arg(aliases=["-n"])] = None,
     check: bool = False,
     seed: int = 0,
-    intensity: Literal["auto", "unit", "percent", "byte", "uint16", "none"] = "auto",
+    intensity: Literal["auto", "unit", "byte", "uint16", "none"] = "auto",
     apart: bool = False,
     inside: bool = False,
     transform: str | None = None,
@@ -47,7 +47,7 @@ def data(
         count: synthetic scans; 1000 if not given.
         check: also compare the checksums of what is there already, and make anew what is damaged.
         seed: of the synthetic streets.
-        intensity: scale of files: 0-1, 0-100, 0-255, 0-65535, or none for files without.
+        intensity: scale of files: 0-1, 0-255, 0-65535, or none for files without.
         apart: every synthetic scan from a street of its own, for sets that are compared; else sixteen from each.
         inside: synthetic scans of rooms, halls and garages, for robots, the sensor as high as its mount says.
         transform: brings points of files into the sensor's frame: x:y:z:roll:pitch:yaw, or a file of 4 x 4 numbers.

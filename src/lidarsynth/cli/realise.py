@@ -18,7 +18,7 @@ def realise(
     seed: Seed = 0,
     device: Device = "cpu",
     intensity: Annotated[
-        Literal["auto", "unit", "percent", "byte", "uint16", "none"],
+        Literal["auto", "unit", "byte", "uint16", "none"],
         arg(help="scale of a bag's intensities, in which those that it gets are written; none: as they seem to be."),
     ] = "none",
     picture: Picture = True,

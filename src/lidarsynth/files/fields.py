@@ -45,8 +45,7 @@ NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found
     "label": ("label", "class", "scalar_label"),
 }
 
-# Intensity -> the value of reflectance 1; nothing in a scan tells percents from bytes.
-SCALES: dict[str, float] = {"unit": 1.0, "percent": 100.0, "byte": 255.0, "uint16": 65535.0}
+SCALES: dict[str, float] = {"unit": 1.0, "byte": 255.0, "uint16": 65535.0}  # intensity -> the value of reflectance 1
 INTENSITIES = ("auto", *SCALES, "none")
 WITHOUT = "--intensity none takes it for 0"  # ends what is said of a scan that could be read so
 
@@ -182,12 +181,12 @@ def _listed(fields: Fields) -> str:
 
 
 def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
-    """(N,) float32 in [0, 1] from finite intensities of 0-1 ("unit"), of 0-100, 0-255 or 0-65535 (as SCALES).
+    """(N,) float32 in [0, 1] from finite intensities of 0-1 ("unit"), 0-255 ("byte") or 0-65535 ("uint16").
 
     "auto": an 8-bit type is 0-255, other integers are 0-255 up to 255 and 0-65535 above; floats are 0-1 up to 1, 0-255
     up to 255, 0-65535 above, but that one in a thousand may be brighter than its scale, and most of fractions up to 2
-    are 0-1; what is above its scale is taken for the most there is. Percents, and floats so dark that none exceeds 1
-    of 255, are to be forced by hand. Raises FileError when the values do not fit the scale.
+    are 0-1; what is above its scale is taken for the most there is. A scan of floats so dark that no point exceeds 1 of
+    255 is the one case to force by hand. Raises FileError when the values do not fit the scale.
     """
     if not len(values):
         return np.zeros(0, np.float32)

@@ -83,7 +83,7 @@ def read_with_report(
     """The scan, and how many of the file's points were dropped: not finite, or (0, 0, 0) where nothing returned.
 
     A file that says of itself that it has no point gives a scan of none.
-    intensity  the file's scale: "unit" 0-1, "percent" 0-100, "byte" 0-255, "uint16" 0-65535, "auto" as the kind of file
+    intensity  the file's scale: "unit" 0-1, "byte" 0-255, "uint16" 0-65535, "auto" as the kind of file
                fixes it, else by type and range (`fields.reflectance_from`), "none" to read a file without intensity
                with reflectance 0
     labels     a SemanticKITTI `.label` file with one word per point of the file
