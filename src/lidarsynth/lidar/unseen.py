@@ -61,8 +61,8 @@ def filled_before(scan: Scan) -> str | None:
 def few_beams(xyz: np.ndarray, sensor: Sensor | None = None) -> str | None:
     """That points (N, 3) lie on so few beams that whatever is made of them is a guess, in one line; or None, as of a
     sensor that has no more."""
-    if not len(xyz) or (sensor is not None and sensor.height <= BEAMS + 1):
-        return None
+    if len(xyz) < SPARSE or (sensor is not None and sensor.height <= BEAMS + 1):
+        return None  # `caution` tells of fewer
     lift = np.array([0, 0, np.mean(sensor.offsets) if sensor is not None and sensor.offsets else 0], np.float32)
     tenth = (10 * (90 + elevations_of(xyz - lift))).astype(int)
     count, within = np.bincount(tenth, minlength=1801), 0
