@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from full_scan import full_scan, same
 
-from lidarsynth.files.formats import READERS, WRITERS, read, read_image, read_with_report, write
+from lidarsynth.data.folder import folder
+from lidarsynth.files.formats import READERS, WRITERS, left_out, read, read_image, read_with_report, write
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS
 
@@ -207,3 +208,11 @@ def test_what_no_type_of_ply_holds_stays_of_64_bits(value: int, tmp_path: Path):
     write(tmp_path / "a.ply", scan)
     assert properties(tmp_path / "a.ply")[-1] == ["int64", "of"]
     np.testing.assert_array_equal(read(tmp_path / "a.ply", intensity="none").extra["of"], scan.extra["of"])
+
+
+def test_a_file_whose_companions_names_would_be_too_long_is_read(tmp_path: Path):
+    path = tmp_path / ("x" * 250 + ".bin")
+    np.ones((3, 4), np.float32).tofile(path)
+    scan, dropped = read_with_report(path)
+    assert (len(scan), dropped, left_out(path, scan, dropped)) == (3, 0, [])
+    assert [frame.labels for frame in folder(tmp_path).frames] == [None]

@@ -38,7 +38,7 @@ def folder(
 
 
 def _frame(path: Path, root: Path) -> Frame:
-    labels = next((str(at) for at in (path.with_suffix(".label"), label_path(path)) if at.is_file()), None)
+    labels = next((str(at) for at in (path.with_suffix(".label"), label_path(path)) if os.path.isfile(at)), None)
     return Frame(str(path), path.parent.relative_to(root).as_posix(), path.name, labels)
 
 

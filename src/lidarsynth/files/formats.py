@@ -237,8 +237,8 @@ def _is_bare(path: str | Path) -> bool:
 
 def _marks_beside(path: Path, count: int) -> Fields:
     """Of a file of so many points, what `write` put beside it of a filled scan, where it has as many."""
-    marks = {name: path.with_suffix(f".{name}") for name in BESIDE}
-    fit = {n: p for n, p in marks.items() if p.is_file() and p.stat().st_size == count * BESIDE[n].itemsize > 0}
+    marks = {name: path.with_suffix(f".{name}") for name in BESIDE}  # a name may be too long for some
+    fit = {n: p for n, p in marks.items() if os.path.isfile(p) and p.stat().st_size == count * BESIDE[n].itemsize > 0}
     return {name: np.fromfile(place, BESIDE[name]) for name, place in fit.items()}
 
 
@@ -264,7 +264,7 @@ def marks_left_out(path: str | Path, scan: Scan, dropped: int) -> list[str]:
     lines, count = [], len(scan) + dropped
     for name, kind in BESIDE.items() if _is_bare(path) else ():
         marks = Path(path).with_suffix(f".{name}")
-        if marks.is_file() and name not in scan.extra:  # those that fit are read
+        if os.path.isfile(marks) and name not in scan.extra:  # those that fit are read
             lines.append(f"{marks.name} left out: expected {count * kind.itemsize} bytes for {count} points, "
                          f"found {marks.stat().st_size} bytes")  # fmt: skip
     return lines
