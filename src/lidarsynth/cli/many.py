@@ -311,7 +311,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     from lidarsynth.data.bag_writer import write_bag
     from lidarsynth.data.bags import is_bag
     from lidarsynth.verbs.batch import Work, run
-    from lidarsynth.verbs.output_files import looked_at
+    from lidarsynth.verbs.output_files import check_bag, looked_at
 
     if many.shard or many.skip_existing or len(paths) != 1 or not is_bag(paths[0]):
         raise ValueError(f"{out}: expected one bag to make another of, without --shard and --skip-existing; a folder "
@@ -320,10 +320,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         words = {"project": "range images", "insert": "boxes"}
         word = words.get(job.verb, f"--corrupt {job.corrupt}")
         raise ValueError(f"{out}: expected a file or folder for {word}, found a bag, which holds points")
-    if out.is_dir():
-        raise ValueError(f"{out}: expected the name of a bag to write, found a folder")
-    if out.exists() and out.samefile(paths[0]):
-        raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
+    check_bag(out, [paths[0], *([] if many.metadata is None else [many.metadata])])
     model, begun, results = _model(job), time.perf_counter(), []
     out.parent.mkdir(parents=True, exist_ok=True)
     topic, others = _topics(paths[0], many)

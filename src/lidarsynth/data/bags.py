@@ -12,6 +12,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from copy import copy
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -176,11 +177,30 @@ def _files_of(reader: Any) -> list[Any]:
 
 
 def _qualities(path: Path) -> dict[str, str]:
-    """Topic -> the quality of service that its publishers offered, in the words of the databases at `path`."""
-    found: dict[str, str] = {}
+    """Topic -> the quality of service that its publishers offered, in the words of the databases at `path`, or of the
+    metadata beside those that are compressed."""
+    found = _told_qualities(path / METADATA) if path.is_dir() else {}
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         with suppress(sqlite3.Error), closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as base:
             found |= dict(base.execute("SELECT name, offered_qos_profiles FROM topics"))
+    return found
+
+
+def _told_qualities(path: Path) -> dict[str, str]:
+    """The same of a metadata.yaml, which holds them as text, since its version 9 as a list; none of one that does not
+    tell."""
+    from ruamel.yaml import YAML, YAMLError
+
+    yaml, found = YAML(typ="safe"), dict[str, str]()
+    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError, YAMLError):
+        for one in yaml.load(path.read_text(encoding="utf-8"))[KEY.decode()]["topics_with_message_count"]:
+            name, told = one["topic_metadata"]["name"], one["topic_metadata"].get("offered_qos_profiles")
+            if isinstance(told, list):
+                text = StringIO()
+                yaml.dump(told, text)
+                told = text.getvalue().strip()
+            if told:
+                found[name] = told
     return found
 
 

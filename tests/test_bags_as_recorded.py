@@ -1,0 +1,71 @@
+"""Bags of ROS 2 in the parts that its recorder leaves: nothing of them is lost, and nothing is written among them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarsynth.cli.main import main
+from lidarsynth.data.bag_records import POINTS, Cloud, typestore
+from lidarsynth.data.bag_writer import message_of
+from lidarsynth.data.bags import open_bag
+
+pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
+CLOUD = Cloud(0, "lidar", 0, {axis: np.ones(3, np.float32) for axis in "xyz"})
+MADE = ["--model", "bilinear", "--sensor", "vlp-16"]
+
+
+def recorded(path: Path, storage: str = "MCAP", mode: str | None = None) -> Path:
+    """A ROS 2 bag of two clouds on a latched topic."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    ever = QosTime(2147483647, 4294967295)
+    own = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, ever, ever,
+              QosLiveliness.AUTOMATIC, ever, False)  # fmt: skip
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage])
+    if mode is not None:
+        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        points = writer.add_connection("/points", POINTS, typestore=typestore("cdr"), offered_qos_profiles=[own])
+        for time in (1, 2):
+            writer.write(points, time, message_of(CLOUD, "cdr"))
+    return path
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_the_quality_of_service_of_compressed_files_is_kept(storage: str, tmp_path: Path):
+    """Only the metadata beside them tell it, without unpacking."""
+    with open_bag(recorded(tmp_path / "drive", storage, "FILE")) as bag:
+        ((key, words),) = bag.topics[0].offered
+        assert [message.time for message in bag.messages()] == [1, 2]
+    assert key == "offered_qos_profiles" and words.startswith("- ") and "durability: transient_local" in words
+
+
+@pytest.mark.parametrize("name", ["drive.mcap", "dense.mcap"])
+def test_no_bag_is_written_among_the_parts_of_another(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """It would replace one, or become one more."""
+    folder = recorded(tmp_path / "drive")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(folder), "--out", str(folder / name), *MADE])
+    assert f"{name}: expected a place outside the bag {folder}" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_the_bag_that_holds_the_metadata_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Those of an Ouster lie in the first part of a split recording alone."""
+    from rosbags.rosbag1 import Writer
+
+    paths = tmp_path / "run_0.bag", tmp_path / "run_1.bag"
+    for path in paths:
+        with Writer(path) as writer:
+            kind = "ouster_ros/msg/PacketMsg"
+            packets = writer.add_connection("/ouster/lidar_packets", kind, typestore=typestore("ros1"))
+            writer.write(packets, 1, b"\xd0\x07\0\0" + bytes(2000))
+    before = paths[0].read_bytes()
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(paths[1]), "--metadata", str(paths[0]), "--out", str(paths[0]), *MADE])
+    assert "run_0.bag: expected a bag other than the one that is read" in capsys.readouterr().err
+    assert paths[0].read_bytes() == before
