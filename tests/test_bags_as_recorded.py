@@ -9,6 +9,8 @@ from lidarsynth.cli.main import main
 from lidarsynth.data.bag_records import POINTS, Cloud, typestore
 from lidarsynth.data.bag_writer import message_of
 from lidarsynth.data.bags import open_bag
+from lidarsynth.files.fields import FileError
+from lidarsynth.verbs.inputs import inputs_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
 pytest.importorskip("mcap", reason="mcap comes with the extra `ros`")
@@ -69,3 +71,31 @@ def test_the_bag_that_holds_the_metadata_is_not_replaced(tmp_path: Path, capsys:
         main(["complete", str(paths[1]), "--metadata", str(paths[0]), "--out", str(paths[0]), *MADE])
     assert "run_0.bag: expected a bag other than the one that is read" in capsys.readouterr().err
     assert paths[0].read_bytes() == before
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_a_killed_recording_may_have_compressed_its_first_files(
+    storage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """It leaves no metadata; the last file is not compressed yet."""
+    from zstandard import ZstdCompressor
+
+    (whole,) = (p for p in recorded(tmp_path / "drive", storage).iterdir() if p.suffix != ".yaml")
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    whole.rename(last := folder / f"run_1{whole.suffix}")
+    (folder / f"run_0{whole.suffix}.zstd").write_bytes(ZstdCompressor().compress(last.read_bytes()))
+    words = inputs_of([folder]).words
+    assert [item.name for item in inputs_of([folder]).stream()] == ["run_1/000000", "run_1/000001"]
+    assert words == (f"1 compressed bag was passed over: {folder}/run_0{whole.suffix}.zstd; unpack it (zstd -d) to "
+                     "read it",)  # fmt: skip
+    (folder / f"run_0{whole.suffix}").write_bytes(last.read_bytes())
+    assert not inputs_of([folder]).words
+
+
+def test_parts_of_which_some_are_compressed_are_refused(tmp_path: Path):
+    """Those that are not would be taken for all."""
+    folder = recorded(tmp_path / "drive", mode="FILE")
+    (folder / "drive_1.mcap").write_bytes(next(recorded(tmp_path / "other").glob("*.mcap")).read_bytes())
+    with pytest.raises(FileError, match=r"all packed, found drive\.mcap\.zstd beside drive_1\.mcap: unpack it"):
+        inputs_of([folder])

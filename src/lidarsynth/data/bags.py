@@ -27,6 +27,7 @@ from lidarsynth.lidar.small_file import check_regular
 
 METADATA, KEY = "metadata.yaml", b"rosbag2_bagfile_information"  # of a folder that is a ROS 2 bag, which it begins with
 LOOKED_AT = 4096  # bytes of it
+COMPRESSED = (".mcap.zstd", ".db3.zstd")  # by `ros2 bag record --compression-mode file`
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `rosbag record` leaves
 
 
@@ -46,6 +47,13 @@ def _tells_of_a_bag(path: Path) -> bool:
     return False
 
 
+def packed_bags(files: Iterable[str]) -> list[str]:
+    """Of the files of a folder those that ROS 2 has compressed as a whole, and that do not lie there unpacked, too."""
+    names = set(files)
+    packed = (name for name in names if name.lower().endswith(COMPRESSED))
+    return sorted(name for name in packed if name[: name.rindex(".")] not in names)
+
+
 @contextmanager
 def open_bag(path: str | Path) -> Iterator[Bag]:
     """A bag for reading. Raises FileError, in one line, for what is none, and where the extra `ros` is missing."""
@@ -54,6 +62,9 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         raise FileError(f"{path}: expected a bag, found nothing")
     check_packages()
     inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    if inside and (packed := packed_bags(entry.name for entry in path.iterdir())):
+        raise FileError(f"{path}: expected parts of a bag that are all unpacked, or all packed, found {packed[0]} "
+                        f"beside {inside[0].name}: unpack it (zstd -d)")  # fmt: skip
     for file in inside if path.is_dir() else [path]:
         try:
             check_regular(file)
