@@ -99,3 +99,22 @@ def test_parts_of_which_some_are_compressed_are_refused(tmp_path: Path):
     (folder / "drive_1.mcap").write_bytes(next(recorded(tmp_path / "other").glob("*.mcap")).read_bytes())
     with pytest.raises(FileError, match=r"all packed, found drive\.mcap\.zstd beside drive_1\.mcap: unpack it"):
         inputs_of([folder])
+
+
+@pytest.mark.parametrize("kind", ["SQLITE3", "MCAP", "bag"])
+def test_a_topic_on_which_nothing_was_said_is_none_to_choose(kind: str, tmp_path: Path):
+    """As of a node that was recorded (`ros2 bag record --all`) and had no listeners."""
+    from rosbags import rosbag1, rosbag2
+
+    path, ros = tmp_path / "drive.bag", "ros1" if kind == "bag" else "cdr"
+    if kind == "bag":
+        opened = rosbag1.Writer(path)
+    else:
+        path = tmp_path / "drive"
+        opened = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[kind])
+    with opened as writer:
+        writer.add_connection("/filtered", POINTS, typestore=typestore(ros))
+        points = writer.add_connection("/points", POINTS, typestore=typestore(ros))
+        writer.write(points, 1, message_of(CLOUD, ros))
+    with open_bag(path) as bag:
+        assert bag.point_topic() == "/points" and bag.point_topic("/filtered") == "/filtered"

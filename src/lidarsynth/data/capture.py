@@ -170,7 +170,7 @@ def _ip(frame: bytes, link: int) -> bytes:
         return frame[4:]
     place, at = COOKED.get(link, (12, 14))
     kind = frame[place : place + 2]
-    while kind in VLAN and link == ETHERNET:  # a tag each
+    while kind in VLAN:  # a tag each
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if kind == IPV4.to_bytes(2, "big") else b""
 
