@@ -18,7 +18,7 @@ CLOUD = Cloud(0, "lidar", 0, {axis: np.ones(3, np.float32) for axis in "xyz"})
 MADE = ["--model", "bilinear", "--sensor", "vlp-16"]
 
 
-def recorded(path: Path, storage: str = "MCAP", mode: str | None = None) -> Path:
+def recorded(path: Path, storage: str = "MCAP", mode: str | None = None, cloud: Cloud = CLOUD) -> Path:
     """A ROS 2 bag of two clouds on a latched topic."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -32,7 +32,7 @@ def recorded(path: Path, storage: str = "MCAP", mode: str | None = None) -> Path
     with writer:
         points = writer.add_connection("/points", POINTS, typestore=typestore("cdr"), offered_qos_profiles=[own])
         for time in (1, 2):
-            writer.write(points, time, message_of(CLOUD, "cdr"))
+            writer.write(points, time, message_of(cloud, "cdr"))
     return path
 
 
@@ -118,3 +118,23 @@ def test_a_topic_on_which_nothing_was_said_is_none_to_choose(kind: str, tmp_path
         writer.write(points, 1, message_of(CLOUD, ros))
     with open_bag(path) as bag:
         assert bag.point_topic() == "/points" and bag.point_topic("/filtered") == "/filtered"
+
+
+@pytest.mark.parametrize("kind", ["SQLITE3", "MCAP", "bag"])
+def test_completed_points_are_published_as_they_were(kind: str, tmp_path: Path):
+    around = np.radians(np.arange(0, 360, 0.5, dtype=np.float32))
+    scan = {"x": 9 * np.cos(around), "y": 9 * np.sin(around), "z": 0 * around, "intensity": 0 * around}
+    path, out = tmp_path / "drive", tmp_path / ("new.bag" if kind == "bag" else "new.mcap")
+    if kind == "bag":
+        from rosbags.rosbag1 import Writer
+
+        path = tmp_path / "drive.bag"
+        with Writer(path) as writer:
+            points = writer.add_connection("/points", POINTS, typestore=typestore("ros1"), callerid="/node", latching=1)
+            writer.write(points, 1, message_of(Cloud(0, "lidar", 0, scan), "ros1"))
+    else:
+        recorded(path, kind, cloud=Cloud(0, "lidar", 0, scan))
+    main(["complete", str(path), "--out", str(out), *MADE])
+    with open_bag(path) as before, open_bag(out) as after:
+        assert after.topics[0].offered == before.topics[0].offered
+        assert ("latching", "1") in after.topics[0].offered or "transient_local" in str(after.topics[0].offered)

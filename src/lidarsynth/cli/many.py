@@ -328,6 +328,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     taken: deque[Input] = deque()
     copied = []
     with write_bag(out, others) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
+        writer.publish_as(topic)
         if many.keep_topics:
             _copy(paths[0], writer, others)
         items = enumerate(_noted(inputs.stream(), taken))
@@ -335,8 +336,8 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         for result in run(replace(job, picture=False), stream, many.workers, model, on_step):
             item = taken.popleft()
             if result.cloud is not None:
-                writer.write_cloud(topic, result.cloud)
-            elif many.keep_topics and _copied(item, topic, writer):
+                writer.write_cloud(topic.name, result.cloud)
+            elif many.keep_topics and _copied(item, topic.name, writer):
                 copied.append(Path(result.name).name)
             results.append(replace(result, cloud=None))
             on_scan()
@@ -366,7 +367,7 @@ def _copied(item: Input, topic: str, writer: BagWriter) -> bool:
     return isinstance(message, Message) and message.topic.kind == POINTS and writer.copy_cloud(topic, message)
 
 
-def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
+def _topics(path: Path, many: Many) -> tuple[Topic, list[Topic]]:
     """The topic of points, of packets one of its own, and the others that are to be copied."""
     from lidarsynth.data.bag_records import OF_PACKETS
     from lidarsynth.data.bags import open_bag
@@ -374,8 +375,9 @@ def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
         kind = bag.kind_of(topic)
+        own = next(one for one in bag.topics if (one.name, one.kind) == (topic, kind))
         others = [one for one in bag.topics if (one.name, one.kind) != (topic, kind) or kind in OF_PACKETS]
-        named = f"{topic}/points" if kind in OF_PACKETS else topic
+        named = replace(own, name=f"{topic}/points") if kind in OF_PACKETS else own
         return named, others if many.keep_topics else []
 
 
