@@ -47,8 +47,14 @@ def test_fragments_that_come_in_any_order_make_a_packet(tmp_path: Path):
 
 
 def spun(azimuths: range, time: int = 0) -> list[Datagram]:
-    """A packet at each azimuth, all of one distance, at the times at which it is there."""
-    return [Datagram(time + round(a * PACE), 2368, velodyne_packet(0x22, a % 36000, STEP, 5000)) for a in azimuths]
+    """A packet at each azimuth, all of one distance, at the times at which it is there, by the sensor's clock, too."""
+    found = []
+    for azimuth in azimuths:
+        nanoseconds = time + round(azimuth * PACE)
+        payload = velodyne_packet(0x22, azimuth % 36000, STEP, 5000)
+        clock = struct.pack("<I", nanoseconds // 1000 % 3_600_000_000)
+        found.append(Datagram(nanoseconds, 2368, payload[:1200] + clock + payload[1204:]))
+    return found
 
 
 @pytest.mark.parametrize("turns", [1, 3])
@@ -71,3 +77,18 @@ def test_a_gap_of_less_than_a_turn_stays_in_its_turn():
     azimuths = [a for a in range(0, 4 * 36000, block) if not 36000 + 6000 < a < 36000 + 20000]
     found = list(velodyne.turns([packet for a in azimuths for packet in spun(range(a, a + 1))]))
     assert [len(turn["x"]) // 32 // 12 for turn in found] == pytest.approx([75, 46, 75, 75], abs=1)
+
+
+def test_packets_that_wait_on_the_way_end_no_turn():
+    """A computer that is busy gets those of a turn's time at once, with times of its own."""
+    block = 12 * STEP
+    packets = spun(range(0, 4 * 36000, block))
+    late = [packet._replace(time=max(packet.time, packets[190].time)) if at > 100 else packet
+            for at, packet in enumerate(packets)]  # fmt: skip
+    assert [len(turn["x"]) for turn in velodyne.turns(late)] == [len(turn["x"]) for turn in velodyne.turns(packets)]
+    assert len(list(velodyne.turns(packets))) == 4
+
+
+def test_a_new_hour_of_the_clock_ends_no_turn():
+    packets = spun(range(0, 4 * 36000, 12 * STEP), time=3_600 * 10**9 - 150_000_000)
+    assert [len(turn["x"]) // 32 // 12 for turn in velodyne.turns(packets)] == [75, 75, 75, 75]

@@ -21,6 +21,7 @@ TURN = 36000  # hundredths of a degree
 LATE = 2000  # of them: two packets of the fastest spin; what lies no farther back is late, and begins no turn
 A_TURN_LOST = 0.9 * TURN  # in time, beyond what the sensor has turned
 LOOKED_AT = 2000  # packets for the sector that a sensor is set to: more than a turn of any
+STRETCH = 50  # packets: a turn is some hundred
 REPEATED = 8  # packets that are looked through for the same one
 NAMES = ("x", "y", "z", "intensity", "ring", "time")
 
@@ -31,12 +32,14 @@ class Blocks(NamedTuple):
     belongs   whether a payload is one of its data packets
     check     raises FileError for one that belongs, and of which no returns can be made
     azimuths  hundredths of a degree of each block of one, clockwise seen from above, as the sensor turns
+    clock     nanoseconds of a packet: best the sensor's own, which knows of no delay on the way
     decode    (payload, nanoseconds of the packet) -> NAMES and `block`, each return's; goes to other processes
     """
 
     belongs: Callable[[bytes], bool]
     check: Callable[[bytes], object]
     azimuths: Callable[[bytes], np.ndarray]
+    clock: Callable[[Datagram], int]
     decode: Callable[[bytes, int], Fields]
 
 
@@ -67,11 +70,15 @@ def _seam(packets: list[Datagram], how: Blocks) -> int:
 
 
 def _pace(packets: list[Datagram], how: Blocks) -> float:
-    """Nanoseconds in which the sensor turns by a hundredth of a degree; 0 where the times do not tell."""
+    """Nanoseconds in which the sensor turns by a hundredth of a degree: the median of stretches, as packets may come in
+    bursts, and some are lost; 0 where the times do not tell."""
     steps = np.diff([int(how.azimuths(packet.payload)[0]) for packet in packets]) % TURN
-    times = np.diff([packet.time for packet in packets])
-    onward = (steps > 0) & (steps < LATE) & (times > 0)
-    return float(np.median(times[onward] / steps[onward])) if onward.any() else 0.0
+    times = np.diff([how.clock(packet) for packet in packets])
+    onward = (steps > 0) & (steps < LATE) & (times >= 0)
+    parts = np.arange(0, onward.sum(), STRETCH)
+    if not len(parts):
+        return 0.0
+    return float(np.median(np.add.reduceat(times[onward], parts) / np.add.reduceat(steps[onward], parts)))
 
 
 _Piece = tuple[Datagram, int, int]  # a packet, the first of its blocks that are meant, and the one after the last
@@ -91,11 +98,12 @@ def _parts(packets: Iterable[Datagram], how: Blocks, seam: int, pace: float) -> 
         recent.append(packet.payload)
         how.check(packet.payload)
         azimuth = (how.azimuths(packet.payload).astype(int) - seam) % TURN
+        time = how.clock(packet)
         for first, end in _runs(azimuth):
             start = int(azimuth[first])
             late = last is not None and 0 < (last - start) % TURN < LATE
             step = 0 if late or last is None else (start - last) % TURN
-            lost = last is not None and pace > 0 and packet.time - came > pace * (step + A_TURN_LOST)
+            lost = last is not None and pace > 0 and time - came > pace * (step + A_TURN_LOST)
             late = late and not lost
             if last is None:
                 begun = start
@@ -107,7 +115,7 @@ def _parts(packets: Iterable[Datagram], how: Blocks, seam: int, pace: float) -> 
             own = before if before and last is not None and late and start > last else pieces
             own.append((packet, first, end))
             if not late:
-                last, came = int(azimuth[end - 1]), packet.time
+                last, came = int(azimuth[end - 1]), time
                 swept = last - begun
     for share, held in ((ended, before), (swept, pieces)):
         if held:
