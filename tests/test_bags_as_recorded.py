@@ -138,3 +138,15 @@ def test_completed_points_are_published_as_they_were(kind: str, tmp_path: Path):
     with open_bag(path) as before, open_bag(out) as after:
         assert after.topics[0].offered == before.topics[0].offered
         assert ("latching", "1") in after.topics[0].offered or "transient_local" in str(after.topics[0].offered)
+
+
+def test_what_a_killed_run_left_of_a_bag_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """As large as a drive, and hidden; another run may be at work on it, so that it stays."""
+    path, left = recorded(tmp_path / "drive"), tmp_path / ".new [1].0123456789abcdef.part"
+    left.write_bytes(b"part")
+    (tmp_path / ".new [1].part").write_bytes(b"of others")
+    with pytest.raises(SystemExit, match="2"):
+        main(["complete", str(path), "--out", str(tmp_path / "new [1].mcap"), *MADE])
+    told = [line for line in capsys.readouterr().err.splitlines() if ".part" in line]
+    assert told == [f"lidarsynth: {left}: of a run that was killed; remove it, unless one is at work there"]
+    assert left.exists()

@@ -310,6 +310,7 @@ def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:
 def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many) -> list[Result]:
     from lidarsynth.data.bag_writer import write_bag
     from lidarsynth.data.bags import is_bag
+    from lidarsynth.lidar.whole_file import unfinished
     from lidarsynth.verbs.batch import Work, run
     from lidarsynth.verbs.output_files import check_bag, looked_at
 
@@ -321,6 +322,8 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         word = words.get(job.verb, f"--corrupt {job.corrupt}")
         raise ValueError(f"{out}: expected a file or folder for {word}, found a bag, which holds points")
     check_bag(out, [paths[0], *([] if many.metadata is None else [many.metadata])])
+    for left in unfinished(out):
+        warn(f"{left}: of a run that was killed; remove it, unless one is at work there")
     model, begun, results = _model(job), time.perf_counter(), []
     out.parent.mkdir(parents=True, exist_ok=True)
     topic, others = _topics(paths[0], many)
