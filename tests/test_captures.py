@@ -60,6 +60,7 @@ def test_payloads_of_a_capture(kind: str, tmp_path: Path):
 
 @pytest.mark.parametrize(("link", "head"), [
     (113, b"\0" * 14 + b"\x08\0"), (276, b"\x08\0" + b"\0" * 18), (101, b""), (0, b"\2\0\0\0"),
+    (113, b"\0" * 14 + b"\x81\0\0\5\x08\0"), (276, b"\x81\0" + b"\0" * 18 + b"\0\5\x08\0"),
 ])  # fmt: skip
 def test_captures_of_other_link_layers(link: int, head: bytes, tmp_path: Path):
     """As of `tcpdump -i any`, which writes another one since its version 4.99."""

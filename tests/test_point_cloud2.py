@@ -92,7 +92,7 @@ def test_rows_of_an_organised_cloud_become_rings():
 
 
 def test_encoding_is_the_inverse():
-    values = columns({"x": "f4", "y": "f4", "z": "f4", "ring": "u2", "time": "f8", "new": "u1"}, 20)
+    values = columns({"x": "f4", "y": "f4", "z": "f4", "ring": "u2", "time": "f8", "new": "u1", "": "f4"}, 20)
     values["flag"] = np.arange(20) % 2 == 0
     layout = encode(values)
     message = Message([Field(*place) for place in layout.fields], layout.point_step, layout.data, 20)

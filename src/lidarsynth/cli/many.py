@@ -310,8 +310,9 @@ def _again(first: Any, rest: Iterator[Any]) -> Iterator[Any]:
 def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many) -> list[Result]:
     from lidarsynth.data.bag_writer import write_bag
     from lidarsynth.data.bags import is_bag
+    from lidarsynth.lidar.whole_file import unfinished
     from lidarsynth.verbs.batch import Work, run
-    from lidarsynth.verbs.output_files import looked_at
+    from lidarsynth.verbs.output_files import check_bag, looked_at
 
     if many.shard or many.skip_existing or len(paths) != 1 or not is_bag(paths[0]):
         raise ValueError(f"{out}: expected one bag to make another of, without --shard and --skip-existing; a folder "
@@ -320,10 +321,9 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         words = {"project": "range images", "insert": "boxes"}
         word = words.get(job.verb, f"--corrupt {job.corrupt}")
         raise ValueError(f"{out}: expected a file or folder for {word}, found a bag, which holds points")
-    if out.is_dir():
-        raise ValueError(f"{out}: expected the name of a bag to write, found a folder")
-    if out.exists() and out.samefile(paths[0]):
-        raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
+    check_bag(out, [paths[0], *([] if many.metadata is None else [many.metadata])])
+    for left in unfinished(out):
+        warn(f"{left}: of a run that was killed; remove it, unless one is at work there")
     model, begun, results = _model(job), time.perf_counter(), []
     out.parent.mkdir(parents=True, exist_ok=True)
     topic, others = _topics(paths[0], many)
@@ -331,6 +331,7 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
     taken: deque[Input] = deque()
     copied = []
     with write_bag(out, others) as writer, scan_bar(job.verb, inputs.count, calls) as (on_scan, on_step):
+        writer.publish_as(topic)
         if many.keep_topics:
             _copy(paths[0], writer, others)
         items = enumerate(_noted(inputs.stream(), taken))
@@ -338,8 +339,8 @@ def _into_bag(job: Job, inputs: Inputs, paths: list[Path], out: Path, many: Many
         for result in run(replace(job, picture=False), stream, many.workers, model, on_step):
             item = taken.popleft()
             if result.cloud is not None:
-                writer.write_cloud(topic, result.cloud)
-            elif many.keep_topics and _copied(item, topic, writer):
+                writer.write_cloud(topic.name, result.cloud)
+            elif many.keep_topics and _copied(item, topic.name, writer):
                 copied.append(Path(result.name).name)
             results.append(replace(result, cloud=None))
             on_scan()
@@ -369,7 +370,7 @@ def _copied(item: Input, topic: str, writer: BagWriter) -> bool:
     return isinstance(message, Message) and message.topic.kind == POINTS and writer.copy_cloud(topic, message)
 
 
-def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
+def _topics(path: Path, many: Many) -> tuple[Topic, list[Topic]]:
     """The topic of points, of packets one of its own, and the others that are to be copied."""
     from lidarsynth.data.bag_records import OF_PACKETS
     from lidarsynth.data.bags import open_bag
@@ -377,8 +378,9 @@ def _topics(path: Path, many: Many) -> tuple[str, list[Topic]]:
     with open_bag(path) as bag:
         topic = bag.point_topic(many.topic)
         kind = bag.kind_of(topic)
+        own = next(one for one in bag.topics if (one.name, one.kind) == (topic, kind))
         others = [one for one in bag.topics if (one.name, one.kind) != (topic, kind) or kind in OF_PACKETS]
-        named = f"{topic}/points" if kind in OF_PACKETS else topic
+        named = replace(own, name=f"{topic}/points") if kind in OF_PACKETS else own
         return named, others if many.keep_topics else []
 
 

@@ -232,13 +232,17 @@ class Bag:
                 yield FileError(f"{self.path}: {topic}: {error}")
 
     def point_topic(self, name: str | None = None) -> str:
-        """The topic named, or the only one of points, else of packets. Raises ValueError that lists those there are."""
+        """The topic named, or the only one of points, else of packets; of several the only one that has messages.
+        Raises ValueError that lists those there are."""
         clouds = list(dict.fromkeys(topic.name for topic in self.topics if topic.kind == POINTS))
         packets = [topic.name for topic in self.topics if self._of_lidar(topic)]
         clouds = [*clouds, *packets] if name in packets or not clouds else clouds
         listed = ", ".join(clouds) or "none; it holds " + (
             ", ".join(sorted({t.kind for t in self.topics})) or "nothing"
         )
+        if name is None and len(clouds) > 1:
+            full = [one for one in clouds if any(topic.count for topic in self.topics if topic.name == one)]
+            clouds = full if len(full) == 1 else clouds
         if name is None and len(clouds) == 1:
             return clouds[0]
         if name is None:

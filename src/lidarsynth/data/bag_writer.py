@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -52,6 +52,11 @@ class BagWriter:
         with _telling(self.path):
             self.put(message._replace(topic=self._topic(topic)))
         return True
+
+    def publish_as(self, topic: Topic) -> None:
+        """Clouds on a topic of this name are to be published as it was (`Topic.offered`), in a bag of the same ROS."""
+        if (topic.kind, topic.encoding) == (POINTS, self.encoding):
+            self.topics[topic.name] = replace(points_topic(topic.name, self.encoding), offered=topic.offered)
 
     def _topic(self, name: str) -> Topic:
         if name not in self.topics:

@@ -12,6 +12,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from copy import copy
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -26,6 +27,7 @@ from lidarsynth.lidar.small_file import check_regular
 
 METADATA, KEY = "metadata.yaml", b"rosbag2_bagfile_information"  # of a folder that is a ROS 2 bag, which it begins with
 LOOKED_AT = 4096  # bytes of it
+COMPRESSED = (".mcap.zstd", ".db3.zstd")  # by `ros2 bag record --compression-mode file`
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")  # active: what a killed `rosbag record` leaves
 
 
@@ -45,6 +47,13 @@ def _tells_of_a_bag(path: Path) -> bool:
     return False
 
 
+def packed_bags(files: Iterable[str]) -> list[str]:
+    """Of the files of a folder those that ROS 2 has compressed as a whole, and that do not lie there unpacked, too."""
+    names = set(files)
+    packed = (name for name in names if name.lower().endswith(COMPRESSED))
+    return sorted(name for name in packed if name[: name.rindex(".")] not in names)
+
+
 @contextmanager
 def open_bag(path: str | Path) -> Iterator[Bag]:
     """A bag for reading. Raises FileError, in one line, for what is none, and where the extra `ros` is missing."""
@@ -53,6 +62,9 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         raise FileError(f"{path}: expected a bag, found nothing")
     check_packages()
     inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    if inside and (packed := packed_bags(entry.name for entry in path.iterdir())):
+        raise FileError(f"{path}: expected parts of a bag that are all unpacked, or all packed, found {packed[0]} "
+                        f"beside {inside[0].name}: unpack it (zstd -d)")  # fmt: skip
     for file in inside if path.is_dir() else [path]:
         try:
             check_regular(file)
@@ -176,11 +188,30 @@ def _files_of(reader: Any) -> list[Any]:
 
 
 def _qualities(path: Path) -> dict[str, str]:
-    """Topic -> the quality of service that its publishers offered, in the words of the databases at `path`."""
-    found: dict[str, str] = {}
+    """Topic -> the quality of service that its publishers offered, in the words of the databases at `path`, or of the
+    metadata beside those that are compressed."""
+    found = _told_qualities(path / METADATA) if path.is_dir() else {}
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         with suppress(sqlite3.Error), closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as base:
             found |= dict(base.execute("SELECT name, offered_qos_profiles FROM topics"))
+    return found
+
+
+def _told_qualities(path: Path) -> dict[str, str]:
+    """The same of a metadata.yaml, which holds them as text, since its version 9 as a list; none of one that does not
+    tell."""
+    from ruamel.yaml import YAML, YAMLError
+
+    yaml, found = YAML(typ="safe"), dict[str, str]()
+    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError, YAMLError):
+        for one in yaml.load(path.read_text(encoding="utf-8"))[KEY.decode()]["topics_with_message_count"]:
+            name, told = one["topic_metadata"]["name"], one["topic_metadata"].get("offered_qos_profiles")
+            if isinstance(told, list):
+                text = StringIO()
+                yaml.dump(told, text)
+                told = text.getvalue().strip()
+            if told:
+                found[name] = told
     return found
 
 

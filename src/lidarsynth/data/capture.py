@@ -18,10 +18,18 @@ NEXT_GENERATION = b"\x0a\x0d\x0d\x0a"
 INTERFACE, SIMPLE, ENHANCED = 1, 3, 6  # kinds of blocks of pcapng (draft-ietf-opsawg-pcapng)
 RESOLUTION, OFFSET = 9, 14  # if_tsresol and if_tsoffset, options of an interface
 MAX_RECORD = 1 << 18
+PATIENCE = 10**9  # nanoseconds that fragments wait for others: their number comes again after 65,536 packets
 ETHERNET, RAW_IP, LOOPBACK = 1, (12, 101, 228), 0  # link types (the tcpdump group's list)
 COOKED = {113: (14, 16), 276: (0, 20)}  # `tcpdump -i any`, before 4.99.0 and since: where kind and packet are
 IPV4, UDP = 0x0800, 17
 VLAN = (b"\x81\x00", b"\x88\xa8", b"\x91\x00")  # IEEE 802.1Q, 802.1ad, and what came before it
+
+
+class _Waiting(NamedTuple):
+    """Fragments of a packet by their places, -1 its length as four bytes, and when the first of them came."""
+
+    since: int
+    parts: dict[int, bytes]
 
 
 class Datagram(NamedTuple):
@@ -54,7 +62,7 @@ def datagrams(path: str | Path) -> Iterator[Datagram]:
     packets before it, where a record is longer than any packet.
     """
     path = Path(path)
-    fragments: dict[bytes, dict[int, bytes]] = {}
+    fragments: dict[bytes, _Waiting] = {}
     with _open(path) as file:
         start = file.read(4)
         if start == NEXT_GENERATION:
@@ -64,7 +72,7 @@ def datagrams(path: str | Path) -> Iterator[Datagram]:
         else:
             raise FileError(f"{path}: expected a capture (pcap or pcapng), found a file that begins with {start!r}")
         for time, link, frame in frames:
-            if (found := _udp(_ip(frame, link), fragments)) is not None:
+            if (found := _udp(_ip(frame, link), time, fragments)) is not None:
                 yield Datagram(time, *found)
 
 
@@ -162,12 +170,12 @@ def _ip(frame: bytes, link: int) -> bytes:
         return frame[4:]
     place, at = COOKED.get(link, (12, 14))
     kind = frame[place : place + 2]
-    while kind in VLAN and link == ETHERNET:  # a tag each
+    while kind in VLAN:  # a tag each
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if kind == IPV4.to_bytes(2, "big") else b""
 
 
-def _udp(packet: bytes, fragments: dict[bytes, dict[int, bytes]]) -> tuple[int, bytes, str] | None:
+def _udp(packet: bytes, time: int, fragments: dict[bytes, _Waiting]) -> tuple[int, bytes, str] | None:
     """(destination port, payload, sender's address) once a UDP packet is whole; `fragments` keeps what waits."""
     if len(packet) < 20 or packet[0] >> 4 != 4 or packet[9] != UDP:
         return None
@@ -176,24 +184,29 @@ def _udp(packet: bytes, fragments: dict[bytes, dict[int, bytes]]) -> tuple[int, 
     place = int.from_bytes(packet[6:8], "big")
     offset, more = (place & 0x1FFF) * 8, bool(place & 0x2000)
     if more or offset:
-        body = _joined(packet[4:6] + packet[12:20], offset, more, body, fragments)
+        body = _joined(packet[4:6] + packet[12:20], time, offset, more, body, fragments)
     if len(body) < 8:
         return None
     return int.from_bytes(body[2:4], "big"), body[8:], ".".join(map(str, packet[12:16]))
 
 
-def _joined(key: bytes, offset: int, more: bool, body: bytes, fragments: dict[bytes, dict[int, bytes]]) -> bytes:
-    """The whole packet when its last missing fragment has come, else nothing."""
-    waiting = fragments.setdefault(key, {})
-    waiting[offset] = body
+def _joined(key: bytes, time: int, offset: int, more: bool, body: bytes, fragments: dict[bytes, _Waiting]) -> bytes:
+    """The whole packet when its last missing fragment has come, else nothing. Those of an earlier packet of the same
+    number, which lost one, are given up."""
+    waiting = fragments.get(key)
+    if waiting is None or abs(time - waiting.since) > PATIENCE or waiting.parts.get(offset, body) != body:
+        fragments.pop(key, None)
+        waiting = fragments[key] = _Waiting(time, {})
+    parts = waiting.parts
+    parts[offset] = body
     if not more:
-        waiting[-1] = (offset + len(body)).to_bytes(4, "big")
+        parts[-1] = (offset + len(body)).to_bytes(4, "big")
     if len(fragments) > 64:  # packets that lost a fragment
         del fragments[next(iter(fragments))]
-    if -1 not in waiting:
+    if -1 not in parts:
         return b""
-    whole = b"".join(waiting[at] for at in sorted(waiting) if at >= 0)
-    if len(whole) < int.from_bytes(waiting[-1], "big"):
+    whole = b"".join(parts[at] for at in sorted(parts) if at >= 0)
+    if len(whole) < int.from_bytes(parts[-1], "big"):
         return b""
     fragments.pop(key, None)
     return whole

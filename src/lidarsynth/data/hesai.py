@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -151,7 +152,8 @@ def angles_for(layout: Layout, path: Path, metadata: Path | None) -> Angles:
 
 
 def _blocks(layout: Layout, angles: Angles) -> Blocks:
-    return Blocks(layout.fits, partial(_unit, layout), partial(_azimuths, layout), partial(decode, layout, angles))
+    how = partial(_unit, layout), partial(_azimuths, layout), attrgetter("time"), partial(decode, layout, angles)
+    return Blocks(layout.fits, *how)
 
 
 def _azimuths(layout: Layout, payload: bytes) -> np.ndarray:

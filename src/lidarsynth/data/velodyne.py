@@ -107,6 +107,11 @@ def _azimuths(payload: bytes) -> np.ndarray:
     return np.frombuffer(payload, BLOCK, 12)["azimuth"]
 
 
+def _clock(packet: Datagram) -> int:
+    """Nanoseconds since the hour, of the sensor, which begins anew with it."""
+    return int.from_bytes(packet.payload[1200:1204], "little") * 1000
+
+
 def _returns_of(payload: bytes, time: int) -> Fields:
     return decode(payload, time)[0]
 
@@ -173,4 +178,4 @@ def _points(model: Model, laser: np.ndarray, azimuth: np.ndarray, distance: np.n
     return sweeps.points(distance, np.array(model.elevations)[laser], angle, height)
 
 
-BLOCKS = Blocks(is_velodyne, _model, _azimuths, _returns_of)
+BLOCKS = Blocks(is_velodyne, _model, _azimuths, _clock, _returns_of)

@@ -112,12 +112,14 @@ def _dtype(fields: Sequence[PointField], step: int, order: str) -> np.dtype:
 def encode(fields: Mapping[str, np.ndarray]) -> Layout:
     """Columns (N,) of one length as packed little-endian points; types that the message lacks become float64."""
     columns = {name: _storable(column) for name, column in fields.items()}
-    dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    kinds = [column.dtype.newbyteorder("<") for column in columns.values()]
+    dtype = np.dtype([(f"f{i}", kind) for i, kind in enumerate(kinds)])  # numpy gives one without a name its own
     table = np.empty(len(next(iter(columns.values()))), dtype)
-    for name, column in columns.items():
+    for name, column in zip(dtype.names or (), columns.values(), strict=True):
         table[name] = column
-    places = dtype.fields or {}
-    described = [(name, int(places[name][1]), DATATYPE_OF[columns[name].dtype.str[1:]]) for name in columns]
+    places = np.cumsum([0, *(kind.itemsize for kind in kinds)])
+    described = [(name, int(at), DATATYPE_OF[column.dtype.str[1:]])
+                 for (name, column), at in zip(columns.items(), places[:-1], strict=True)]  # fmt: skip
     return Layout(described, dtype.itemsize, np.frombuffer(table.tobytes(), np.uint8))
 
 

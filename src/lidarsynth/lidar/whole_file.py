@@ -9,6 +9,7 @@ import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 
 
@@ -42,6 +43,12 @@ def write_whole(path: str | Path, content: str | bytes | memoryview) -> None:
 
 
 TOKEN = "[0-9a-f]" * 16  # what `whole_file` puts into a name, as a pattern
+
+
+def unfinished(path: str | Path) -> list[Path]:
+    """What killed processes, or one at work, left beside a file that they wrote with `whole_file`."""
+    path = Path(path)
+    return sorted(path.parent.glob(f".{escape(path.stem[:64])}.{TOKEN}.part"))
 
 
 def sweep(folder: str | Path, deep: bool = False, token: str = "*") -> None:

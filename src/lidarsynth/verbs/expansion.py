@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
 
-from lidarsynth.data.bags import is_bag
+from lidarsynth.data.bags import is_bag, packed_bags
 from lidarsynth.data.cache_files import cache_files
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import by_number, scan_files, scans_below, stem, walk
@@ -33,6 +33,15 @@ def streams_below(folder: Path) -> list[Path]:
         bags = {name for name in folders if is_bag(here / name)}
         folders[:] = [name for name in folders if name not in bags]
         found += filter(is_stream, (here / name for name in (*bags, *files)))
+    return sorted(found, key=by_number)
+
+
+def packed_below(folder: Path) -> list[Path]:
+    """The compressed bags under a folder that no metadata beside them tells of, as of a recording that was killed."""
+    found: list[Path] = []
+    for here, folders, files in walk(folder):
+        folders[:] = [name for name in folders if not is_bag(here / name)]
+        found += [here / name for name in packed_bags(files)]
     return sorted(found, key=by_number)
 
 

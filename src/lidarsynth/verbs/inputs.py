@@ -27,11 +27,19 @@ from lidarsynth.files.formats import left_out, read_with_report, sensor_in
 from lidarsynth.files.labels import label_path
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
-from lidarsynth.lidar.plural import was
+from lidarsynth.lidar.plural import plural, was
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.verbs.earlier_results import earlier_results
-from lidarsynth.verbs.expansion import all_expanded, is_folder, is_stream, scan_names, stream_folders, streams_below
+from lidarsynth.verbs.expansion import (
+    all_expanded,
+    is_folder,
+    is_stream,
+    packed_below,
+    scan_names,
+    stream_folders,
+    streams_below,
+)
 
 NAMED = 5  # bags and captures that are passed over
 OF_METADATA = "expected a capture, or a bag of an Ouster's packets, for --metadata"
@@ -181,7 +189,7 @@ class Inputs:
     streams  whether bags or captures are among them
     passed   bags and captures in a folder of scan files, which alone are read
     below    scans below the output folder that are not read, though no report there tells of them
-    cut      what is to be said, a line each, of bags that end early
+    cut      what is to be said, a line each, of bags that end early, or are compressed and not read
     places   where the result of each file belongs below the output folder, without an ending, and in which folder there
              those of each bag or capture
     """
@@ -222,7 +230,7 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     single = len(files) == 1 and not streams and not (len(paths) == 1 and is_folder(paths[0]))
     count: int | None = len(files)
     folders = stream_folders(streams)
-    cut: list[str] = []
+    cut = [words for folder in filter(is_folder, paths) if (words := _packed_words(packed_below(folder)))]
     packets = False
     for path in streams:
         try:
@@ -249,6 +257,13 @@ def inputs_of(paths: Sequence[Path], reading: Reading | None = None, out: Path |
     inside = [p for folder in filter(is_folder, paths) for p in streams_below(folder) if p not in streams]
     places = {item.path: item.name for item in files} | folders
     return Inputs(single, count, stream, bool(streams), tuple(inside), tuple(dict.fromkeys(cut)), below, places)
+
+
+def _packed_words(packed: Sequence[Path]) -> str:
+    """What is said of compressed bags that are not read, in one line; nothing of none."""
+    named = ", ".join(map(str, packed[:NAMED])) + (", ..." if packed[NAMED:] else "")
+    them, count = "them" if packed[1:] else "it", plural(len(packed), "compressed bag")
+    return f"{count} {was(len(packed))} passed over: {named}; unpack {them} (zstd -d) to read {them}" if packed else ""
 
 
 def _stream_count(path: Path, reading: Reading, cut: list[str]) -> tuple[int | None, bool]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from lidarsynth.data.bag_writer import FORMATS
+from lidarsynth.data.bags import is_bag
 from lidarsynth.files.formats import READERS, WRITERS
 from lidarsynth.verbs.batch import EVERY, FIRST, Work
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
@@ -84,3 +85,15 @@ def target(out: Path, source: Path) -> Path:
             f"{out}: expected a writable folder, found {'a file' if parent.is_file() else 'no right'} at {parent}"
         )
     return out
+
+
+def check_bag(out: Path, read: Sequence[Path]) -> None:
+    """Raises ValueError where a new bag `out` would be a folder, one of the files that are `read`, or lie among the
+    parts of a bag of ROS 2, of which it would become one."""
+    if out.is_dir():
+        raise ValueError(f"{out}: expected the name of a bag to write, found a folder")
+    if out.exists() and any(path.exists() and out.samefile(path) for path in read):
+        raise ValueError(f"{out}: expected a bag other than the one that is read, found the same")
+    if out.suffix.lower() == ".mcap" and is_bag(out.parent):
+        raise ValueError(f"{out}: expected a place outside the bag {out.parent}, whose parts are read as one, found "
+                         "one in it")  # fmt: skip
