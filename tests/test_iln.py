@@ -200,6 +200,7 @@ def test_official_checkpoints_load(fixture_tensors, network_of):
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of modules that torch.compile brings
+@pytest.mark.filterwarnings("ignore:Guards may run slower:RuntimeWarning")  # on Python 3.13.0
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
 def test_convolutions_can_be_compiled_for_training():
     """Torch 2.13 expects another layout of the gradient of its own padding that repeats rows."""
