@@ -226,7 +226,7 @@ def test_bad_arrays_are_told_by_the_library():
         ls.get_sensor("vlp-16").denser(2.5)  # type: ignore[arg-type]
 
 
-@pytest.mark.filterwarnings("ignore:expected a turn of a sensor", "ignore:expected points on many beams")
+@pytest.mark.filterwarnings("ignore:expected a turn of a sensor")
 def test_what_python_lacks_is_asked_for_by_its_name_there():
     few, model = Scan(np.ones((50, 3), np.float32)), ls.load("default").into("vlp-16")
     with pytest.raises(ValueError, match=r"^expected at least 100 points.*: name it with --from, or sensor_in$"):

@@ -115,8 +115,7 @@ def test_confidences_none_of_which_is_a_number_are_told(tmp_path: Path):
     assert "confidence" not in blocks
     lost["confidence"][2] = 1
     header, blocks = unpacked(packed(Shown(Scan(np.ones((5, 3), np.float32), extra=lost))))
-    assert header["notes"] == ["confidence is no number at 4 points; shown as 0"]
-    assert blocks["confidence"].tolist() == [0, 0, 255, 0, 0]
+    assert header["notes"] == [] and blocks["confidence"].tolist() == [0, 0, 255, 0, 0]
 
 
 def test_points_of_which_nobody_says_whether_they_are_new_are_told():
@@ -124,21 +123,6 @@ def test_points_of_which_nobody_says_whether_they_are_new_are_told():
     header, blocks = unpacked(packed(Shown(Scan(np.ones((5, 3), np.float32), extra=lost))))
     assert header["notes"] == ["new is no number at 1 point; shown as measured"]
     assert blocks["new"].tolist() == [0, 1, 0, 1, 0]
-
-
-def test_a_reflectance_of_0_everywhere_is_told_but_where_none_was_asked_for(tmp_path: Path):
-    scan = turn()
-    write(tmp_path / "dark.bin", Scan(scan.xyz))
-    for intensity, told in (("auto", ("reflectance left out: it is 0 everywhere",)), ("none", ())):
-        assert series_of([tmp_path / "dark.bin"], Reading(intensity))[0].notes == told
-
-
-def test_a_message_whose_reflectance_is_0_everywhere_says_so(tmp_path: Path):
-    pytest.importorskip("rosbags", reason="lidarsynth[ros] is not installed")
-    fields = {axis: turn().xyz[:, k].copy() for k, axis in enumerate("xyz")}
-    with write_bag(tmp_path / "a.mcap") as writer:
-        writer.write_cloud("/points", Cloud(1, "lidar", 1, fields | {"intensity": np.zeros_like(fields["x"])}))
-    assert series_of([tmp_path / "a.mcap"], Reading())[0].notes == ("reflectance left out: it is 0 everywhere",)
 
 
 def test_several_paths_are_as_many_scans_as_they_hold(tmp_path: Path):
@@ -232,8 +216,7 @@ def test_what_does_not_fit_is_left_out_and_said(boxes: str, told: str, tmp_path:
 
 def test_marks_of_points_without_a_return_go_with_them_unsaid(tmp_path: Path):
     scan, path = turn(), tmp_path / "a.bin"
-    points = np.concatenate([np.zeros((2, 3), np.float32), scan.xyz])
-    write(path, Scan(points, np.full(len(points), 0.5, np.float32)))
+    write(path, Scan(np.concatenate([np.zeros((2, 3), np.float32), scan.xyz])))
     new = np.arange(len(scan) + 2) % 2
     path.with_suffix(".new").write_bytes(new.astype("u1").tobytes())
     shown = read_shown(path)

@@ -11,7 +11,6 @@ from lidarsynth.data.folder import stem
 from lidarsynth.files.fields import WITHOUT, FileError, dropped_points
 from lidarsynth.files.formats import left_out, read_with_report
 from lidarsynth.files.labels import read_labels
-from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.verbs.viewpoint import viewpoint_note
 from lidarsynth.viewer.packing import Shown
@@ -46,12 +45,6 @@ def without_reflectance(error: FileError) -> str:
     return f"reflectance left out: {error}".removesuffix(f"; {WITHOUT}")
 
 
-def all_dark(scan: Scan, intensity: str) -> tuple[str, ...]:
-    """The note of a scan whose reflectance says nothing, where it was asked for."""
-    dark = intensity != "none" and len(scan) and not scan.reflectance.any()
-    return ("reflectance left out: it is 0 everywhere",) if dark else ()
-
-
 def _shown(path: Path, intensity: str, rings: tuple[int, int] | None) -> Shown:
     labels = next((p for p in _label_places(path) if p.is_file()), None)
     notes: list[str] = []
@@ -67,7 +60,7 @@ def _shown(path: Path, intensity: str, rings: tuple[int, int] | None) -> Shown:
         notes.append(dropped_points(dropped))
     if (placed := viewpoint_note(path)) is not None:
         notes.append(placed)
-    notes += [*left_out(path, scan, dropped), *all_dark(scan, intensity)]
+    notes += left_out(path, scan, dropped)
     try:
         boxes = next((found for p in _box_places(path) if (found := _boxes(p)) is not None), [])
     except ValueError as error:

@@ -104,14 +104,10 @@ def _confidence_left_out(scan: Scan) -> list[str]:
 
 
 def _no_numbers(scan: Scan) -> list[str]:
-    """What is to be said of points whose `new` or confidence is no number, though others' are, a line each."""
-    notes = []
-    for name, shown in (("new", "measured"), ("confidence", "0")):
-        values = scan.extra.get(name)
-        lost = 0 if values is None else len(values) - int(np.isfinite(values).sum())
-        if lost and (name == "new" or lost < len(scan)):
-            notes.append(f"{name} is no number at {plural(lost, 'point')}; shown as {shown}")
-    return notes
+    """What is to be said of points whose `new` is no number."""
+    new = scan.extra.get("new")
+    lost = 0 if new is None else len(new) - int(np.isfinite(new).sum())
+    return [f"new is no number at {plural(lost, 'point')}; shown as measured"] if lost else []
 
 
 def _in_255(values: np.ndarray) -> np.ndarray:

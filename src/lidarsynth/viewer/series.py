@@ -16,7 +16,7 @@ from lidarsynth.data.frames import moved
 from lidarsynth.data.whole_turns import TimedTurn
 from lidarsynth.files.fields import FileError, dropped_points
 from lidarsynth.verbs.inputs import FileInput, Input, Loaded, MessageInput, Reading, TurnInput, inputs_of
-from lidarsynth.viewer.beside import all_dark, can_do_without, read_shown, without_reflectance
+from lidarsynth.viewer.beside import can_do_without, read_shown, without_reflectance
 from lidarsynth.viewer.packing import Shown
 
 SCAN_FOLDERS = ("velodyne", "LIDAR_TOP")  # of data sets that have other files of the same ending beside their scans
@@ -105,11 +105,10 @@ class Stream:
 
 def _read(item: Input) -> tuple[Loaded, tuple[str, ...]]:
     """A scan, also one that has no intensity, as of files, and then the note of that."""
-    known = isinstance(item, FileInput | MessageInput | TurnInput)
     try:
-        loaded = item.read()
-        return loaded, all_dark(loaded.scan, item.reading.intensity) if known else ()
+        return item.read(), ()
     except FileError as error:
+        known = isinstance(item, FileInput | MessageInput | TurnInput)
         if not (known and can_do_without(error, item.reading.intensity)):
             raise
         return replace(item, reading=replace(item.reading, intensity="none")).read(), (without_reflectance(error),)
