@@ -576,6 +576,34 @@ def test_cyclists_ride_forward_beside_the_road():
     np.testing.assert_allclose(np.sum(ahead * moment.velocity[rides, :2], axis=1), speed, rtol=0.02)
 
 
+def test_cyclists_brake_before_they_wait_at_the_main_road():
+    """At 2 m/s^2, where they have the 9 m for it that it takes at 6 m/s; none passes the one before."""
+    waits = 0
+    for number in range(3):
+        drive = set_apart(draw_drive(5, number, 15.0, Density(cyclists=4)))
+        rides = np.flatnonzero((drive.actors.kind == "bicyclist") & (drive.number > 0) & (drive.ahead != 0))
+        track = drive.ahead[rides] * drive.along[:, rides]
+        speed = np.diff(track, axis=0) / STEP
+        far = (speed[0] > 3.9) & (speed[-1] == 0) & (np.ptp(track, axis=0) > 9.1)
+        waits += int(far.sum())
+        np.testing.assert_array_less(-2.001, np.diff(speed[:, far], axis=0) / STEP)
+        assert (speed > -1e-6).all()
+        for road in np.unique(drive.number[rides]):
+            for way in (-1, 1):
+                mine = track[:, (drive.number[rides] == road) & (drive.ahead[rides] == way)]
+                apart = np.diff(mine[:, np.argsort(mine[0])], axis=1)
+                assert (apart > np.minimum(apart[0], 2.4) - 1e-6).all()
+    assert waits > 10
+
+
+def test_a_cyclist_beyond_the_ends_of_all_roads_stands():
+    plain = draw_drive(5, 2, 15.0, Density(cyclists=4))
+    assert np.isfinite(plain.aside).all()
+    drive = set_apart(plain)
+    moment = drive.moment(1.0)
+    assert np.isfinite(moment.place).all() and np.isfinite(moment.velocity).all()
+
+
 def test_cyclists_roll_off_kerbs_and_do_not_fall():
     """Their height changes with their velocity, where a side road meets theirs too."""
     lowest = 1.0

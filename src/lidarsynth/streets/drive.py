@@ -188,7 +188,8 @@ def _set_off(
     s, d = np.array([road.coordinates(x, y) for road in roads]).transpose(1, 0, 2)
     number = np.argmin(np.abs(d) - np.array([[road.half] for road in roads]), axis=0)
     number[actors.pace == TRAFFIC] = 0
-    walks = (actors.pace == WALK) & (draw[0] > STANDING)
+    on_some = np.isfinite(d).any(axis=0)  # beyond the ends of all roads one stands
+    walks = (actors.pace == WALK) & (draw[0] > STANDING) & on_some
     number[~walks & (actors.pace != TRAFFIC)] = -1
     along, aside = s[number, np.arange(count)], d[number, np.arange(count)]
     ahead = np.where(actors.pace == TRAFFIC, np.where(aside < 0, 1, -1), np.where(draw[1] < 0.5, 1, -1))

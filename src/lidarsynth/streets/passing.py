@@ -25,7 +25,7 @@ from lidarsynth.streets.apart import (
 )
 from lidarsynth.streets.drive import Drive
 from lidarsynth.streets.ground import Road
-from lidarsynth.streets.traffic import STEP
+from lidarsynth.streets.traffic import BRAKING, STEP
 from lidarsynth.streets.world import TRAFFIC
 
 GAP = 0.1  # m between boxes
@@ -82,9 +82,9 @@ def _abreast(drive: Drive) -> Drive:
             gone = np.abs(along[:, mine] - along[0, mine]).min(axis=1)
             to, limit = way * along[0, mine], _limit(drive, number)
             order = np.argsort(np.argsort(-np.where(to < -limit, to, -np.inf)))
-            track = to + gone[:, None]
-            stop = np.maximum(-limit - QUEUE * order, to)
-            along[:, mine] = way * np.where((to < -limit) & (number > 0), np.minimum(track, stop), track)
+            track, pace = to + gone[:, None], gone[1] / STEP
+            halted = _halted(to, gone, np.maximum(-limit - QUEUE * order, to), pace)
+            along[:, mine] = way * np.where((to < -limit) & (number > 0), halted, track)
     drives = np.flatnonzero((drive.actors.pace == TRAFFIC) & (ahead != 0))
     wide = drive.actors.size[:, 1] / 2 + MARGIN + GAP
     for one in drives.tolist():
@@ -92,6 +92,15 @@ def _abreast(drive: Drive) -> Drive:
         if (np.abs(drive.aside[other] - drive.aside[one]) < wide[other] + wide[one]).any():
             ahead[one] = 0
     return replace(drive, along=along, ahead=ahead)
+
+
+def _halted(start: np.ndarray, gone: np.ndarray, stop: np.ndarray, pace: float) -> np.ndarray:
+    """(steps, N) m along a road of those who ride from `start` (N,) at `pace` m/s and brake so as to stand at `stop`
+    (N,): as comfortably as there is room. gone (steps,) m that they ride where they need not stop."""
+    brakes = np.minimum(pace**2 / (2 * BRAKING), stop - start)  # m from the brake to the stop: twice that in full ride
+    begun = np.clip(start + gone[:, None] - (stop - brakes), 0, 2 * brakes)
+    saved = begun**2 / np.maximum(4 * brakes, 1e-9)
+    return np.minimum(start + gone[:, None], stop - brakes + begun) - saved
 
 
 def _cleared(drive: Drive) -> Drive:
