@@ -245,6 +245,18 @@ def test_reflectance_is_in_the_terms_of_the_scan(model: ScanModel, street: Scan)
     assert 0.1 < ratio < 0.4 and not none.reflectance.any()
 
 
+def test_what_is_inserted_fades_with_distance_as_the_scan_does(model: ScanModel, street: Scan):
+    away = np.linalg.norm(street.xyz, axis=1)
+    dark = replace(street, reflectance=(street.reflectance / np.maximum(away, 1)).astype(np.float32))
+    bright, faded = (model.insert(scan, "car:6", seed=5).scan for scan in (street, dark))
+    new = bright.extra["new"] > 0
+    away, light = np.linalg.norm(bright.xyz[new], axis=1), bright.reflectance[new]
+    parts = [part & (light > 0.05) for part in (away < 10, away > 20)]
+    shares = [np.median(faded.reflectance[new][part] / light[part]) for part in parts]
+    assert shares[1] < 0.6 * shares[0] and min(part.sum() for part in parts) > 20
+    assert shares[1] < 0.6 * shares[0]
+
+
 def test_lost_rays_are_where_rings_have_gaps():
     azimuth = np.radians(np.arange(0.25, 360, 0.5))
     kept = np.ones((2, 720), bool)

@@ -53,6 +53,49 @@ def test_scale_and_gamma_are_undone(street: RangeImage, scale: float, gamma: flo
     np.testing.assert_allclose(back.reported(even)[even < 1], other.reflectance[even < 1], atol=1e-5)
 
 
+def fading(image: RangeImage, exponent: float, near: float) -> RangeImage:
+    """As a sensor of 255 levels reports the energy that comes back."""
+    light = image.reflectance * (near / np.maximum(image.range, near)) ** exponent
+    return reported_as(image, (255 * light).round() / 255)
+
+
+@pytest.mark.parametrize(("exponent", "near"), [(2.0, 6.0), (2.0, 2.0), (1.0, 1.0)])
+def test_how_a_scan_fades_with_distance_is_found_and_undone(street: RangeImage, exponent: float, near: float):
+    known, dark = every(street, 2), fading(street, exponent, near)
+    found = response_of(dark, known)
+    assert abs(found.fades - exponent) < 0.4
+    even = found.unfaded(dark)
+    lit = dark.reflectance > 10 / 255
+    inside = lit & (even.reflectance < 1)
+    np.testing.assert_allclose(found.faded(even.reflectance, dark.range)[inside], dark.reflectance[inside], atol=1e-5)
+    logs = [np.log(image.reflectance[inside]) for image in (even, dark, street)]
+    assert np.std(logs[0] - logs[2]) < 0.4 * np.std(logs[1] - logs[2])
+    assert not response_of(dark, known, tuned=True).fades, "a model of the sensor has learned it so"
+    assert not response_of(replace(dark, sensor=replace(dark.sensor, dimness=(0.0,) * 32)), known).fades
+
+
+def test_nothing_fades_where_farther_surfaces_are_darker_alone():
+    """Streets as they are, and with their second and fifth power; of the quarters of their turns hardly any."""
+    streets = SyntheticStreets(5, 128, replace(SENSORS["hdl-32e"], width=512))
+    images, parts = [streets.image(k) for k in range(0, 128, 16)], np.arange(512) // 128
+    for power in (1, 2, 5):
+        seen = [reported_as(image, (1.2 * image.reflectance) ** power) for image in images]
+        assert not any(response_of(image, every(image, 4)).fades for image in seen)
+        quarters = [np.broadcast_to(parts == part, images[0].shape) for part in range(4)]
+        assert sum(response_of(image, part).fades > 0 for image in seen for part in quarters) <= 1
+
+
+def test_what_is_filled_in_fades_as_the_scan_does(street: RangeImage, monkeypatch: pytest.MonkeyPatch):
+    known, dark, model = every(street, 4), fading(street, 2.0, 2.0), ls.load("default").into(street.sensor)
+    found = model.complete(dark.keep(known), known)
+    np.testing.assert_array_equal(found.reflectance[known], dark.keep(known).reflectance[known])
+    monkeypatch.setattr("lidarsynth.systems.cascade.response._fading", lambda reflectance, metres: AS_STREETS)
+    others = model.complete(dark.keep(known), known), ls.load("bilinear").complete(dark.keep(known), known)
+    errors = [np.abs(one.reflectance - dark.reflectance)[~known].mean() for one in (found, *others)]
+    assert errors[0] < 0.95 * errors[1]
+    assert errors[0] < 0.9 * errors[2]
+
+
 def test_a_darker_reading_sensor_gets_the_same_surfaces_and_darker_points(street: RangeImage):
     model, known = ls.load("default").into(street.sensor), every(street, 4)
     dark = reported_as(street, 0.2 * street.reflectance)

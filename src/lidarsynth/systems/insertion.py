@@ -292,7 +292,8 @@ def _points(scan: Scan, there: Placed, new: np.ndarray, first: int) -> Scan:
     source = np.concatenate([np.arange(count), lost.before])[new]
     xyz = to_sensor(sensor, rays.starts[new] + rays.directions[new] * rays.metres[new, None]).astype(np.float32)
     dim = np.asarray(response.dimness or [0.0] * sensor.height, np.float32)[rays.row[new]]
-    light = response.reported((rays.reflectance[new] - dim).clip(0, 1)) * bool(scan.reflectance.any())
+    light = response.reported((rays.reflectance[new] - dim).clip(0, 1))
+    light = response.faded(light, rays.metres[new]) * bool(scan.reflectance.any())
     owner = rays.owner[new].astype(np.int32)
     extra = {name: np.zeros(len(new), values.dtype) for name, values in scan.extra.items()}
     extra |= {name: _rings(scan.extra[name], rays, new, source) for name in RINGS if name in scan.extra}

@@ -184,7 +184,7 @@ class CascadeModel(AnySensorModel):
         recorded = image.keep(known)  # on a blocked ray too, which is told as empty
         rng, lit = generators(how.seed, 1), bool(recorded.reflectance.any())
         own = replace(self._as_found(recorded, known), grain=SPECKLE)
-        image, unit = as_streets(recorded, known, own.response, self.tuned)
+        image, unit = as_streets(own.response.unfaded(recorded), known, own.response, self.tuned)
         known = known | (self._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
@@ -202,7 +202,7 @@ class CascadeModel(AnySensorModel):
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
         filled = straight_in_gaps(settled(filled, image, told), told) if noise is None else filled
         shade = own.response.straightened(own.response.reported(filled.reflectance), image, known)
-        filled = replace(filled, reflectance=unit.read(shade, filled) * filled.mask)
+        filled = replace(filled, reflectance=own.response.faded(unit.read(shade, filled), filled.range) * filled.mask)
         filled = with_known(filled if noise is None else noisy(filled, rng[0]), recorded, known, keep_reflectance=lit)
         (on_step or (lambda: None))()
         return own._named([filled], recorded=True)[0]
@@ -323,7 +323,7 @@ class CascadeModel(AnySensorModel):
         """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         image = image.keep(known)
         own, told = self._as_found(image, known), known | (self._blocked & ~image.mask)
-        image, _ = as_streets(image, known, own.response, self.tuned)
+        image, _ = as_streets(own.response.unfaded(image), known, own.response, self.tuned)
         shades = own.response.even(image.reflectance)[None]
         pixels = known_of(image.range[None], shades, told[None], True, padded(self.sensor))
         return signals(*own._network(pixels, None, doubt=True))[0, :, : self.sensor.height, : self.sensor.width]
@@ -389,7 +389,7 @@ class CascadeModel(AnySensorModel):
 
     def _as_found(self, image: RangeImage, known: np.ndarray) -> CascadeModel:
         """With what the known returns tell of the sensor: how high it stands, and how it reports reflectance."""
-        return replace(self, sensor=standing(self.sensor, image, known), response=response_of(image, known))
+        return replace(self, sensor=standing(self.sensor, image, known), response=response_of(image, known, self.tuned))
 
     @property
     def _blocked(self) -> np.ndarray:

@@ -1,12 +1,14 @@
 """How a sensor reports reflectance, where nobody has measured it: found out from the scan itself.
 
-Virtual sensors of training report scale * reflectance ** gamma, and some beams less than others (`streets.Optics`). Of
-a recorded scan both are estimated from its known pixels, so that a network sees it as the streets it has learned, and
-what it answers is said in the sensor's own terms. Measured in docs/completion.md.
+Virtual sensors of training report scale * reflectance ** gamma, and some beams less than others (`streets.Optics`);
+others report the energy that came back, which fades with distance. Of a recorded scan all this is estimated from its
+known pixels, so that a network sees it as the streets it has learned, and what it answers is said in the sensor's own
+terms. Measured in docs/completion.md.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +35,12 @@ PARTS, WIDTH, SEAM = 8, 64, 16  # parts of the turn in which they are tried, col
 # (docs/completion.md).
 USUAL = 0.5
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
+BINS, MOST = 12, 2.0  # of ranges, of as many returns each; the exponent of what spreads and is not made up for
+NEAR = (0.1, 2.0, 4.0, 6.0, 8.0, 10.0)  # metres, from which on what fades does
+BRIGHT = 0.99  # share of the known returns that are less than 1 when they are unfaded
+# How much a scan fades for one to have it: the slope of the logarithm of its medians, by the spread within a range.
+# Streets, insides and real training scans have -1.0 and more, reported with any gamma; what fades by 2, -1.8 and less.
+LITTLE, SURELY = 1.3, 1.8
 
 
 class Response(NamedTuple):
@@ -41,6 +49,8 @@ class Response(NamedTuple):
     scale, gamma  positive; dimness (H,), in reflectance, or () for what the sensor itself says; the defaults change
     nothing. plain: share of 0 to 1 that the mean of what is known around, calm, has in the most likely reflectance,
     beside the network's. straight: then, in what is reported, the share of the line between the nearest known returns.
+    fades: from `near` metres on what is reported falls as metres ** -fades; all before is of what is `unfaded`, by
+    that and by `level`.
     """
 
     scale: float = 1.0
@@ -48,6 +58,22 @@ class Response(NamedTuple):
     dimness: tuple[float, ...] = ()
     plain: float = 0.0
     straight: float = 0.0
+    fades: float = 0.0
+    near: float = NEAR[0]
+    level: float = 1.0
+
+    def unfaded(self, image: RangeImage) -> RangeImage:
+        """The image with reflectances that do not fade with distance, 1 at most."""
+        if not self.fades:
+            return image
+        return replace(image, reflectance=np.minimum(image.reflectance * self._lost(image.range), np.float32(1)))
+
+    def faded(self, unfaded: np.ndarray, metres: np.ndarray) -> np.ndarray:
+        """Reflectances of `unfaded` as they are reported of `metres`, both of any shape; 1 at most."""
+        return np.minimum(unfaded / self._lost(metres), np.float32(1)) if self.fades else unfaded
+
+    def _lost(self, metres: np.ndarray) -> np.ndarray:
+        return np.float32(self.level) * np.maximum(metres, np.float32(self.near)) ** np.float32(self.fades)
 
     def even(self, reported: np.ndarray) -> np.ndarray:
         """Reflectance in [0, 1] of any shape as the streets' sensor would report it, but for the beams' dimness."""
@@ -69,7 +95,8 @@ class Response(NamedTuple):
         return torch.lerp(filled.reflectance, filled.plain, self.plain)
 
     def straightened(self, reported: np.ndarray, image: RangeImage, known: np.ndarray) -> np.ndarray:
-        """(H, W) the most likely reflectance, as reported, with its share of the line between known returns."""
+        """(H, W) the most likely reflectance, as reported, with its share of the line between known returns; all
+        that is reported unfaded."""
         if not self.straight:
             return reported
         return (1 - np.float32(self.straight)) * reported + np.float32(self.straight) * line(image, known)
@@ -90,23 +117,53 @@ class Response(NamedTuple):
 AS_STREETS = Response()
 
 
-def response_of(image: RangeImage, known: np.ndarray) -> Response:
+def response_of(image: RangeImage, known: np.ndarray, tuned: bool = False) -> Response:
     """By the known returns of an image, known (H, W) bool.
 
     `AS_STREETS`, which changes nothing, for a sensor whose beams are measured, and for fewer than 50 returns. A scan of
-    `hdl-64e-kitti` that reports twice or half of what KITTI's does is taken for another unit's, of unknown beams.
+    `hdl-64e-kitti` that reports twice or half of what KITTI's does is taken for another unit's, of unknown beams. A
+    model that was `tuned` to scans of the sensor knows how they fade.
     """
     lit = known & image.mask & (image.reflectance > 0)
     if lit.sum() < ENOUGH:
         return AS_STREETS
-    low, middle, high = np.log(np.maximum(np.quantile(image.reflectance[lit], (0.25, 0.5, 0.75)), LEAST))
-    of_kitti = abs(middle - np.log(STREETS[1])) < UNIT
+    of_kitti = abs(np.log(max(np.median(image.reflectance[lit]), LEAST)) - np.log(STREETS[1])) < UNIT
     if image.sensor.dimness or (hdl64e.dimness(image.sensor) and of_kitti):
         return AS_STREETS
+    fading = AS_STREETS if tuned else _fading(image.reflectance[lit], image.range[lit])
+    unfaded = fading.unfaded(image).reflectance
+    low, middle, high = np.log(np.maximum(np.quantile(unfaded[lit], (0.25, 0.5, 0.75)), LEAST))
     gamma = float(np.clip(np.log(STREETS[2] / STREETS[0]) / max(high - low, NARROWEST), *GAMMAS))
-    response = Response(float(STREETS[1] / np.exp(gamma * middle)), gamma)
-    dim = dimness_of(response.even(image.reflectance), image.range, known & image.mask)
+    response = fading._replace(scale=float(STREETS[1] / np.exp(gamma * middle)), gamma=gamma)
+    dim = dimness_of(response.even(unfaded), image.range, known & image.mask)
     return response._replace(dimness=tuple(dim.tolist()))
+
+
+def _fading(reflectance: np.ndarray, metres: np.ndarray) -> Response:
+    """How reflectances (N,) above 0 of returns at metres (N,) fade with the distance; not where they fall no more than
+    surfaces do that are farther: by medians of bins of ranges, of as many returns each."""
+    if len(metres) < BINS * ENOUGH:
+        return AS_STREETS
+    order = np.argsort(metres, kind="stable")
+    far, light = np.log(np.maximum(metres[order], 0.1)), np.log(reflectance[order])
+    bins = np.array_split(np.arange(len(order)), BINS)
+    low, middle, high = np.array([np.quantile(light[part], (0.25, 0.5, 0.75)) for part in bins]).T
+    fits = []
+    medians = np.array([np.median(far[part]) for part in bins])
+    for near in NEAR:
+        away = np.maximum(medians, np.log(near))
+        away -= away.mean()
+        slope = -(away @ middle) / max(away @ away, 0.1)
+        if near == NEAR[0] or np.log(near) < np.median(far):
+            fits.append((np.var(middle + slope * away), slope, near))
+    _, slope, near = min(fits)
+    shown = slope / max(np.median(high - low), NARROWEST)
+    fades = float(np.clip(slope, 0, MOST) * np.clip((shown - LITTLE) / (SURELY - LITTLE), 0, 1))
+    if not fades:
+        return AS_STREETS
+    fading = Response(fades=fades, near=near)
+    brightest = np.quantile(reflectance * fading._lost(metres), BRIGHT)
+    return fading._replace(level=float(1 / brightest))
 
 
 def tried(
@@ -121,9 +178,9 @@ def tried(
     """The response with the shares of the mean, and of the line between returns, that suit the scan: every second known
     beam of some parts of the turn is hidden and filled, and those taken that err least.
 
-    told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. Of a sensor whose
-    beams are measured, and where fewer than four beams return enough, the usual share; where no reflectance is known,
-    and for a fill that was `tuned` to scans of the sensor, none.
+    image unfaded; told (H, W) bool; reflectance (H, W), even, as the fill is told it; rays of the padded image. Of a
+    sensor whose beams are measured, and where fewer than four beams return enough, the usual share; where no
+    reflectance is known, and for a fill that was `tuned` to scans of the sensor, none.
     """
     returned = told & image.mask
     if tuned or not image.reflectance[returned].any():
