@@ -234,6 +234,31 @@ def test_a_pipe_is_no_file_to_write(tmp_path: Path):
         check_place(tmp_path / "out.ply")
 
 
+def test_a_report_takes_the_place_of_its_own_kind_alone(tmp_path: Path, capsys):
+    judged = json.dumps({"protocol": "bev-1", "version": 1, "values": {}})
+    out, report = tmp_path / "out", tmp_path / "out/report.json"
+    xyz = np.random.default_rng(0).uniform(-20, 20, (500, 3)).astype(np.float32)
+    write(tmp_path / "scan.ply", Scan(xyz, np.full(500, 0.5, np.float32)))
+    words = ["complete", str(tmp_path / "scan.ply"), "--model", "bilinear", "--sensor", "vlp-16", "--no-picture"]
+    out.mkdir()
+    for theirs in ('{"thesis": 1}', "[]", "no JSON", judged):
+        report.write_text(theirs)
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, "--out", str(out)])
+        assert "expected a place for the report of this run" in capsys.readouterr().err
+        assert report.read_text() == theirs and list(out.iterdir()) == [report]
+        if theirs != judged:
+            with pytest.raises(ValueError, match="found a file that is no report of evaluate"):
+                evaluate.check_out(report)
+    evaluate.check_out(report)  # of its own
+    report.write_text("")  # as mktemp leaves it
+    evaluate.check_out(report)
+    for _ in range(2):
+        main([*words, "--out", str(out)])
+    with pytest.raises(ValueError, match="found a file that is no report of evaluate"):
+        evaluate.check_out(report)
+
+
 @pytest.mark.parametrize("device", ["meta", "tpu-9", "", "cuda:99", "hpu"])
 def test_devices_that_compute_nothing_are_refused(device: str):
     with pytest.raises(ValueError, match="expected a device"):
