@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from lidarsynth.benchmark.config import read_config
+from lidarsynth.cli.main import main
 from lidarsynth.cli.terminal import check_device
 from lidarsynth.data.index import read_index
 from lidarsynth.evaluation import accumulation, evaluate
@@ -22,11 +24,13 @@ from lidarsynth.experiment.record import Experiment
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import SENSORS, read_sensor
-from lidarsynth.lidar.small_file import read_json, read_toml
+from lidarsynth.lidar.small_file import LARGEST_INDEX, PIECE, read_json, read_text, read_toml
 from lidarsynth.lidar.whole_file import sweep, whole_file, write_whole
 from lidarsynth.networks.tensors import read_state
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.table import load_folder
+from lidarsynth.verbs.description import describe
+from lidarsynth.verbs.output_files import check_place
 from lidarsynth.weights import download
 from lidarsynth.weights.official import read_official
 
@@ -184,6 +188,75 @@ def test_a_cache_folder_is_found_without_a_home(monkeypatch):
     monkeypatch.delenv("LIDARSYNTH_CACHE", raising=False)
     monkeypatch.setattr(Path, "home", homeless)
     assert download.cache_folder().name == "lidarsynth-cache"
+
+
+@pytest.mark.parametrize("word", ["r2dm-h-kitti360", "r2dm-h-kitti360-300k"])
+def test_a_release_that_cannot_be_fetched_is_not_taken_for_another_word(word: str, tmp_path: Path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LIDARSYNTH_CACHE", str(tmp_path / "file/cache"))
+    with pytest.raises(ValueError, match=r"kitti360-300k\.pth; LIDARSYNTH_CACHE may name another folder for it$"):
+        describe(word)
+    with pytest.raises(ValueError, match=r"was r2dm-h-kitti360 meant\?$"):
+        describe("r2dm-h-kiti360")
+
+
+def test_a_short_file_costs_little_memory_whatever_its_bound(tmp_path: Path):
+    (tmp_path / "report.json").write_text('{"done": 2}')
+    tracemalloc.start()
+    try:
+        assert read_json(tmp_path / "report.json", LARGEST_INDEX) == {"done": 2}
+        assert tracemalloc.get_traced_memory()[1] < LARGEST_INDEX / 64
+    finally:
+        tracemalloc.stop()
+
+
+def test_text_is_read_whole_and_to_its_bound(tmp_path: Path):
+    text = "0123456789" * (PIECE // 4)
+    (tmp_path / "long.txt").write_text(text)
+    assert read_text(tmp_path / "long.txt", len(text)) == text
+    with pytest.raises(ValueError, match=f"expected at most {len(text) - 1} bytes"):
+        read_text(tmp_path / "long.txt", len(text) - 1)
+
+
+@pytest.mark.parametrize("verb", ["sensor lost.bin --out out.toml", "view lost.bin --out out.html"])
+def test_what_cannot_be_written_is_refused_before_scans_are_read(verb: str, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(SystemExit, match="2"):
+        main(verb.split())
+    name = verb.rpartition(" ")[2]
+    assert capsys.readouterr().err == f"lidarsynth: {name}: expected a writable folder, found no right at {tmp_path}\n"
+
+
+def test_a_pipe_is_no_file_to_write(tmp_path: Path):
+    os.mkfifo(tmp_path / "out.ply")
+    with pytest.raises(ValueError, match=r"out\.ply: expected the name of a file to write, found a device or pipe"):
+        check_place(tmp_path / "out.ply")
+
+
+def test_a_report_takes_the_place_of_its_own_kind_alone(tmp_path: Path, capsys):
+    judged = json.dumps({"protocol": "bev-1", "version": 1, "values": {}})
+    out, report = tmp_path / "out", tmp_path / "out/report.json"
+    xyz = np.random.default_rng(0).uniform(-20, 20, (500, 3)).astype(np.float32)
+    write(tmp_path / "scan.ply", Scan(xyz, np.full(500, 0.5, np.float32)))
+    words = ["complete", str(tmp_path / "scan.ply"), "--model", "bilinear", "--sensor", "vlp-16", "--no-picture"]
+    out.mkdir()
+    for theirs in ('{"thesis": 1}', "[]", "no JSON", judged):
+        report.write_text(theirs)
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, "--out", str(out)])
+        assert "expected a place for the report of this run" in capsys.readouterr().err
+        assert report.read_text() == theirs and list(out.iterdir()) == [report]
+        if theirs != judged:
+            with pytest.raises(ValueError, match="found a file that is no report of evaluate"):
+                evaluate.check_out(report)
+    evaluate.check_out(report)  # of its own
+    report.write_text("")  # as mktemp leaves it
+    evaluate.check_out(report)
+    for _ in range(2):
+        main([*words, "--out", str(out)])
+    with pytest.raises(ValueError, match="found a file that is no report of evaluate"):
+        evaluate.check_out(report)
 
 
 @pytest.mark.parametrize("device", ["meta", "tpu-9", "", "cuda:99", "hpu"])

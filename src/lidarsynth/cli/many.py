@@ -153,6 +153,7 @@ def _one(job: Job, inputs: Inputs, out: Path) -> list[Result]:
 def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str) -> list[Result]:
     from lidarsynth.lidar.whole_file import TOKEN, sweep
     from lidarsynth.verbs.batch_report import (
+        check_report,
         is_mixed,
         merge_shards,
         other_names,
@@ -170,6 +171,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending, report = many.format or ("npz" if job.verb == "project" else "ply"), report_path(out, shard)
+    check_report(report)
     before = rows_before(out, shard, ending) if many.skip_existing else {}
     if (told := other_names(out, ending, before, inputs.places)) is not None:
         warn(told)

@@ -40,10 +40,12 @@ def sensor(
     from lidarsynth.pictures.render import save_png
     from lidarsynth.verbs.inputs import Reading, inputs_of
     from lidarsynth.verbs.learned_sensor import doubts, from_metadata, learn, sensor_toml, summary, write_toml
+    from lidarsynth.verbs.output_files import check_place
     from lidarsynth.verbs.placement import parse_rings, read_transform
 
     if out.suffix != ".toml":
         raise ValueError(f"{out}: expected a name that ends in .toml, found {out.name[-20:]!r}")
+    check_place(out)
     told = scans[0] if metadata is None and len(scans) == 1 else metadata
     if told is not None and (known := from_metadata(told, out.stem)) is not None:
         write_toml(out, sensor_toml(known, [f"from the metadata {told.name}"]))

@@ -208,7 +208,7 @@ def answer(verb: Callable[[], object]) -> None:
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "memory" not in str(error):
             raise  # a fault of ours
-        _refuse(f"expected enough memory, found too little: {error}".partition("\n")[0])
+        _refuse(f"expected enough memory, found too little: {error}".partition("\n")[0].removesuffix(": "))
 
 
 @contextmanager

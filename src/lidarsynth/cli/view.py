@@ -44,6 +44,7 @@ def view(
 ) -> None:
     """Scans in the browser, from a page on this machine alone; or, with --out, as one file to send."""
     from lidarsynth.verbs.inputs import Reading
+    from lidarsynth.verbs.output_files import check_place
     from lidarsynth.verbs.placement import parse_rings, read_transform
     from lidarsynth.viewer.page import write_page
     from lidarsynth.viewer.pairs import compared, entries
@@ -52,6 +53,8 @@ def view(
     at_least(0, {"port": port})
     if out is not None and out.suffix.lower() not in ENDINGS:
         raise ValueError(f"{out}: expected a name that ends in .html, found {out.name[-20:]!r}")
+    if out is not None:
+        check_place(out)
     how = Reading(intensity, topic, metadata, read_transform(transform, mount, axes), rings=parse_rings(rings))
     series = compared(scans, other, how)
     for line in dict.fromkeys(line for one in series.values() for line in one.cut):

@@ -360,7 +360,19 @@ def check_out(out: Path) -> None:
     page = out.with_suffix(".md")
     if page.exists() and (not page.is_file() or DEFINITIONS not in page.read_text(encoding="utf-8", errors="replace")):
         raise ValueError(f"{out}: expected a name beside whose .md nothing is lost, found {page}, which is no report")
+    if out.exists() and out.stat().st_size and not _is_report(out):
+        raise ValueError(
+            f"{out}: expected a name under which nothing is lost, found a file that is no report of evaluate"
+        )
     _check_place(out)
+
+
+def _is_report(path: Path) -> bool:
+    try:
+        values = read_json(path, LARGEST_INDEX)
+    except (OSError, ValueError):
+        return False
+    return isinstance(values, dict) and {"protocol", "version", "values"} <= values.keys()
 
 
 def _check_place(out: Path) -> None:

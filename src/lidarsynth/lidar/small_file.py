@@ -21,6 +21,7 @@ else:
 LARGEST = 1 << 20  # bytes of a file of settings
 LARGEST_INDEX = 1 << 30  # of the index of a cache, which has a line per scan
 LARGEST_WEIGHTS = 1 << 36
+PIECE = 1 << 20
 DOTTED = re.compile(
     r"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){16}"""
 )  # begins where a word does, so that it stays linear
@@ -39,8 +40,10 @@ def check_regular(path: str | Path, most: int = 1 << 62) -> None:
 def read_text(path: str | Path, most: int = LARGEST) -> str:
     """The text of a regular file of at most `most` bytes of UTF-8. Raises ValueError; OSError where it has no file."""
     check_regular(path, most)
-    with Path(path).open("rb") as file:
-        content = file.read(most + 1)  # it may have grown
+    content, room = bytearray(), most + 1  # it may have grown
+    with Path(path).open("rb") as file:  # by pieces: one read of 1 GiB asks for as much memory, however short the file
+        while piece := file.read(min(PIECE, room - len(content))):
+            content += piece
     if len(content) > most:
         raise ValueError(f"{path}: expected at most {most} bytes, found more")
     try:

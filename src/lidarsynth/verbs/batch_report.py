@@ -36,6 +36,13 @@ def report_path(out: Path, shard: Shard) -> Path:
     return out / (REPORT if shard[1] == 1 else f"report-{shard[0]}-of-{shard[1]}.json")
 
 
+def check_report(path: Path) -> None:
+    """Raises ValueError where a run's report would take the place of a file that is none."""
+    if path.exists() and path.stat().st_size and read_report(path) is None:
+        raise ValueError(f"{path}: expected a place for the report of this run, found a file that is no such report; "
+                         "move it, or name another --out")  # fmt: skip
+
+
 def check_same(out: Path, recipe: Mapping[str, Any]) -> None:
     """Raises ValueError where a report in the folder tells of results of another recipe: they are not to go on with."""
     for path in sorted(out.glob("report*.json")):

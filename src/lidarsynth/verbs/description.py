@@ -36,7 +36,7 @@ def describe(what: str, reading: Reading | None = None) -> str:
     if what in WORDS or (path.suffix in (".toml", ".json") and path.name != RECORD):
         return describe_sensor(get_sensor(what))
     from lidarsynth.systems.table import build_network  # torch takes seconds, which no file above needs
-    from lidarsynth.weights.load import load_parts, shipped
+    from lidarsynth.weights.load import RELEASES, load_parts, shipped
 
     if what in PRESETS and what not in shipped() and not path.is_dir():
         experiment = PRESETS[what]()
@@ -44,8 +44,8 @@ def describe(what: str, reading: Reading | None = None) -> str:
     try:
         parts = load_parts(what)
     except ValueError as error:
-        near = get_close_matches(what.lower(), {*WORDS, *PRESETS, *shipped()}, n=1)
-        if not near or path.exists():
+        near = get_close_matches(what.lower(), {*WORDS, *PRESETS, *shipped(), *RELEASES}, n=1)
+        if not near or near[0] == what.removesuffix("-300k") or path.exists():  # as `load` takes the word
             raise
         raise ValueError(f"{error}; was {near[0]} meant?") from None
     return describe_model(*parts, source=what)

@@ -75,16 +75,23 @@ def target(out: Path, source: Path) -> Path:
     """`out`, where it may be written. Raises ValueError for a folder, an unknown ending, or the source's own file."""
     if not _is(WRITERS, out) or _is([".pcd.bin"], out):
         raise ValueError(f"{out}: expected a name that ends in {', '.join(WRITERS)}, found {out.name[-20:]!r}")
-    if out.is_dir():
-        raise ValueError(f"{out}: expected the name of a file to write, found a folder")
+    check_place(out)
     if out.exists() and source.exists() and out.samefile(source):
         raise ValueError(f"{out}: expected a file other than the scan that is read, found the same")
+    return out
+
+
+def check_place(out: Path) -> None:
+    """Raises ValueError, before any work, where a file cannot be put: what is there is none, or its folder, or the
+    nearest above it that there is, cannot be written to."""
+    if out.exists() and not out.is_file():
+        found = "a folder" if out.is_dir() else "a device or pipe"
+        raise ValueError(f"{out}: expected the name of a file to write, found {found}")
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK):
         raise ValueError(
             f"{out}: expected a writable folder, found {'a file' if parent.is_file() else 'no right'} at {parent}"
         )
-    return out
 
 
 def check_bag(out: Path, read: Sequence[Path]) -> None:

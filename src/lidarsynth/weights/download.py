@@ -63,6 +63,8 @@ def download(url: str, path: str | Path) -> Iterator[tuple[int, int | None]]:
         if part.is_file() and not part.stat().st_size:
             part.unlink(missing_ok=True)
         place = f"without a network, put the file at {path}"
+        if isinstance(error, OSError) and error.filename and not isinstance(error, urllib.error.URLError):  # our files
+            place += "; LIDARSYNTH_CACHE may name another folder for it"
         raise ValueError(f"{url}: expected a download, found {_reason(error)}; {place}") from None
 
 
