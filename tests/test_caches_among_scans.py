@@ -101,6 +101,52 @@ def test_info_tells_of_a_cache_in_the_making(tmp_path: Path, capsys: pytest.Capt
     assert "found only caches or empty folders" in refused(["info", tmp_path / "in"], capsys)
 
 
+def test_info_tells_of_shards_that_are_gone_or_cut(tmp_path: Path):
+    list(write_cache(tmp_path / "cache", image, 300, SENSOR, WHAT))
+    assert "broken" not in (file_lines(tmp_path / "cache", Reading()) or {})
+    for name in ("0000000.npy", "0000128.npy", "0000192.npy"):
+        (tmp_path / "cache" / name).unlink()
+    (tmp_path / "cache" / "0000256.npy").write_bytes(b"cut")
+    told = (file_lines(tmp_path / "cache", Reading()) or {})["broken"]
+    assert told == ("4 shards of 5 gone or cut (0000000.npy, 0000128.npy, 0000192.npy, ...); the same data command "
+                    "makes them anew")  # fmt: skip
+    list(write_cache(tmp_path / "cache", image, 300, SENSOR, WHAT))
+    assert "broken" not in (file_lines(tmp_path / "cache", Reading()) or {}) and len(CachedImages(tmp_path / "cache"))
+
+
+def test_other_files_of_data_sets_are_no_scans(tmp_path: Path):
+    """Argoverse 2's tables and map beside its sweeps, KITTI-360's planar scanner beside its turns."""
+    sweep, turn = "log/sensors/lidar/3159.feather", "drive_sync/velodyne_points/data/0.bin"
+    others = ("log/annotations.feather", "log/city_SE3_egovehicle.feather", "log/calibration/intrinsics.feather",
+              "log/calibration/egovehicle_SE3_sensor.feather", "log/map/log_ground_height_surface____PIT.npy",
+              "drive_sync/sick_points/data/0.bin")  # fmt: skip
+    for name in (sweep, turn, *others):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"0")
+    assert [path.relative_to(tmp_path).as_posix() for path in scan_files(tmp_path)] == [turn, sweep]
+    (named,) = inputs_of([tmp_path / others[0]]).stream()
+    assert named.path == tmp_path / others[0], "one that is named is read, and refused as what it is"
+
+
+def test_a_folder_of_text_says_how_such_scans_are_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """VeloView writes each turn as a .csv, which a folder's scans are not taken to be."""
+    folder = tmp_path / "turns"
+    folder.mkdir()
+    x, y, z = full_scan().xyz.T
+    for i in range(2):
+        rows = "\n".join(f"{a},{b},{c},9" for a, b, c in zip(x, y, z, strict=True))
+        (folder / f"turn (Frame {i:04d}).csv").write_text(f"x,y,z,intensity\n{rows}\n")
+    error = refused(["data", "files", folder, tmp_path / "cache", "--sensor", "vlp-16"], capsys)
+    assert f"found none but 2 files of text: where they are scans, name them, as '{folder}/*.csv'; for a cache" in error
+    assert f"`lidarsynth project '{folder}/*.csv' --out IMAGES` makes images first" in error
+    main(["project", f"{folder}/*.csv", "--sensor", "vlp-16", "--out", str(tmp_path / "images"), "--no-picture"])
+    main(["data", "files", str(tmp_path / "images"), str(tmp_path / "cache"), "--workers", "0"])
+    assert len(CachedImages(tmp_path / "cache")) == 2
+    with pytest.raises(ValueError, match=r"turns: expected a cache, or samples \(") as told:
+        image_set(folder)
+    assert ".csv" not in str(told.value) and ".txt" not in str(told.value), "of which a folder's are none"
+
+
 def test_a_cache_whose_last_scans_are_gone_is_whole(scans: Path):
     words = ["data", "files", str(scans), str(scans / "cache"), "--sensor", "vlp-16", "--workers", "0"]
     main(words)
@@ -142,6 +188,8 @@ def test_data_sets_say_what_they_expect(tmp_path: Path, capsys: pytest.CaptureFi
         kitti360(tmp_path)
     with pytest.raises(ValueError, match="expected raw drives, DATE/DATE_drive_NNNN_sync, found none"):
         kitti_published(tmp_path)
+    error = refused(["data", "nuscenes", tmp_path, tmp_path / "cache"], capsys)
+    assert "found none: data files takes scans without tables" in error
     (tmp_path / "a.pcd.bin").write_bytes(b"\0" * 20)
     with pytest.raises(ValueError, match=r"a\.pcd\.bin: expected a \.bin of four floats a point, found a \.pcd\.bin"):
         list_frames(tmp_path, "00")

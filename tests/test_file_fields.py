@@ -36,6 +36,24 @@ def test_intensity_scales_are_recognised(values: np.ndarray, scale: float):
     np.testing.assert_allclose(reflectance_from(values), values / np.float64(scale), rtol=1e-6)
 
 
+@pytest.mark.parametrize("light", ["reflectivity", "Reflectance", "Intensity", "remission", "i"])
+@pytest.mark.parametrize("beam", ["ring", "Channel", "laser_id"])
+@pytest.mark.parametrize("when", ["Time", "t", "GPS_Time"])
+def test_cloudcompares_word_before_a_field_changes_nothing(light: str, beam: str, when: str, tmp_path: Path):
+    """It writes the further fields of any file that it has read as scalar_NAME, into .ply and above text."""
+    rows = "1 2 3 51 0 5.0\n-2 1 -3 204 1 5.1\n"
+    (tmp_path / "p.xyz").write_text(f"//X Y Z Scalar_{light} Scalar_{beam} Scalar_{when}\n{rows}")
+    found = read(tmp_path / "p.xyz")
+    np.testing.assert_allclose(found.reflectance, [0.2, 0.8], rtol=1e-6)
+    assert found.ring is not None and found.ring.tolist() == [0, 1]
+    assert found.time is not None and found.time.tolist() == [5.0, 5.1] and not found.extra
+    (tmp_path / "p.xyz").write_text(f"x y z scalar_{light} intensity scalar_ring\n1 2 3 51 102 7\n")
+    own = read(tmp_path / "p.xyz")
+    assert own.reflectance[0] == np.float32(0.4) and list(own.extra) == [f"scalar_{light}"], (
+        "the plain name comes first"
+    )
+
+
 def test_intensity_scales_can_be_forced():
     values = np.array([0, 0.5, 1.0])
     np.testing.assert_allclose(reflectance_from(values, "byte"), values / 255, rtol=1e-6)

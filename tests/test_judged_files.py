@@ -256,6 +256,24 @@ def test_images_of_several_sensors_in_one_set_are_told_and_have_no_rows_per_beam
     assert not told(ls.evaluate(real, real), "other beams")
 
 
+def test_points_of_a_sensor_that_nobody_knows_are_told_where_the_images_do_not_see_them(tmp_path: Path):
+    """As of one of a user's own, whose points the protocol's images would squeeze into their first and last rows."""
+    own = Sensor("own", tuple(np.linspace(12, -22, 24) + 0.3 * np.sin(np.arange(24))), width=900)
+    for folder, seeds in (("samples", range(2)), ("real", range(2, 4))):
+        (tmp_path / folder).mkdir()
+        for seed in seeds:
+            write(tmp_path / folder / f"{seed}.pcd", street(seed, own))
+    sides = tmp_path / "samples", tmp_path / "real"
+    notes = told(ls.evaluate(*sides), "that hdl-64e sees, whose images they are drawn into")
+    assert len(notes) == 2 and "points of samples" in notes[0] and "points of the reference" in notes[1]
+    assert "of them outside its view of -24.6 to +3.0 degrees: other beams" in notes[0]
+    assert not told(ls.evaluate(*sides, sensor=own), "other beams")
+    images = [street(seed, own) for seed in range(2)]
+    assert not told(ls.evaluate(images, images), "other beams (of points"), "which keep their own rows"
+    inside = [street(seed, SENSORS["hdl-64e-kitti"].resized(width=64)).to_scan() for seed in range(2)]
+    assert not told(ls.evaluate(inside, inside), "drawn into, found")
+
+
 def test_several_sensors_are_told_of_merged_parts_too(tmp_path: Path):
     (tmp_path / "mixed").mkdir()
     for i, image in enumerate((street(0), street(1), street(2), street(2, KITTI))):

@@ -48,6 +48,25 @@ def test_a_scan_stations_intensities_are_scaled_once(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "p.pts", intensity="none").reflectance, [0, 0, 0])
 
 
+def test_what_ouster_cli_writes_is_read_with_its_rings(tmp_path):
+    """`ouster-cli source CAPTURE save o.csv`, version 1.0.1: metres of two returns, rows of beams, times in ns."""
+    (tmp_path / "o.csv").write_text(
+        "# frame num: 0\n"
+        "# TIMESTAMP (ns), ROW, DESTAGGERED IMAGE COLUMN, MEASUREMENT_ID, RANGE (mm), REFLECTIVITY (%), "
+        "SIGNAL (photons), X1 (m), Y1 (m), Z1 (m), RANGE2 (mm), X2 (m), Y2 (m), Z2 (m)\n"
+        "278309695850,0,0,1006,1891,194,126,-1.8111,-0.1022,0.5685,0,0.0,0.0,0.0\n"
+        "278309695850,1,0,1006,0,0,0,0.0000,0.0000,0.0000,0,0.0,0.0,0.0\n"
+        "278409695850,2,0,1018,1911,51,193,-1.8405,-0.1055,-0.5379,0,0.0,0.0,0.0\n"
+    )
+    found, dropped = read_with_report(tmp_path / "o.csv")
+    np.testing.assert_allclose(found.xyz, [[-1.8111, -0.1022, 0.5685], [-1.8405, -0.1055, -0.5379]], rtol=1e-6)
+    np.testing.assert_allclose(found.reflectance, [194 / 255, 0.2], rtol=1e-6)
+    assert found.ring is not None and found.ring.tolist() == [0, 2] and dropped == 1
+    assert found.time is not None and np.ptp(found.time) == pytest.approx(0.1)
+    own = read_text(b"x,y,z,i,row,x1,y1,z1\n1,2,3,0.5,7,4,5,6\n")  # columns of somebody else
+    assert own["x"] == 1 and own["x1"] == 4 and own["row"] == 7
+
+
 def test_an_empty_cell_is_a_lost_point(tmp_path):
     (tmp_path / "p.xyz").write_text("x,y,z,intensity\n1,,3,1\n1,2,3,1\n")
     assert len(read(tmp_path / "p.xyz")) == 1

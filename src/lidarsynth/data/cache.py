@@ -191,10 +191,19 @@ def _is_stored(index: dict[str, Any], task: _Task, kind: np.dtype, first: int, c
         return False
     if entry["count"] == 0:
         return True
-    size = len(npy_header(kind, entry["count"])) + entry["count"] * kind.itemsize
-    if not path.is_file() or path.stat().st_size != size:
-        return False
-    return not check or sha256(path) == entry["sha256"]
+    return _is_whole(path, kind, entry["count"]) and (not check or sha256(path) == entry["sha256"])
+
+
+def _is_whole(path: Path, kind: np.dtype, count: int) -> bool:
+    """Whether a shard of `count` images is there, by its size."""
+    size = len(npy_header(kind, count)) + count * kind.itemsize
+    return path.is_file() and path.stat().st_size == size
+
+
+def lost_shards(folder: Path, index: dict[str, Any], sensor: Sensor) -> list[str]:
+    """The names of the shards of a cache's index whose files are gone or not whole, by their sizes."""
+    kind, shards = record_type(sensor), sorted(index["shards"].items())
+    return [name for name, entry in shards if entry["count"] and not _is_whole(folder / name, kind, entry["count"])]
 
 
 def _refuse_gone(index: dict[str, Any], task: _Task) -> None:

@@ -14,10 +14,14 @@ from lidarsynth.data.frames import Frame, Frames
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import NAMED_ONLY, READERS
 from lidarsynth.files.labels import label_path
+from lidarsynth.lidar.plural import plural
 
 # Folders of published data sets, and of ours, whose .bin and .pcd hold a value a point, or a radar's points: no scans.
-BESIDE = ("labels", "rings", "point_times", "lidarseg", "panoptic", "predictions")
+BESIDE = ("labels", "rings", "point_times", "lidarseg", "panoptic", "predictions", "sick_points")
 RADAR = "radar_"
+# Of an Argoverse 2 log, in small letters: its other files of such endings, and what is in the name of its map's.
+TABLES = ("annotations.feather", "city_se3_egovehicle.feather", "egovehicle_se3_sensor.feather", "intrinsics.feather")
+HEIGHTS = "_ground_height_surface_"
 LOCK = ".#"  # before the names of links to nothing by which editors lock a file
 
 
@@ -43,7 +47,8 @@ def _frame(path: Path, root: Path) -> Frame:
 
 
 def scan_files(root: str | Path) -> list[Path]:
-    """The scan files under a folder, sorted, but those of BESIDE, radars and caches. Raises ValueError without any."""
+    """The scan files under a folder, sorted, but those of BESIDE, radars, other tables and caches. Raises ValueError
+    without any."""
     root = Path(root)
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
@@ -51,8 +56,20 @@ def scan_files(root: str | Path) -> list[Path]:
     if not paths:
         listed = ", ".join(suffix for suffix in READERS if suffix not in NAMED_ONLY)
         raise ValueError(f"{root}: expected scans ({listed}; {' and '.join(NAMED_ONLY)} by name), found "
-                         f"{'a cache of range images' if is_cache(root) else 'none'}")  # fmt: skip
+                         f"{'a cache of range images' if is_cache(root) else 'none' + _named_only(root)}")  # fmt: skip
     return paths
+
+
+def _named_only(root: Path) -> str:
+    """What is to be said of tables of text in a folder without scans: how they are read, or nothing where none are."""
+    tables = [here / name for here, _, files in walk(root) for name in files if name.lower().endswith(NAMED_ONLY)]
+    if not tables:
+        return ""
+    pattern = str(tables[0].parent / f"*{tables[0].suffix}")
+    return (
+        f" but {plural(len(tables), 'file')} of text: where they are scans, name them, as '{pattern}'; for a cache "
+        f"`lidarsynth project '{pattern}' --out IMAGES` makes images first, which data files takes"
+    )
 
 
 def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
@@ -117,5 +134,6 @@ def by_number(path: Path) -> tuple[str | int, ...]:
 
 
 def _beside(path: Path) -> bool:
-    """Whether a path below the folder leads through one that holds something else of each point."""
-    return any(part in BESIDE or part.startswith(RADAR) for part in map(str.lower, path.parts[:-1]))
+    """Whether a path below the folder leads through one that holds something else of each point, or is a log's."""
+    *folders, name = map(str.lower, path.parts)
+    return any(part in BESIDE or part.startswith(RADAR) for part in folders) or name in TABLES or HEIGHTS in name

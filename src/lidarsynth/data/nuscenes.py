@@ -122,7 +122,8 @@ def _tables(root: Path, split: str) -> Path:
     wanted = there if split == "all" else [name for name in there if name == f"v1.0-{split}"]
     if len(wanted) != 1:
         expected = "one folder v1.0-*; choose a split" if split == "all" else f"v1.0-{split}"
-        raise ValueError(f"{root}: expected {expected}, found {', '.join(there) or 'none'}")
+        found = ", ".join(there) or "none: data files takes scans without tables"
+        raise ValueError(f"{root}: expected {expected}, found {found}")
     return root / wanted[0]
 
 

@@ -22,6 +22,7 @@ from lidarsynth.evaluation.notes import (
     columns_apart,
     one_set,
     other_frames,
+    out_of_images,
     tensors_taken,
     turned_images,
     unlike_metres,
@@ -135,6 +136,7 @@ class _Run:
         """What is unlike in the images that were read, or statistics stand for, and judged as those of `drawn`."""
         sides = {"samples": judged, "the reference": truth}
         told = unused_sensor(self.sensor, judged, drawn) + unlike_sensors(sides, drawn)
+        told += out_of_images(sides, drawn)
         told += tensors_taken(sides, drawn, self.sensor) + unlike_metres(sides) + other_frames(sides)
         if self.protocol.clouds:
             return told

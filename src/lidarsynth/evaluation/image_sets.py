@@ -21,7 +21,7 @@ from lidarsynth.evaluation.protocol import Clouds
 from lidarsynth.evaluation.sample_tensors import check_distances, check_points, from_tensor, within
 from lidarsynth.files.arrays import ZIP_ERRORS, image_of, unzip
 from lidarsynth.files.fields import INTENSITIES, MAX_BYTES
-from lidarsynth.files.formats import READERS, holds_image, naming, no_file, read, read_image
+from lidarsynth.files.formats import NAMED_ONLY, READERS, holds_image, naming, no_file, read, read_image
 from lidarsynth.lidar.corner_grid import decoded, drawn_and_coded, on_corner_grid
 from lidarsynth.lidar.depth import OVERSHOOT
 from lidarsynth.lidar.projection import project_thinned, thin
@@ -175,9 +175,9 @@ def _taken(given: object, name: str) -> Item:
 def _files(path: Path) -> list[Path]:
     """The readable files under a folder, sorted, or the file itself. Hidden files and folders are left out, and what a
     folder of scans may hold beside them, as the other verbs do."""
-    known = (*READERS, *TENSORS)
+    known: tuple[str, ...] = (*READERS, *TENSORS)
     if path.is_dir():
-        files = scans_below(path, TENSORS)
+        files, known = scans_below(path, TENSORS), tuple(suffix for suffix in known if suffix not in NAMED_ONLY)
     else:
         files = [path] if path.is_file() and path.name.lower().endswith(known) else []
     files = [file for file in files if not any(part[0] == "." for part in file.relative_to(path).parts)]

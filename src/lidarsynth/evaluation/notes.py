@@ -15,6 +15,7 @@ from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
+from lidarsynth.lidar.view import out_of_view
 from lidarsynth.streets.hdl64e import own_car
 
 METRES = 1.5  # no outdoor scan ends so near
@@ -52,6 +53,20 @@ def unlike_sensors(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
         return ()
     told = " and ".join(f"{side} of {', '.join(names)}" for side, names in taken.items())
     return (f"the points of {told} are drawn into images of {drawn.name}: other beams",)
+
+
+def out_of_images(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
+    """Notes where points of a side, by some scans of a sensor that is not known, are above or below the view of the
+    one whose images they are drawn into, or on none of its lowest beams; not of points in another frame."""
+    notes = []
+    for side, images in sides.items():
+        scans = [scan for scan in _some(images) if isinstance(scan, Scan)] if images else []
+        unknown = [scan for scan in scans if recognise(scan)[0] is None and not check_frame(scan).faults]
+        told = [text for scan in unknown if (text := out_of_view(scan.xyz, drawn))]
+        if told and 2 * len(told) > len(scans):
+            notes.append(f"expected points of {side} that {drawn.name} sees, whose images they are drawn into, found "
+                         f"{told[0]}: other beams (of points on both sides --sensor names theirs)")  # fmt: skip
+    return tuple(notes)
 
 
 def _sensors_of(images: ImageSet) -> list[str]:

@@ -25,25 +25,16 @@ SHORTEST, LONGEST = 1e-3, 10.0  # seconds that a turn may last
 SCALED = "reflectance by the format"  # a further field: intensities as 0-1, of formats that fix their scale; for "auto"
 PLACE = "place in the file"  # a further field: where each point stood in its file or message, from 1; 0 of a new one
 
-NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, the first found wins; case does not matter
+NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, also behind SCALAR; the first found wins, in any case
     "x": ("x", "points:0", "points_m_xyz:0", "//x"),
     "y": ("y", "points:1", "points_m_xyz:1"),
     "z": ("z", "points:2", "points_m_xyz:2"),
-    "reflectance": ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i", "scalar_intensity"),
-    "ring": ("ring", "channel", "line", "laser", "laser_number", "laser_id", "scalar_ring"),
-    "time": (
-        "time",
-        "timestamp",
-        "t",
-        "offset_time",
-        "offset_ns",
-        "time_offset",
-        "gps_time",
-        "timestamps",
-        "scalar_timestamp",
-    ),
-    "label": ("label", "class", "scalar_label"),
+    "reflectance": ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i"),
+    "ring": ("ring", "channel", "line", "laser", "laser_number", "laser_id"),
+    "time": ("time", "timestamp", "t", "offset_time", "offset_ns", "time_offset", "gps_time", "timestamps"),
+    "label": ("label", "class"),
 }
+SCALAR = "scalar_"  # before the names of fields, as CloudCompare writes them
 
 SCALES: dict[str, float] = {"unit": 1.0, "byte": 255.0, "uint16": 65535.0}  # intensity -> the value of reflectance 1
 INTENSITIES = ("auto", *SCALES, "none")
@@ -57,7 +48,7 @@ class FileError(ValueError):
 def find(fields: Fields, name: str) -> str | None:
     """The file's own name of our field `name` (a key of NAMES), or None."""
     lower = {key.lower(): key for key in reversed(list(fields))}
-    return next((lower[usual] for usual in NAMES[name] if usual in lower), None)
+    return next((lower[word] for start in ("", SCALAR) for own in NAMES[name] if (word := start + own) in lower), None)
 
 
 def check_names(names: Sequence[str]) -> None:

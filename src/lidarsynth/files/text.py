@@ -14,6 +14,7 @@ SEPARATORS = (",", ";", "\t", None)  # None: any white space
 COMMENT = ("#", "//", "%")
 HEADER_LINES = 64
 TRUTHS = {"true": "1", "false": "0"}
+OUSTER = {"x1": "x", "y1": "y", "z1": "z", "row": "ring"}  # of ouster-cli's csv, where two returns have numbers
 DIGITS = 18  # of a count of points, at most
 
 
@@ -36,7 +37,7 @@ def read_text(data: bytes) -> Fields:
         if (_numeric(told) or empty) and len(words) >= 3 and not line.startswith(COMMENT):
             break
         if _names(words):
-            names = [_without_unit(word) or word for word in words]
+            names = _told(words)
         elif line.startswith(COMMENT) and start < HEADER_LINES:
             continue
         elif len(words) == 1 and words[0].isdecimal() and len(words[0]) <= DIGITS and start < HEADER_LINES:
@@ -107,7 +108,15 @@ def _without_blanks(line: str, tabs: int) -> str:
 
 def _names(words: list[str]) -> bool:
     """Whether a line names columns."""
-    return {"x", "y", "z"} <= {_ours(word.strip("#/% \"'")) for word in words}
+    return {"x", "y", "z"} <= set(map(_ours, _told([word.strip("#/% \"'") for word in words])))
+
+
+def _told(words: list[str]) -> list[str]:
+    """The names without units; those of ouster-cli's first returns, and of the row of their beam, in usual words."""
+    names = [_without_unit(word) or word for word in words]
+    lower = {name.lower() for name in names}
+    ousters = {"x1", "y1", "z1"} <= lower and lower.isdisjoint({"x", "y", "z", "ring"})
+    return [OUSTER.get(name.lower(), name) for name in names] if ousters else names
 
 
 def _ours(word: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from lidarsynth.data.angle_files import is_angles, read_angles
 from lidarsynth.data.bag_records import Bag, Cloud
 from lidarsynth.data.bags import SUFFIXES, is_bag, metadata_from, open_bag
+from lidarsynth.data.cache import lost_shards
 from lidarsynth.data.cache_files import is_cache
 from lidarsynth.data.capture import is_capture
 from lidarsynth.data.folder import check_readable, scan_files, walk
@@ -226,6 +227,10 @@ def _cache(path: Path) -> Lines:
     index = read_index(path)
     told, sensor = report(index), from_dict(index["sensor"], str(path), "own")
     lines = {"kind": "cache of range images, for training and as a reference", "images": str(told["stored"])}
+    if lost := lost_shards(path, index, sensor):
+        named = ", ".join(lost[:NAMED]) + (", ..." if lost[NAMED:] else "")
+        lines["broken"] = f"{plural(len(lost), 'shard')} of {len(index['shards'])} gone or cut ({named}); " \
+                          "the same data command makes them anew"  # fmt: skip
     if done(index) < index["count"]:
         lines["unfinished"] = f"{done(index)} of {plural(index['count'], 'scan')} done; {GOES_ON}"
     lines["sensor"] = f"{sensor.name}, {sensor.height} beams x {sensor.width} columns, to {sensor.max_range:g} m"
