@@ -1,5 +1,7 @@
 """Depth codecs: inverse pairs, the reference program's values, and what happens to pixels without a return."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -95,6 +97,22 @@ def test_arrays_and_ranges_alone_become_images():
         np.testing.assert_allclose(image.range, expected.range, rtol=0.05)
         assert image.reflectance.any() == (len(given) == 2)
     assert from_x_0(np.full((2, 64, 1024), -1.0), "hdl-64e").sensor is ls.SENSORS["hdl-64e"]
+
+
+def test_arrays_may_be_read_only_turned_and_of_the_other_byte_order():
+    image = image_of(np.random.default_rng(0).uniform(2, 79, (16, 64)).astype(np.float32))
+    x_0 = to_x_0(image)
+    other = x_0.numpy().astype(x_0.numpy().dtype.newbyteorder())
+    frozen = replace(image, range=image.range.copy(), reflectance=image.reflectance.copy())
+    for part in (other, frozen.range, frozen.reflectance):
+        part.flags.writeable = False
+    torch.set_warn_always(True)
+    try:
+        for given in (other, other[:, ::-1][:, ::-1], x_0.numpy()[..., ::-1].copy()[..., ::-1]):
+            np.testing.assert_array_equal(from_x_0(given, SENSOR).range, from_x_0(x_0, SENSOR).range)
+        torch.testing.assert_close(to_x_0(frozen), x_0, rtol=0, atol=0)
+    finally:
+        torch.set_warn_always(False)
 
 
 def test_other_codes_are_no_x_0():

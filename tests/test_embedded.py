@@ -150,6 +150,14 @@ def test_what_the_program_around_has_set_changes_no_scan(word: str):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_device_around_is_seen_where_torch_names_none(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch, "get_default_device", lambda: torch.device("cpu"))  # as torch 2.6 in a `with`
+    with torch.device("meta"):
+        with usual_torch():
+            assert torch.zeros(1).device.type == "cpu"
+        assert torch.zeros(1).device.type == "meta"
+
+
 def test_the_default_type_stays_as_it_is_needed_until_the_last_thread_is_done():
     one, other = usual_torch(), usual_torch()  # of two threads
     with float64():

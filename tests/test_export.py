@@ -190,6 +190,16 @@ def test_what_cannot_be_exported_is_said_in_a_line(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_open_columns_want_a_torch_that_writes_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for old in ("2.6.0", "2.6.0+cu124"):
+        monkeypatch.setattr(torch, "__version__", type(torch.__version__)(old))
+        with pytest.raises(
+            ValueError, match=rf"^expected torch 2.7 or newer for any .*, found {re.escape(old)}; leave"
+        ):
+            export_onnx(cascade(), tmp_path / "x.onnx", open_columns=True)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_folder_of_the_file_is_made_and_what_is_no_file_is_refused_at_once(tmp_path: Path):

@@ -2,7 +2,9 @@
 
 import copy
 import inspect
+import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterable
 from dataclasses import replace
@@ -161,6 +163,17 @@ def test_the_card_keeps_back_nothing_and_makes_nothing_up():
     assert "\nlicense: cc-by-nc-sa-3.0\n" in kitti
     house = card_of(replace(preset("r2dm-h"), card=Card('for "us": only')))
     assert '\nlicense: other\nlicense_name: "for \\"us\\": only"\n' in house
+
+
+def test_a_hub_elsewhere_is_named_as_huggingface_hub_is_told_of_it():
+    said = []
+    for place in ("", "https://hub.example.org/"):
+        told = "from lidarsynth.systems.hub import HUB; print(HUB)"
+        done = subprocess.run(
+            [sys.executable, "-c", told], env=os.environ | {"HF_ENDPOINT": place}, capture_output=True
+        )
+        said.append(done.stdout.decode().strip())
+    assert said == ["https://huggingface.co", "https://hub.example.org"]
 
 
 def test_the_stand_in_has_the_signatures_of_the_real_one():

@@ -73,6 +73,25 @@ def test_what_stands_where_nothing_returned_is_never_seen(model: CascadeModel, i
         assert_same(filler.complete(spoilt, known), filler.complete(some, known))
 
 
+@pytest.mark.parametrize("word", ["cascade", "bilinear", "kitti-streets"])
+def test_known_pixels_may_be_a_turned_view_or_read_only(model: CascadeModel, image: RangeImage, word: str):
+    filler = model if word == "cascade" else ls.load(word)
+    if word == "kitti-streets":
+        tall, wide = filler.sensor.height // 8, filler.sensor.width // 256
+        parts = (np.tile(part[:8], (tall, wide)) for part in (image.range, image.reflectance, image.mask))
+        image = RangeImage(*parts, filler.sensor)
+    known = np.random.default_rng(0).random(image.shape) < 0.3
+    turned, frozen = known[:, ::-1].copy()[:, ::-1], known.copy()
+    frozen.flags.writeable = False
+    expected = filler.complete(image, known)
+    torch.set_warn_always(True)
+    try:
+        for given in (turned, frozen):
+            np.testing.assert_array_equal(filler.complete(image, given).range, expected.range)
+    finally:
+        torch.set_warn_always(False)
+
+
 def test_where_nothing_is_known_nothing_is_filled(model: CascadeModel, image: RangeImage):
     nothing = np.zeros(image.shape, bool)
     for given, known in ((image, nothing), (image.keep(nothing), None), (image.keep(nothing), ~nothing)):

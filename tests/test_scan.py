@@ -1,6 +1,9 @@
 """Scan and RangeImage: shapes that fit, points out of images and images out of parts of images."""
 
-from dataclasses import replace
+import ast
+import inspect
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +24,16 @@ def image() -> RangeImage:
     reflectance = (rng.random(mask.shape, np.float32) * mask).astype(np.float32)
     label = np.where(mask, rng.integers(1, 20, mask.shape), 0)
     return RangeImage(distance, reflectance, mask, SENSOR, label)
+
+
+def test_the_hints_of_an_image_have_its_fields_and_take_a_word_for_a_sensor():
+    tree = ast.parse(Path(inspect.getfile(RangeImage)).read_text())
+    (image,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == "RangeImage")
+    (hints,) = (node for node in ast.walk(image) if isinstance(node, ast.FunctionDef) and node.name == "__init__")
+    told = {arg.arg: ast.unparse(arg.annotation) for arg in hints.args.args[1:] if arg.annotation}
+    assert told == {f.name: f.type for f in fields(RangeImage)} | {"sensor": "Sensor | str"}
+    given = [default.default for default in fields(RangeImage) if default.default is not MISSING]
+    assert [ast.literal_eval(default) for default in hints.args.defaults] == given
 
 
 def test_a_scan_picks_points_from_all_its_fields():

@@ -79,8 +79,8 @@ def decode(code: Tensor, sensor: Sensor, codec: str = "log") -> Tensor:
 
 def to_x_0(image: RangeImage, codec: str = "log") -> Tensor:
     """RangeImage -> x_0 (2, H, W) float32 in [-1, 1]: range code, reflectance; -1 in both where nothing returned."""
-    distance = torch.from_numpy(np.ascontiguousarray(image.range, np.float32))
-    reflectance = torch.from_numpy(np.ascontiguousarray(image.reflectance, np.float32))
+    parts = (np.require(part, np.float32, ["C", "W"]) for part in (image.range, image.reflectance))
+    distance, reflectance = map(torch.from_numpy, parts)
     return 2 * torch.stack([encode(distance, image.sensor, codec), reflectance]) - 1
 
 
@@ -92,6 +92,8 @@ def from_x_0(x_0: Tensor | np.ndarray, sensor: Sensor | str, codec: str = "log")
     Raises ValueError for another shape, NaN, and values that are not so coded: outside -1 to 1 by more than 0.05 (less
     is clipped; a sampler that passes by more is clamped first), or all of them in 0 to 1.
     """
+    if isinstance(x_0, np.ndarray):  # a view, of a mapped file, of the other byte order: torch takes none of them
+        x_0 = np.array(x_0, x_0.dtype.newbyteorder("="))
     sensor, x_0 = get_sensor(sensor), torch.as_tensor(x_0).detach().float().cpu()
     if x_0.ndim != 3 or x_0.shape[0] not in (1, 2):
         raise ValueError(f"x_0 must be (2, H, W), or (1, H, W) without reflectance, got {tuple(x_0.shape)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -255,6 +256,15 @@ class RangeImage:
     new: np.ndarray | None = None
     instance: np.ndarray | None = None
     boxes: tuple[Box, ...] = ()
+
+    if TYPE_CHECKING:  # the dataclass's own, but that a word may stand for a sensor
+
+        def __init__(
+            self, range: np.ndarray, reflectance: np.ndarray, mask: np.ndarray, sensor: Sensor | str,
+            label: np.ndarray | None = None, xyz: np.ndarray | None = None, completed: Scan | None = None,
+            confidence: np.ndarray | None = None, surface: np.ndarray | None = None, new: np.ndarray | None = None,
+            instance: np.ndarray | None = None, boxes: tuple[Box, ...] = (),
+        ) -> None: ...  # fmt: skip
 
     def __post_init__(self):
         object.__setattr__(self, "sensor", get_sensor(self.sensor))

@@ -33,7 +33,7 @@ def usual_torch() -> Iterator[None]:
         with ExitStack() as stack:
             if torch.is_inference_mode_enabled():
                 stack.enter_context(torch.inference_mode(False))
-            if torch.get_default_device().type != "cpu":
+            if torch.empty(0).device.type != "cpu":  # torch 2.6 names no device of a `with`
                 stack.enter_context(torch.device("cpu"))
             for kind in filter(torch.is_autocast_enabled, KINDS):
                 stack.enter_context(torch.autocast(kind, enabled=False))

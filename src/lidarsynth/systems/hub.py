@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.record import RECORD, WEIGHTS, Experiment
 
 REPOSITORY = re.compile(r"(?P<id>[\w-][\w.-]*/[\w-][\w.-]*)(@(?P<revision>[\w./-]+))?", re.ASCII)
-HUB = "https://huggingface.co"
+HUB = os.environ.get("HF_ENDPOINT", "").rstrip("/") or "https://huggingface.co"  # as huggingface_hub takes it
 
 
 def is_repository(source: str) -> bool:

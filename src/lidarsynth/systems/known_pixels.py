@@ -14,13 +14,14 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 
 
 def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
-    """(H, W) bool: the given pixels, or the measured ones. Raises ValueError for another shape or type."""
+    """(H, W) bool: the given pixels, or the measured ones, laid out as torch takes them. Raises ValueError for another
+    shape or type."""
     known = image.mask if known is None else known
     if not isinstance(known, np.ndarray):
         raise ValueError(f"known must be {image.shape} bool, got a {type(known).__name__}")
     if known.shape != image.shape or known.dtype != np.bool_:
         raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
-    return known
+    return np.require(known, requirements=["C", "W"])
 
 
 def of_rays(image: RangeImage, sensor: Sensor) -> RangeImage:

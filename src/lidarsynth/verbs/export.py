@@ -52,7 +52,8 @@ def export_onnx(model: ScanModel, path: str | Path, sensor: str | None = None, o
 
     The file's metadata name the sensor (JSON), what inputs and outputs are, the model and its licence.
     A folder that is not there is made. The model stays as it is, on its device. Raises ValueError for other models, for
-    a name without .onnx, for open columns that the sensor's own are none of, and where the extra `onnx` is missing.
+    a name without .onnx, for open columns that the sensor's own are none of or before torch 2.7, and where the extra
+    `onnx` is missing.
     """
     path = Path(path)
     _check_writable(path)
@@ -84,7 +85,11 @@ def _check_writable(path: Path) -> None:
 
 
 def _check_columns(sensor: Sensor, graph: Graph) -> None:
-    """Raises ValueError for a sensor whose own images a file with open columns would not take."""
+    """Raises ValueError for a sensor whose own images a file with open columns would not take, and for a torch that
+    writes none."""
+    if graph.open_columns and torch.__version__ < "2.7":  # compares as versions do
+        raise ValueError(f"expected torch 2.7 or newer for any number of columns, found {torch.__version__}; leave "
+                         "--any-columns out")  # fmt: skip
     least = LEAST * graph.multiple
     if graph.open_columns and (sensor.width % graph.multiple or not least <= sensor.width <= LONGEST):
         raise ValueError(f"{sensor.name}: expected a multiple of {graph.multiple} from {least} to {LONGEST} as its own "
