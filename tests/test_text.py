@@ -31,6 +31,19 @@ def test_every_way_of_writing_the_same_points(text: str, tmp_path):
     np.testing.assert_array_equal(scan.reflectance, np.float32([0.5, 0.25]))
 
 
+def test_quotes_blanks_and_empty_cells_change_no_number():
+    """Files without any are read a shorter way."""
+    rows = [[str(i), f"{i / 7:.6f}", "-1e-3", str(2**60 + i)] for i in range(5)]
+    plain = "\n".join(["x,y,z,t", *map(",".join, rows)]) + "\n"
+    known = read_text(plain.encode())
+    assert known["t"].tolist() == [2**60 + i for i in range(5)] and known["x"].tolist() == [0, 1, 2, 3, 4]
+    for text in (plain.replace(",", '","').replace("\n", '"\n"')[:-1].join(('"', "")), plain.replace(",", " , ")):
+        found = read_text(text.encode())
+        assert list(found) == list(known) and all(np.array_equal(found[key], known[key]) for key in known)
+    lost = read_text((plain + ",,,\n").encode())
+    assert np.array_equal(lost["y"][:5], known["y"]) and np.isnan(lost["y"][5])
+
+
 def test_unnamed_columns_are_told_by_their_numbers():
     assert list(read_text(b"1 2 3 255 0 9\n1 2 3 1 2 3\n")) == ["x", "y", "z"]  # colours
     assert list(read_text(b"1 2 3 0.5 7\n1 2 3 0.5 8\n")) == ["x", "y", "z", "intensity", "ring"]

@@ -57,7 +57,7 @@ def read_text(data: bytes) -> Fields:
     if names is None:
         return guessed(table)
     check_names(names)
-    return {name: exact(table[:, i], [row[i] for row in words]) for i, name in enumerate(names)}
+    return {name: exact(table[:, i], (row[i] for row in words)) for i, name in enumerate(names)}
 
 
 def guessed(table: np.ndarray) -> Fields:
@@ -146,7 +146,10 @@ def _table(lines: list[str], separator: str | None, names: list[str] | None) -> 
     rows = [line.split(separator) for line in lines if not line.startswith(COMMENT)]
     if uneven := next((row for row in rows if len(row) != width), None):
         raise FileError(f"expected {width} numbers a line, found {len(uneven)}: {' '.join(uneven)[:40]!r}")
-    words = [[word.strip("\"' ") or "nan" for word in row] for row in rows]
+    try:
+        return np.array(rows, dtype=np.float64), rows
+    except ValueError:  # quoted, or empty
+        words = [[word.strip("\"' ") or "nan" for word in row] for row in rows]
     try:
         return np.array(words, dtype=np.float64), words
     except ValueError:
