@@ -301,6 +301,11 @@ def test_a_scan_is_projected_without_torch(tmp_path: Path):
     assert done.returncode == 0 and (tmp_path / "a.npz").exists() and (tmp_path / "a.png").exists()
     assert "lidarsynth.verbs.batch" in done.stderr and "| torch" not in done.stderr
     assert "torch" not in imported_by(done)
+    np.save(tmp_path / "b.npy", np.load(tmp_path / "a.npy"))
+    words = str(tmp_path / "a.npy"), str(tmp_path / "b.npy"), "--sensor", "vlp-16", "--out", str(tmp_path / "images")
+    done = run_python("-X", "importtime", "-m", "lidarsynth", "project", *words)
+    assert done.returncode == 0 and len(list((tmp_path / "images").glob("?.npz"))) == 2
+    assert "torch" not in imported_by(done)
 
 
 def cpu_seconds(*arguments: str) -> float:
