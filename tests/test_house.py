@@ -270,11 +270,16 @@ def test_experiments_and_presets_are_pure_python():
         assert own <= sys.stdlib_module_names | {"lidarsynth"}
 
 
+def imported_by(done: subprocess.CompletedProcess[str]) -> set[str]:
+    """The modules that `python -X importtime` lists, however deep."""
+    return {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+
+
 def test_help_does_not_import_torch():
     done = run_python("-X", "importtime", "-m", "lidarsynth", "--help")
     assert done.returncode == 0, done.stderr[-500:]
     assert "lidarsynth" in done.stdout
-    read = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    read = imported_by(done)
     assert "lidarsynth.cli.main" in read, "importtime lists what --help imported"
     assert not read & {"torch", "numpy", "PIL", "tqdm.auto", "safetensors", "einops", "typeguard"}
 
@@ -285,6 +290,7 @@ def test_what_a_file_is_is_said_without_torch(tmp_path: Path):
     done = run_python("-X", "importtime", "-m", "lidarsynth", "info", str(tmp_path / "own.toml"))
     assert done.returncode == 0 and "4 from +3.00 to -3.00 degrees" in done.stdout
     assert "| torch" not in done.stderr
+    assert "lidarsynth.verbs.description" in (read := imported_by(done)) and "torch" not in read
 
 
 def test_a_scan_is_projected_without_torch(tmp_path: Path):
@@ -294,6 +300,12 @@ def test_a_scan_is_projected_without_torch(tmp_path: Path):
     done = run_python("-X", "importtime", "-m", "lidarsynth", "project", *words)
     assert done.returncode == 0 and (tmp_path / "a.npz").exists() and (tmp_path / "a.png").exists()
     assert "lidarsynth.verbs.batch" in done.stderr and "| torch" not in done.stderr
+    assert "torch" not in imported_by(done)
+    np.save(tmp_path / "b.npy", np.load(tmp_path / "a.npy"))
+    words = str(tmp_path / "a.npy"), str(tmp_path / "b.npy"), "--sensor", "vlp-16", "--out", str(tmp_path / "images")
+    done = run_python("-X", "importtime", "-m", "lidarsynth", "project", *words)
+    assert done.returncode == 0 and len(list((tmp_path / "images").glob("?.npz"))) == 2
+    assert "torch" not in imported_by(done)
 
 
 def cpu_seconds(*arguments: str) -> float:

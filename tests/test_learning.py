@@ -2,6 +2,7 @@
 
 import lzma
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from test_recognise import turn
 
 from lidarsynth.cli.main import main
 from lidarsynth.files.formats import read, write
+from lidarsynth.lidar import learning
 from lidarsynth.lidar.blocked import blocked_runs
+from lidarsynth.lidar.cones import fit_ring
 from lidarsynth.lidar.frame import check_frame
 from lidarsynth.lidar.learning import _standing, learn_sensor
 from lidarsynth.lidar.recognition import rings_by_elevation
@@ -51,6 +54,30 @@ def test_of_many_scans_enough_are_read_evenly_whether_their_number_is_known_or_n
     learned = learn(Inputs(False, count, lambda: (Turn(i, read) for i in range(450)), True), "own")
     assert ENOUGH / 2 <= learned.scans == len(read) <= ENOUGH
     assert len(set(np.diff(read).tolist())) == 1 and read[0] == 0 and read[-1] > 440
+
+
+def test_a_ring_is_fitted_by_one_thread():
+    """Others' share of so short a work is waiting, long where cores are busy."""
+    rng = np.random.default_rng(0)
+    angle, rho = rng.uniform(-np.pi, np.pi, 30_000), rng.uniform(3, 60, 30_000)
+    xyz = np.stack([rho * np.cos(angle), rho * np.sin(angle), 0.1 * rho + rng.normal(0, 0.01, 30_000)], axis=1)
+    of_all, of_this = time.process_time(), time.thread_time()
+    fit = fit_ring(xyz)
+    of_all, of_this = time.process_time() - of_all, time.thread_time() - of_this
+    assert fit.elevation == pytest.approx(np.degrees(np.arctan(0.1)), abs=1e-2)
+    assert of_all < 1.3 * of_this
+
+
+def test_rings_of_a_beam_each_are_fitted_once(monkeypatch: pytest.MonkeyPatch):
+    fitted: list[float | None] = []
+
+    def counted(xyz: np.ndarray, height: float | None = None):
+        fitted.append(height)
+        return fit_ring(xyz, height)
+
+    monkeypatch.setattr(learning, "fit_ring", counted)
+    learn_sensor([turn(SENSORS["vlp-16"])], "own")
+    assert len(fitted) <= 2 * 16, "with a height of its own, and with none"
 
 
 @pytest.mark.parametrize("name", ["hdl-64e-kitti", "hdl-32e", "vlp-16"])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lidarsynth.files import text as text_files
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import read, read_with_report
 from lidarsynth.files.text import read_text
@@ -29,6 +30,24 @@ def test_every_way_of_writing_the_same_points(text: str, tmp_path):
     scan = read(tmp_path / "p.csv")
     np.testing.assert_array_equal(scan.xyz, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(scan.reflectance, np.float32([0.5, 0.25]))
+
+
+def test_quotes_blanks_and_empty_cells_change_no_number(monkeypatch: pytest.MonkeyPatch):
+    """Files without any are read a shorter way, and all by so many lines at a time."""
+    rows = [[str(i), f"{i / 7:.6f}", "-1e-3", str(2**60 + i)] for i in range(5)]
+    plain = "\n".join(["x,y,z,t", *map(",".join, rows)]) + "\n"
+    known = read_text(plain.encode())
+    assert known["t"].tolist() == [2**60 + i for i in range(5)] and known["x"].tolist() == [0, 1, 2, 3, 4]
+    for text in (plain.replace(",", '","').replace("\n", '"\n"')[:-1].join(('"', "")), plain.replace(",", " , ")):
+        found = read_text(text.encode())
+        assert list(found) == list(known) and all(np.array_equal(found[key], known[key]) for key in known)
+    monkeypatch.setattr(text_files, "BLOCK", 2)  # lines
+    found = read_text(plain.replace("1,0.", '"1",0.').encode())
+    assert all(np.array_equal(found[key], known[key]) for key in known)
+    with pytest.raises(FileError, match=r"expected numbers in column y, found 'two'"):
+        read_text((plain + "5,two,0,0\n").encode())
+    lost = read_text((plain + ",,,\n").encode())
+    assert np.array_equal(lost["y"][:5], known["y"]) and np.isnan(lost["y"][5])
 
 
 def test_unnamed_columns_are_told_by_their_numbers():

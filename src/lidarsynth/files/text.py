@@ -15,6 +15,7 @@ COMMENT = ("#", "//", "%")
 HEADER_LINES = 64
 TRUTHS = {"true": "1", "false": "0"}
 OUSTER = {"x1": "x", "y1": "y", "z1": "z", "row": "ring"}  # of ouster-cli's csv, where two returns have numbers
+BLOCK = 1 << 16  # lines
 DIGITS = 18  # of a count of points, at most
 
 
@@ -50,7 +51,8 @@ def read_text(data: bytes) -> Fields:
         if names is not None and not any(counts):  # and nothing else: a scan of no point
             return {name: np.zeros(0) for name in names}
         raise FileError(f"expected lines of x y z and more numbers, found none in {plural(len(lines), 'line')}")
-    table, words = _table(lines[start:], separator, names)
+    rows = [line for line in lines[start:] if not line.startswith(COMMENT)]
+    table = _table(rows, separator, names)
     if len(counts) == 1 and counts[0] != len(table):
         raise FileError(f"expected {plural(counts[0], 'point')}, the number before them, found {len(table)}")
     if names is not None and len(names) != table.shape[1]:
@@ -58,7 +60,7 @@ def read_text(data: bytes) -> Fields:
     if names is None:
         return guessed(table)
     check_names(names)
-    return {name: exact(table[:, i], [row[i] for row in words]) for i, name in enumerate(names)}
+    return {n: exact(table[:, i], (_bare(row.split(separator)[i]) for row in rows)) for i, n in enumerate(names)}
 
 
 def guessed(table: np.ndarray) -> Fields:
@@ -149,17 +151,30 @@ def _no_number(words: list[str], names: list[str] | None) -> str:
     return f"expected numbers{where}, found {word[:40]!r}"
 
 
-def _table(lines: list[str], separator: str | None, names: list[str] | None) -> tuple[np.ndarray, list[list[str]]]:
-    """(N, columns) float64, and the words that it was read from; an empty cell is NaN."""
+def _table(lines: list[str], separator: str | None, names: list[str] | None) -> np.ndarray:
+    """(N, columns) float64; an empty cell is NaN. Words are held of BLOCK lines at a time."""
     width = len(_words(lines[0], separator))
-    rows = [line.split(separator) for line in lines if not line.startswith(COMMENT)]
+    return np.concatenate(
+        [_numbers(lines[i : i + BLOCK], separator, names, width) for i in range(0, len(lines), BLOCK)]
+    )
+
+
+def _numbers(lines: list[str], separator: str | None, names: list[str] | None, width: int) -> np.ndarray:
+    rows = [line.split(separator) for line in lines]
     if uneven := next((row for row in rows if len(row) != width), None):
         raise FileError(f"expected {width} numbers a line, found {len(uneven)}: {' '.join(uneven)[:40]!r}")
-    words = [[word.strip("\"' ") or "nan" for word in row] for row in rows]
     try:
-        return np.array(words, dtype=np.float64), words
+        return np.array(rows, dtype=np.float64)
+    except ValueError:  # quoted, or empty
+        words = [[_bare(word) or "nan" for word in row] for row in rows]
+    try:
+        return np.array(words, dtype=np.float64)
     except ValueError:
         words = words if names is None else [_with_truths(row) for row in words]
         if lost := next((row for row in words if not _numeric(row)), None):
             raise FileError(_no_number(lost, names)) from None
-        return np.array(words, dtype=np.float64), words
+        return np.array(words, dtype=np.float64)
+
+
+def _bare(word: str) -> str:
+    return word.strip("\"' ")

@@ -3,14 +3,14 @@ types that headers declare, and those that a type does not hold."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 EXACT = 2**53  # up to which float64 tells whole numbers apart
 
 
-def exact(column: np.ndarray, words: Sequence[bytes] | Sequence[str]) -> np.ndarray:
+def exact(column: np.ndarray, words: Iterable[bytes] | Iterable[str]) -> np.ndarray:
     """A column (N,) of float64 as int64 or uint64, where it is of whole numbers that float64 does not tell apart, and
     one of these types does; else as it is. `words` are its numbers as the file writes them."""
     if not (np.isfinite(column).all() and np.abs(column).max(initial=0) >= EXACT):

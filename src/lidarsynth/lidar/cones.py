@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarsynth.lidar.inner_product import inner_product
+
 NEAR = 2.0  # metres: nearer points are the carrier's own, and their angle says little of the beam
 ROUNDS = 12
 POINTS = 4_000  # of a scan are enough
@@ -118,10 +120,10 @@ def fit_ring(xyz: np.ndarray, height: float | None = None) -> Ring:
         scale = _deviation(residual)
         weight = robust_weight(residual, scale)
         total = weight.sum()
-        mean_value, mean_inverse = weight @ values / total, weight @ inverse / total
-        spread = weight @ (inverse - mean_inverse) ** 2
+        mean_value, mean_inverse = inner_product(weight, values) / total, inner_product(weight, inverse) / total
+        spread = inner_product(weight, (inverse - mean_inverse) ** 2)
         if height is None and spread > 1e-9:
-            lift = float(weight @ ((inverse - mean_inverse) * (values - mean_value)) / spread)
+            lift = float(inner_product(weight, (inverse - mean_inverse) * (values - mean_value)) / spread)
             error = float(scale / np.sqrt(spread))
         slope = float(mean_value - lift * mean_inverse)
     return Ring(float(np.degrees(np.arctan(slope))), lift, error, float(np.degrees(scale)), len(xyz))

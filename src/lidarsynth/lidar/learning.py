@@ -295,8 +295,10 @@ def _fit_rows(points: list[np.ndarray], least: int = THIN) -> tuple[list[Ring], 
     rows = np.flatnonzero(size >= FEWEST)
     if len(rows) < 2:
         raise ValueError(f"expected rings of at least {FEWEST} points beyond {NEAR:g} m, found {len(rows)}")
-    group = _of_one_beam(_fits([points[row] for row in rows]))
-    fits = _fits([np.concatenate([points[row] for row in rows[group == own]]) for own in range(group.max() + 1)])
+    fits = _fits([points[row] for row in rows])
+    group = _of_one_beam(fits)
+    if group.max() + 1 < len(rows):  # some rings are of one beam
+        fits = _fits([np.concatenate([points[row] for row in rows[group == own]]) for own in range(group.max() + 1)])
     row_of = np.full(len(points), -1)
     row_of[rows] = group
     few = np.flatnonzero((size >= least) & (size < FEWEST))

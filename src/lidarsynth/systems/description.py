@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-
-from torch import nn
+from typing import TYPE_CHECKING
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.sensor import Sensor
+
+if TYPE_CHECKING:  # `info` of a scan needs no torch
+    from torch import nn
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from hashlib import blake2b
+from typing import TYPE_CHECKING
 
-from lidarsynth.systems.scan_model import ScanModel
+if TYPE_CHECKING:  # `project` of many scans needs no torch
+    from lidarsynth.systems.scan_model import ScanModel
 
 
 def fingerprint(model: ScanModel) -> str:

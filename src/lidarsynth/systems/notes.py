@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, ClassVar, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
-from torch import Tensor
 
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
@@ -14,9 +13,11 @@ from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import caution, few_beams
 from lidarsynth.lidar.view import beyond_beams, out_of_view
-from lidarsynth.networks.tensors import as_array
 
-Points: TypeAlias = Scan | np.ndarray | Tensor  # that a model is given: a scan, or (N, 3) or (N, 4), on any device
+if TYPE_CHECKING:  # `project` needs no torch
+    from torch import Tensor
+
+Points: TypeAlias = "Scan | np.ndarray | Tensor"  # that a model is given: a scan, or (N, 3) or (N, 4), on any device
 IN_PYTHON = ", or take model.into(sensor)"  # beside the command line's option, which the reason names
 
 
@@ -30,6 +31,8 @@ class Knows(Protocol):
 
 def taken(points: Points) -> Scan:
     """The points as a scan. Raises ValueError as `lidar.scan.as_scan`."""
+    from lidarsynth.networks.tensors import as_array
+
     return as_scan(as_array(points))
 
 

@@ -177,11 +177,11 @@ def run(job: Job, works: Iterable[Work], workers: int = 1, model: ScanModel | No
 
 def start(job: Job, model: ScanModel | None, on_step: OnStep, workers: int) -> Callable[[Work], Result]:
     """What one process does with each scan, its model loaded once."""
-    if workers > 1:
-        import torch
-
-        torch.set_num_threads(1)
     if job.verb != "project":
+        if workers > 1:
+            import torch
+
+            torch.set_num_threads(1)
         if model is None:
             from lidarsynth.weights.load import load
 

@@ -7,15 +7,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
-from lidarsynth.metrics.reconstruction import Errors, mean_errors
 from lidarsynth.verbs.batch import MEANT, Result
 from lidarsynth.verbs.earlier_results import journal_path, made_rows, read_report
 from lidarsynth.verbs.expansion import is_stream
+
+if TYPE_CHECKING:  # `project` needs no torch
+    from lidarsynth.metrics.reconstruction import Errors
 
 REPORT = "report.json"
 Shard = tuple[int, int]  # this part, counted from 1, and all parts
@@ -195,7 +197,11 @@ def unfinished(settings: Mapping[str, Any], mixed: bool = False) -> dict[str, An
 def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The mean over scans of each method's errors, or nothing."""
     tables = [row["errors"] for row in rows if "errors" in row]
-    methods = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
+    if not tables:
+        return {}
+    from lidarsynth.metrics.reconstruction import mean_errors
+
+    methods = [name for name in tables[0] if all(name in table for table in tables)]
     means = {name: mean_errors([_errors(table[name]) for table in tables]) for name in methods}
     return {"errors": {name: _plain(mean) for name, mean in means.items()}} if means else {}
 
@@ -206,6 +212,8 @@ def _plain(errors: Errors) -> dict[str, float | None]:
 
 
 def _errors(row: Mapping[str, Any]) -> Errors:
+    from lidarsynth.metrics.reconstruction import Errors
+
     values: dict[str, Any] = {name: math.nan if value is None else value for name, value in row.items()}
     return Errors(**values)
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidarsynth.lidar.inner_product import inner_product
 from lidarsynth.lidar.scan import RangeImage
 
 # Pixels around, without a known one, that make a gap; how far a return may be from straight, and a ring's step to be of
@@ -79,14 +80,14 @@ class _Bends:
         scale = STAYING + self._summed(weight, self.by_one**2, self.by_other**2, 1)
         left = STAYING * (1 - change) - self._back(weight * bend)
         added, ahead = np.zeros_like(change), left / scale
-        size = first = left @ ahead
+        size = first = inner_product(left, ahead)
         for _ in range(SOLVING):
             if size <= ENOUGH * first:
                 break
             pull = self._back(weight * self._bend(ahead, 0.0)) + STAYING * ahead
-            step = size / (ahead @ pull)
+            step = size / inner_product(ahead, pull)
             added, left = added + step * ahead, left - step * pull
-            before, size = size, left @ (left / scale)
+            before, size = size, inner_product(left, left / scale)
             ahead = left / scale + size / before * ahead
         return added
 
