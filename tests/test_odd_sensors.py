@@ -1,6 +1,7 @@
 """Sensors and scans that a model cannot do anything with are refused in one line; the rest of the odd ones are done."""
 
 import pickle
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -98,3 +99,12 @@ def test_beams_that_meet_the_ground_within_three_metres_are_seen_to_be_there(top
     assert out_of_view(points, sensor) is None
     raised = points + np.array([0, 0, mount], np.float32)  # a dome sees points there, too
     assert (out_of_view(raised, sensor) is None) == (bottom == -90)
+
+
+@pytest.mark.parametrize(("mount", "told"), [(4.0, 0), (15.0, 1)])
+def test_scans_of_a_sensor_on_a_roof_are_said_to_have_too_little_ground(model, mount, told):
+    roof = model.into(Sensor("roof", BEAMS, width=128, mount=mount)).choosing(1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        roof.generate(1, steps=1)
+    assert [str(warning.message).startswith("expected a sensor up to 5 m") for warning in caught] == [True] * told

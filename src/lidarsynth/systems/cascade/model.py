@@ -54,7 +54,7 @@ from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, on
 from lidarsynth.systems.cascade.naming import GROWING, RARER, RIDERS, named, sketched
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast, unnamed
-from lidarsynth.systems.cascade.request import calls, resolved
+from lidarsynth.systems.cascade.request import calls, resolved, warn_of_height
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.shading import shaded
 from lidarsynth.systems.cascade.silent import silent_rows, with_silent
@@ -147,6 +147,7 @@ class CascadeModel(AnySensorModel):
         Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """
         self._checked(n, steps, seed, sampler, batch_size, first)
+        warn_of_height(self.sensor)
         how, whole = sampling(self.network, steps, sampler), self.into(whole_turn(self.sensor))
         return each_usually(within(whole._drawn(n, how, checked_seed(seed), batch_size, first, on_step), self.sensor))
 
