@@ -1,6 +1,7 @@
 """Sensors and scans that a model cannot do anything with are refused in one line; the rest of the odd ones are done."""
 
 import pickle
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import lidarsynth as ls
 from lidarsynth.lidar.scan import RangeImage, Scan
 from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.view import out_of_view
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
 
@@ -86,3 +88,23 @@ def test_nothing_in_a_gap_comes_nearer_than_the_sensor_sees():
     far = RangeImage(metres + 1, np.zeros_like(metres), np.ones_like(told), sensor)
     assert straight_in_gaps(image, told).range.min() > 1.0
     assert straight_in_gaps(far, told).range.min() < 2.0002  # it does come nearer where it may
+
+
+@pytest.mark.parametrize(("top", "bottom", "mount"), [(-5, -60, 1.5), (90, -90, 0.6), (10, -55, 0.5)])
+def test_beams_that_meet_the_ground_within_three_metres_are_seen_to_be_there(top, bottom, mount):
+    sensor = ls.Sensor(
+        "steep", tuple(np.linspace(top, bottom, 32).tolist()), 512, min_range=0.1, max_range=30.0, mount=mount
+    )
+    points = SyntheticStreets(7, 1, sensor).image(0).to_scan().xyz
+    assert out_of_view(points, sensor) is None
+    raised = points + np.array([0, 0, mount], np.float32)  # a dome sees points there, too
+    assert (out_of_view(raised, sensor) is None) == (bottom == -90)
+
+
+@pytest.mark.parametrize(("mount", "told"), [(4.0, 0), (15.0, 1)])
+def test_scans_of_a_sensor_on_a_roof_are_said_to_have_too_little_ground(model, mount, told):
+    roof = model.into(Sensor("roof", BEAMS, width=128, mount=mount)).choosing(1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        roof.generate(1, steps=1)
+    assert [str(warning.message).startswith("expected a sensor up to 5 m") for warning in caught] == [True] * told

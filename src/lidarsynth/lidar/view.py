@@ -111,7 +111,9 @@ def out_of_view(xyz: np.ndarray, sensor: Sensor) -> str | None:
     outside = float(_outside(elevation, sensor).mean())
     if outside > OUTSIDE:
         return f"{outside:.0%} of them outside its view of {_view(sensor)}"
-    below = int((np.array(sensor.elevations) < np.quantile(elevation, LOWEST) - MARGIN).sum())
+    near = np.quantile(elevations_of(xyz - _lift(sensor)), LOWEST)  # steep beams meet the ground within 3 m alone
+    lowest = min(np.quantile(elevation, LOWEST), near) - MARGIN
+    below = int((np.array(sensor.elevations) < lowest).sum())
     return f"none on its {below} lowest beams of {sensor.height}" if below > BELOW * sensor.height else None
 
 

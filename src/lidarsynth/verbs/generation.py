@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -19,12 +20,14 @@ from typing import Any, NamedTuple
 from lidarsynth.data.workers import in_order
 from lidarsynth.files.formats import WRITERS, write, write_labels
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sensor import UnlikelySensorWarning
 from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.whole_file import sweep, write_whole
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.systems.cascade.model import FILL_STEPS, CascadeModel
+from lidarsynth.systems.cascade.request import warn_of_height
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 from lidarsynth.verbs.companions import LABEL
 from lidarsynth.verbs.insertion import BOXES
@@ -181,6 +184,8 @@ def generate_into(
         for run in runs:
             yield from make(model, run, on_step)
         return
+    if isinstance(model, CascadeModel):
+        warn_of_height(model.sensor)
     pieces = cut(runs, model.together)
     threads = max(1, (os.cpu_count() or 1) // workers)
     with closing(in_order(partial(_piece, make, source, pieces, threads), range(len(pieces)), workers)) as made:
@@ -223,6 +228,7 @@ def _opened(source: Drawing, threads: int) -> ScanModel:
 
     from lidarsynth.weights.load import load
 
+    warnings.simplefilter("ignore", UnlikelySensorWarning)  # told by the process that began this one
     torch.set_num_threads(threads)
     return source.of(load(source.model, device=source.device))
 

@@ -54,9 +54,10 @@ from lidarsynth.systems.cascade.layout import CHOICE, block, detailed, grids, on
 from lidarsynth.systems.cascade.naming import GROWING, RARER, RIDERS, named, sketched
 from lidarsynth.systems.cascade.perfect import fitting, logistic, observed, observing
 from lidarsynth.systems.cascade.recast import all_recast, as_cast, unnamed
-from lidarsynth.systems.cascade.request import calls, resolved
+from lidarsynth.systems.cascade.request import calls, resolved, warn_of_height
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.shading import shaded
+from lidarsynth.systems.cascade.silent import silent_rows, with_silent
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.cascade.surfaces import paved
 from lidarsynth.systems.cascade.unit import as_streets
@@ -146,6 +147,7 @@ class CascadeModel(AnySensorModel):
         Raises ValueError for an unknown sampler, steps of `columns`, counts below 1, or a sensor smaller than the grid.
         """
         self._checked(n, steps, seed, sampler, batch_size, first)
+        warn_of_height(self.sensor)
         how, whole = sampling(self.network, steps, sampler), self.into(whole_turn(self.sensor))
         return each_usually(within(whole._drawn(n, how, checked_seed(seed), batch_size, first, on_step), self.sensor))
 
@@ -193,6 +195,7 @@ class CascadeModel(AnySensorModel):
             parts = Told(metres, reflectance, told), own.sensor, dim, rays_at, rng, how, on_step
             slopes = np.tan(np.radians(np.asarray(own.sensor.elevations)))
             metres, reflectance, told = with_planes(with_holes_drawn(self.network, *parts), known, slopes)
+            told &= known | ~silent_rows(known, image.mask, self._blocked)[:, None]  # those are no holes
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
@@ -306,13 +309,7 @@ class CascadeModel(AnySensorModel):
         return named(*told, self.precision, least, more, inside=inside)
 
     def _between(
-        self,
-        metres: np.ndarray,
-        reflectance: np.ndarray,
-        rows: np.ndarray,
-        columns: np.ndarray,
-        rng: Each,
-        kinds: list,
+        self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: Each, kinds: list
     ) -> list[RangeImage]:
         """Samples of whole images, told metres (B, R, C), 0 for no return, and reflectance of rows and columns."""
         ranges, shades, told = placed(metres, reflectance, rows, columns, self.sensor, self._blocked)
@@ -329,20 +326,20 @@ class CascadeModel(AnySensorModel):
         return signals(*own._network(pixels, None, doubt=True))[0, :, : self.sensor.height, : self.sensor.width]
 
     def _fill(
-        self,
-        metres: np.ndarray,
-        reflectance: np.ndarray,
-        told: np.ndarray,
-        lit: bool,
-        rng: Each,
-        kinds: Each = None,
+        self, metres: np.ndarray, reflectance: np.ndarray, told: np.ndarray, lit: bool, rng: Each, kinds: Each = None
     ) -> list[RangeImage]:
         """Images of (B, H, W) known pixels: the most likely ones, or, with generators, samples.
 
         kinds  generators that draw classes, and edges as one draws them; None = those of samples
         """
-        known = known_of(metres, reflectance, told, lit, padded(self.sensor))
-        return self._answers(known, rng, kinds=kinds or rng, recorded=kinds is None)
+
+        def ask(told: np.ndarray) -> list[RangeImage]:
+            known = known_of(metres, reflectance, told, lit, padded(self.sensor))
+            return self._answers(known, rng, kinds=kinds or rng, recorded=kinds is None)
+
+        if kinds is not None and rng is None:  # what a sample in the making is corrected by
+            return ask(told)
+        return with_silent(ask, told, metres > 0 if kinds is None else told, self._blocked)
 
     def _answers(
         self, known: Known, rng: Each, surely: np.ndarray | None = None, kinds: Each = None, recorded: bool = False

@@ -1,15 +1,18 @@
-"""What may be asked of a cascade's completion, and with what it answers where nothing is said."""
+"""What may be asked of a cascade, with what it answers where nothing is said, and of which sensors it may not draw."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 from lidarsynth.diffusion import repaint
+from lidarsynth.lidar.sensor import Sensor, UnlikelySensorWarning
 from lidarsynth.systems.cascade.layout import STEPS_DEFAULT
 from lidarsynth.systems.filling import Filling
 
 METHODS = ("auto", "conditional", "sample", "repaint")
 RESAMPLES_DEFAULT = 10
+HIGHEST = 5.0  # metres; layouts have learned from 1.2 to 2.5: seen from 4 half of the returns are ground, as in streets
 
 
 def resolved(how: Filling, name: str) -> Filling:
@@ -32,3 +35,11 @@ def calls(how: Filling) -> int:
         return 1
     assert how.steps is not None and how.resamples is not None
     return 1 + repaint.evaluations(how.steps, how.resamples)
+
+
+def warn_of_height(sensor: Sensor) -> None:
+    """Warns where a sensor stands higher than what layouts have learned of allows: its scans have too little ground."""
+    if sensor.mount > HIGHEST:
+        warnings.warn(f"expected a sensor up to {HIGHEST:g} m above the road to generate, found {sensor.name} at "
+                      f"{sensor.mount:g} m: scans have far too little ground and too much of walls; `streets` casts "
+                      "such scans", UnlikelySensorWarning, stacklevel=3)  # fmt: skip
