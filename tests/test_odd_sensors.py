@@ -9,7 +9,7 @@ import pytest
 
 import lidarsynth as ls
 from lidarsynth.lidar.scan import RangeImage, Scan
-from lidarsynth.lidar.sensor import Sensor, get_sensor
+from lidarsynth.lidar.sensor import Sensor, from_dict, get_sensor
 from lidarsynth.lidar.view import out_of_view
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
@@ -108,3 +108,15 @@ def test_scans_of_a_sensor_on_a_roof_are_said_to_have_too_little_ground(model, m
         warnings.simplefilter("always")
         roof.generate(1, steps=1)
     assert [str(warning.message).startswith("expected a sensor up to 5 m") for warning in caught] == [True] * told
+
+
+def test_nothing_is_put_where_the_sensor_of_a_sparse_scan_never_looks(model):
+    table = {"name": "ahead", "beams": 64, "top": 12.5, "bottom": -12.5, "width": 1024, "view": [-60, 60]}
+    ahead = from_dict(table)
+    scan = SyntheticStreets(777, 1, ahead)[0]
+    with pytest.warns(UserWarning, match="found hardly any in 23. degrees of the turn"):
+        done = model.into("hdl-64e").upsample(scan, ahead)
+    row, column = np.nonzero(done.new)
+    azimuth = np.degrees(done.sensor.ray_angles()[1][row, column])
+    assert (np.array(done.sensor.elevations)[row] < -13).sum() > 1000, "below its beams, ahead, much is put"
+    assert np.abs(azimuth).max() < 61

@@ -48,7 +48,8 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
     """A scan of `sensor_in` in the image of `sensor`, and which pixels it looked at: (H, W) bool.
 
     A pixel was looked at where it was measured, and, empty, where the nearest beam of `sensor_in` reported no return
-    in that direction. Raises ValueError when no point falls into the image.
+    in that direction; and, empty, wherever `sensor_in` never looks, whatever the beam, as behind one that looks ahead.
+    Raises ValueError when no point falls into the image.
     """
     image = check_seen(project(replace(scan, ring=None), sensor, "spherical"), len(scan))
     own = project(scan, sensor_in, "auto", width=sensor.width)
@@ -60,6 +61,8 @@ def sparse_image(scan: Scan, sensor_in: Sensor, sensor: Sensor) -> tuple[RangeIm
     answered = np.any([np.roll(own.mask, shift, axis=1) for shift in range(-2, 3)], axis=0)
     for beam in beams:
         known[gap[beam].argmin()] |= ~answered[beam]
+    middles = (np.arange(sensor.width) + 0.5) / sensor.width
+    known |= sensor_in.blocked_rays()[:, (middles * sensor_in.width).astype(int)].all(axis=0)
     return image, known
 
 
