@@ -8,8 +8,9 @@ streets    held-out worlds as hdl-64e-kitti sees them: whole, and of every fourt
            them the RangeNet on the whole scans
 real       folders of labelled real scans, read as `benchmarks/street.py --classes` reads them
 inside     held-out buildings, seen by virtual sensors of which nobody says how they stand: returns that get their
-           class, furniture none; and how many of these scans, of streets of virtual sensors, and of the scans of
-           `streets` and `real` are taken for the inside of a building, as they have floors
+           class, furniture none; and how many of these scans, of streets of virtual sensors and of those of robots,
+           0.25 to 1.8 m up, and of the scans of `streets` and `real` are taken for the inside of a building, as they
+           have floors
 by-class   the IoU of each class, of streets and real scans that are wholly known
 least      of streets and real scans: how many pixels keep a class with so much confidence, and how many are right
 
@@ -32,6 +33,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER, CLASSES
 from lidarsynth.metrics.reconstruction import class_iou, confusion_matrix
 from lidarsynth.networks.rangenet import RangeNet
+from lidarsynth.streets.interiors import draw_robot
 from lidarsynth.streets.virtual import VirtualStreets
 from lidarsynth.streets.world import POSES
 from lidarsynth.systems.cascade.model import CascadeModel
@@ -101,10 +103,11 @@ def inside(model: CascadeModel, count: int, others: dict[str, list[RangeImage]])
     """Lines of a Markdown table: of each class in buildings, how many of its returns get it, and IoU; and how many
     scans of each kind are taken for the inside of a building."""
     floor, counts, taken = CLASS_NUMBER["other-ground"], np.zeros((20, 20), np.int64), []
-    wide = VirtualStreets(any_sensor.HELD_OUT, POSES * count)
+    wide, low = (VirtualStreets(any_sensor.HELD_OUT, POSES * count, drawn=drawn) for drawn in (None, draw_robot))
     sets = {
         f"{count} buildings": any_sensor.buildings(count),
         f"{count} streets": [wide.image(POSES * k) for k in range(count)],
+        f"{count} streets by robots": [low.image(POSES * k) for k in range(count)],
     }
     for name, images in (sets | others).items():
         answers = [answered(model.into(image.sensor).with_labels(), image).label for image in images]
