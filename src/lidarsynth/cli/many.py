@@ -89,7 +89,8 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     for line in inputs.words:
         warn(line)
     if many.workers > 1 and not inputs.single:
-        begin_early("lidarsynth.verbs.batch", *["lidarsynth.weights.load"] * (job.verb != "project"))
+        load = () if job.verb == "project" else ("lidarsynth.weights.load",)
+        begin_early("lidarsynth.verbs.batch", *load)
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)
@@ -171,7 +172,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending, report = many.format or ("npz" if job.verb == "project" else "ply"), report_path(out, shard)
-    check_report(report)
+    check_report(out, shard)
     before = rows_before(out, shard, ending) if many.skip_existing else {}
     if (told := other_names(out, ending, before, inputs.places)) is not None:
         warn(told)
