@@ -13,6 +13,7 @@ from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.view import out_of_view
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
+from lidarsynth.verbs import generation
 
 BEAMS = tuple(np.linspace(10.0, -20.0, 16).tolist())
 
@@ -108,3 +109,15 @@ def test_scans_of_a_sensor_on_a_roof_are_said_to_have_too_little_ground(model, m
         warnings.simplefilter("always")
         roof.generate(1, steps=1)
     assert [str(warning.message).startswith("expected a sensor up to 5 m") for warning in caught] == [True] * told
+
+
+def test_processes_say_nothing_of_a_sensor_on_a_roof_again(model, tmp_path, monkeypatch):
+    roof = model.into(Sensor("roof", BEAMS, width=128, mount=15.0)).choosing(1)
+    monkeypatch.setattr(generation, "_opened", lambda source, threads: roof)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        parts = tmp_path, roof, [range(1)], 4, (".npz",), 1
+        assert len(list(generation.generate_into(*parts, workers=2, source=generation.Drawing()))) == 1  # by this one
+        assert len(caught) == 1
+        roof.generate(1, steps=1)
+        assert len(caught) == 2, "whose program is told of others as before"
