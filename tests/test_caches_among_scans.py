@@ -139,6 +139,9 @@ def test_a_folder_of_text_says_how_such_scans_are_taken(tmp_path: Path, capsys: 
     error = refused(["data", "files", folder, tmp_path / "cache", "--sensor", "vlp-16"], capsys)
     assert f"found none but 2 files of text: where they are scans, name them, as '{folder}/*.csv'; for a cache" in error
     assert f"`lidarsynth project '{folder}/*.csv' --out IMAGES` makes images first" in error
+    (folder / "NOTES.txt").touch()
+    error = refused(["data", "files", folder, tmp_path / "cache", "--sensor", "vlp-16"], capsys)
+    assert f"none but 3 files of text: where they are scans, name them, as '{folder}/*.csv'; for a cache" in error
     main(["project", f"{folder}/*.csv", "--sensor", "vlp-16", "--out", str(tmp_path / "images"), "--no-picture"])
     main(["data", "files", str(tmp_path / "images"), str(tmp_path / "cache"), "--workers", "0"])
     assert len(CachedImages(tmp_path / "cache")) == 2

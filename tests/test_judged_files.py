@@ -272,6 +272,11 @@ def test_points_of_a_sensor_that_nobody_knows_are_told_where_the_images_do_not_s
     assert not told(ls.evaluate(images, images), "other beams (of points"), "which keep their own rows"
     inside = [street(seed, SENSORS["hdl-64e-kitti"].resized(width=64)).to_scan() for seed in range(2)]
     assert not told(ls.evaluate(inside, inside), "drawn into, found")
+    outside = [street(seed, own).to_scan() for seed in range(2)]
+    assert told(ls.evaluate(outside, outside), "drawn into, found")
+    assert not told(ls.evaluate(outside + inside, inside), "drawn into, found"), "where no more than half are of others"
+    camera = [Scan(scan.xyz[:, [1, 2, 0]] * np.float32([-1, -1, 1]), scan.reflectance) for scan in outside]
+    assert not told(ls.evaluate(camera, camera), "drawn into, found"), "whose frame is what is told of"
 
 
 def test_several_sensors_are_told_of_merged_parts_too(tmp_path: Path):

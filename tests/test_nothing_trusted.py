@@ -259,6 +259,25 @@ def test_a_report_takes_the_place_of_its_own_kind_alone(tmp_path: Path, capsys):
         evaluate.check_out(report)
 
 
+def test_the_report_of_all_shards_takes_the_place_of_its_own_kind_alone(tmp_path: Path, capsys):
+    out, report = tmp_path / "out", tmp_path / "out/report.json"
+    for name in "ab":
+        xyz = np.random.default_rng(0).uniform(-20, 20, (500, 3)).astype(np.float32)
+        write(tmp_path / f"{name}.ply", Scan(xyz, np.full(500, 0.5, np.float32)))
+    words = ["project", f"{tmp_path}/?.ply", "--sensor", "vlp-16", "--no-picture", "--out", str(out), "--shard"]
+    out.mkdir()
+    report.write_text('{"thesis": 1}')
+    for part in ("1/2", "2/2"):
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, part])
+        assert "report.json: expected a place for the report of this run" in capsys.readouterr().err
+    assert report.read_text() == '{"thesis": 1}' and list(out.iterdir()) == [report]
+    report.unlink()
+    for part in ("1/2", "2/2", "2/2"):
+        main([*words, part])
+    assert json.loads(report.read_text())["done"] == 2
+
+
 @pytest.mark.parametrize("device", ["meta", "tpu-9", "", "cuda:99", "hpu"])
 def test_devices_that_compute_nothing_are_refused(device: str):
     with pytest.raises(ValueError, match="expected a device"):

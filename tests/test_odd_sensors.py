@@ -13,6 +13,7 @@ from lidarsynth.lidar.sensor import Sensor, from_dict, get_sensor
 from lidarsynth.lidar.view import out_of_view
 from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.systems.cascade.gaps import straight_in_gaps
+from lidarsynth.verbs import generation
 
 BEAMS = tuple(np.linspace(10.0, -20.0, 16).tolist())
 
@@ -120,3 +121,15 @@ def test_nothing_is_put_where_the_sensor_of_a_sparse_scan_never_looks(model):
     azimuth = np.degrees(done.sensor.ray_angles()[1][row, column])
     assert (np.array(done.sensor.elevations)[row] < -13).sum() > 1000, "below its beams, ahead, much is put"
     assert np.abs(azimuth).max() < 61
+
+
+def test_processes_say_nothing_of_a_sensor_on_a_roof_again(model, tmp_path, monkeypatch):
+    roof = model.into(Sensor("roof", BEAMS, width=128, mount=15.0)).choosing(1)
+    monkeypatch.setattr(generation, "_opened", lambda source, threads: roof)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        parts = tmp_path, roof, [range(1)], 4, (".npz",), 1
+        assert len(list(generation.generate_into(*parts, workers=2, source=generation.Drawing()))) == 1  # by this one
+        assert len(caught) == 1
+        roof.generate(1, steps=1)
+        assert len(caught) == 2, "whose program is told of others as before"

@@ -13,6 +13,8 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.rays import padded, rays_of
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.model import CascadeModel
+from lidarsynth.systems.cascade.naming import named
 from lidarsynth.systems.cascade.response import (
     AS_STREETS,
     SHARES,
@@ -94,6 +96,17 @@ def test_what_is_filled_in_fades_as_the_scan_does(street: RangeImage, monkeypatc
     errors = [np.abs(one.reflectance - dark.reflectance)[~known].mean() for one in (found, *others)]
     assert errors[0] < 0.95 * errors[1]
     assert errors[0] < 0.9 * errors[2]
+
+
+def test_what_fades_is_named_as_what_does_not(street: RangeImage):
+    model = ls.load("default").into(street.sensor).with_labels()
+    dark = fading(street, 2.0, 2.0)
+    found = response_of(dark, dark.mask)
+    assert isinstance(model, CascadeModel) and model.network.classes is not None and found.fades
+    ways = (dark, found), (found.unfaded(dark), found._replace(fades=0.0)), (dark, found._replace(fades=0.0))
+    by = [named(model.network.classes, [image], response, street.sensor)[0].label for image, response in ways]
+    np.testing.assert_array_equal(by[0], by[1])
+    assert not np.array_equal(by[0], by[2]), "which it is told"
 
 
 def test_a_darker_reading_sensor_gets_the_same_surfaces_and_darker_points(street: RangeImage):

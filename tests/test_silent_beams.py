@@ -6,6 +6,7 @@ import pytest
 import lidarsynth as ls
 from lidarsynth.lidar.corruption import every_beam
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.cascade.holes import Told
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.silent import silent_rows, told_of_silent
 
@@ -45,6 +46,14 @@ def test_none_is_where_its_neighbours_look_at_the_sky():
     assert silent(told) == [4]
 
 
+def test_none_is_where_its_neighbours_are_known_to_see_nothing():
+    told, returned = without(4), without(4)
+    returned[:4, 3:] = False  # 3 of 40 return
+    assert not silent_rows(told, returned, NONE).any()
+    returned[:4, 3] = True
+    assert np.flatnonzero(silent_rows(told, returned, NONE)).tolist() == [4]
+
+
 def test_blocked_beams_are_not():
     told, closed = without(4, 5), NONE.copy()
     closed[4] = True
@@ -73,6 +82,21 @@ def test_the_beam_of_a_dead_laser_is_filled_in(word, row, method):
     assert errors[0] < (1.0 if method == "conditional" else 1.3) * errors[1]
     assert np.array_equal(made.range[known], street.range[known])
     assert np.array_equal(made.reflectance[known], street.reflectance[known])
+
+
+def test_repaint_draws_no_hole_where_beams_are_silent(monkeypatch: pytest.MonkeyPatch):
+    """Three side by side fill whole cells of its grid."""
+
+    def all_drawn(network: object, told: Told, *how: object) -> Told:
+        return Told(np.where(told.known, told.metres, 3.0), told.reflectance, np.ones_like(told.known))
+
+    street, model = SyntheticStreets(4321, 4, ls.SENSORS["vlp-16"]).image(0), ls.load("default").into("vlp-16")
+    known = street.mask.copy()
+    known[7:10] = False
+    monkeypatch.setattr("lidarsynth.systems.cascade.model.with_holes_drawn", all_drawn)
+    made = model.complete(street.keep(known), method="repaint", steps=1, resamples=1)
+    drawn = (np.abs(made.range - 3) < 0.2) & ~known
+    assert drawn[~known].sum() > 1000 and drawn[7:10].mean() < 0.1
 
 
 def test_a_beam_that_the_grid_lacks_is_drawn_as_those_beside_it():

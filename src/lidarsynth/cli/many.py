@@ -171,7 +171,7 @@ def _into_folder(job: Job, inputs: Inputs, out: Path, many: Many, intensity: str
 
     shard, skipped, begun = parse_shard(many.shard), [], time.perf_counter()
     ending, report = many.format or ("npz" if job.verb == "project" else "ply"), report_path(out, shard)
-    check_report(report)
+    check_report(out, shard)
     before = rows_before(out, shard, ending) if many.skip_existing else {}
     if (told := other_names(out, ending, before, inputs.places)) is not None:
         warn(told)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,7 +66,8 @@ def _named_only(root: Path) -> str:
     tables = [here / name for here, _, files in walk(root) for name in files if name.lower().endswith(NAMED_ONLY)]
     if not tables:
         return ""
-    pattern = str(tables[0].parent / f"*{tables[0].suffix}")
+    endings = Counter(str(table.parent / f"*{table.suffix}") for table in sorted(tables))
+    pattern = endings.most_common(1)[0][0]
     return (
         f" but {plural(len(tables), 'file')} of text: where they are scans, name them, as '{pattern}'; for a cache "
         f"`lidarsynth project '{pattern}' --out IMAGES` makes images first, which data files takes"

@@ -7,6 +7,6 @@ import numpy as np
 
 def inner_product(a: np.ndarray, b: np.ndarray) -> np.float64:
     """a @ b of (N,) and (N,) float64, without the threads that `@` gives 10,000 numbers and more to: where other
-    processes keep the cores busy, it waits for them a thousand times as long as the sum takes. Raises ValueError for
-    other shapes."""
+    processes keep the cores busy, it waits for them a thousand times as long as the sum takes. Raises ValueError where
+    the lengths differ and neither is 1."""
     return np.einsum("i,i", a, b)

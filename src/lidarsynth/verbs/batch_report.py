@@ -38,11 +38,12 @@ def report_path(out: Path, shard: Shard) -> Path:
     return out / (REPORT if shard[1] == 1 else f"report-{shard[0]}-of-{shard[1]}.json")
 
 
-def check_report(path: Path) -> None:
-    """Raises ValueError where a run's report would take the place of a file that is none."""
-    if path.exists() and path.stat().st_size and read_report(path) is None:
-        raise ValueError(f"{path}: expected a place for the report of this run, found a file that is no such report; "
-                         "move it, or name another --out")  # fmt: skip
+def check_report(out: Path, shard: Shard) -> None:
+    """Raises ValueError where a report of a run, or of all its shards, would replace a file that is none."""
+    for path in (report_path(out, shard), out / REPORT):
+        if path.exists() and path.stat().st_size and read_report(path) is None:
+            raise ValueError(f"{path}: expected a place for the report of this run, found a file that is no such "
+                             "report; move it, or name another --out")  # fmt: skip
 
 
 def check_same(out: Path, recipe: Mapping[str, Any]) -> None:

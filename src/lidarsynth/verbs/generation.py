@@ -218,7 +218,9 @@ def _piece(
     k: int,
 ) -> list[Path]:
     """In a worker: the files of one run."""
-    return list(make(_opened(source, threads), pieces[k], None))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnlikelySensorWarning)  # told by the process that began this one
+        return list(make(_opened(source, threads), pieces[k], None))
 
 
 @lru_cache(maxsize=1)
@@ -228,7 +230,6 @@ def _opened(source: Drawing, threads: int) -> ScanModel:
 
     from lidarsynth.weights.load import load
 
-    warnings.simplefilter("ignore", UnlikelySensorWarning)  # told by the process that began this one
     torch.set_num_threads(threads)
     return source.of(load(source.model, device=source.device))
 

@@ -136,7 +136,8 @@ def named(
     rays, device, labels = response.told(rays_told(sensor)), next(network.parameters()).device, []
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
         for image in images:
-            told = class_inputs_of(image, response.even(response.unfaded(image).reflectance), rays, device)
+            bright = response.unfaded(image)
+            told = class_inputs_of(bright, response.even(bright.reflectance), rays, device)
             chances = None if inside is None else _inside(inside, network, told, image)
             chances = _outside(network, told, image, off, alone) if chances is None else chances
             labels.append(_likeliest(chances, least) * image.mask)

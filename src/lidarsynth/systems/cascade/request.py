@@ -1,4 +1,4 @@
-"""What may be asked of a cascade, with what it answers where nothing is said, and of which sensors it may not draw."""
+"""What may be asked of a cascade, with what it answers where nothing is said, and whose scans it draws less well."""
 
 from __future__ import annotations
 

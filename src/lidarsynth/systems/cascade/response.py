@@ -38,8 +38,8 @@ ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
 BINS, MOST = 12, 2.0  # of ranges, of as many returns each; the exponent of what spreads and is not made up for
 NEAR = (0.1, 2.0, 4.0, 6.0, 8.0, 10.0)  # metres, from which on what fades does
 BRIGHT = 0.99  # share of the known returns that are less than 1 when they are unfaded
-# How much a scan fades for one to have it: the slope of the logarithm of its medians, by the spread within a range.
-# Streets, insides and real training scans have -1.0 and more, reported with any gamma; what fades by 2, -1.8 and less.
+# How steeply the logarithm of the medians falls, by the spread within a range, where a scan fades a little, and surely.
+# Streets and real training scans fall less, reported with any gamma, and so do insides with few exceptions.
 LITTLE, SURELY = 1.3, 1.8
 
 
