@@ -13,6 +13,7 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.lidar.surroundings import CHANNELS, surroundings
 from lidarsynth.networks.class_unet import MULTIPLE, RAYS, ClassUNet, around_the_turn
+from lidarsynth.streets.reader import SyntheticStreets
 from lidarsynth.streets.varied import VariedStreets
 from lidarsynth.systems.cascade.examples import CascadeBatch
 from lidarsynth.systems.cascade.lessons import HEIGHT, WIDTH, Lessons, Pixels, _filled_in, lesson, lessons
@@ -30,6 +31,7 @@ from lidarsynth.systems.cascade.naming import (
 )
 from lidarsynth.systems.cascade.response import AS_STREETS
 from lidarsynth.systems.cascade.scores import SEAM, lovasz
+from lidarsynth.weights.load import load
 
 WIDE = Sensor("wide", tuple(np.linspace(2, -24, 40).tolist()), 1024)
 
@@ -299,3 +301,13 @@ def test_pieces_inside_are_wholly_people_or_furniture_and_all_else_stays():
     surely[person] = 1.0
     assert (of_pieces(chances, surely, metres).argmax(0)[:, 10:14] == person).all()
     assert_close(of_pieces(chances, alike, torch.zeros_like(metres)), chances)  # nothing returned
+
+
+def test_streets_that_a_robot_sees_are_no_insides_of_buildings():
+    low = replace(SENSORS["vlp-16"], width=1024, mount=0.3)
+    streets, model, floors = SyntheticStreets(98_003, 160, low), load("default").into(low), 0
+    for image in map(streets.image, range(0, 160, 32)):
+        label = model.label(replace(image, label=None).to_scan()).label
+        assert label is not None
+        floors += (label == CLASS_NUMBER["other-ground"]).mean() > 0.05
+    assert floors <= 1, "all five of them, before the network of insides had seen such streets"
