@@ -40,7 +40,7 @@ INSIDE = {"unlabeled": 1.5, "car": 2.0, "person": 12.0, "other-ground": 1.2, "bu
 # from which on a scan is of the inside of a building (docs/classes.md).
 INDOORS = ("unlabeled", "other-ground")
 OUTDOORS = ("road", "parking", "sidewalk", "fence", "vegetation", "trunk", "terrain", "pole", "traffic-sign")
-MOSTLY, SOME = 0.7, 0.02
+MOSTLY, SOME = 0.5, 0.02
 # Inside, people are told from furniture piece by piece: by the logarithm of their chance there, so much of what the
 # network of streets says, and as much more as brings their IoU to most in held-out insides.
 ALSO, PEOPLE, FAINT = 0.5, 2.0, 1e-4  # the last: of a chance, below which it no longer counts
