@@ -89,7 +89,7 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     for line in inputs.words:
         warn(line)
     if many.workers > 1 and not inputs.single:
-        begin_early("lidarsynth.verbs.batch", *["lidarsynth.weights.load"] * (job.verb != "project"))
+        begin_early("lidarsynth.verbs.batch", *(["lidarsynth.weights.load"] if job.verb != "project" else []))
     job = replace(job, transform=transform, strict=many.strict)
     if not (many.all_pictures or inputs.single or (inputs.count or PICTURES + 1) <= PICTURES):
         job = replace(job, picture=False)

@@ -35,7 +35,7 @@ PARTS, WIDTH, SEAM = 8, 64, 16  # parts of the turn in which they are tried, col
 # (docs/completion.md).
 USUAL = 0.5
 ALIKE = 0.15  # natural logarithm of ranges that differ as on one surface
-BINS, MOST = 12, 2.0  # of ranges, of as many returns each; the exponent of what spreads and is not made up for
+BINS, MOST = 12, 2.0  # of ranges, of as many returns each; the largest exponent, of energy that spreads on a sphere
 NEAR = (0.1, 2.0, 4.0, 6.0, 8.0, 10.0)  # metres, from which on what fades does
 BRIGHT = 0.99  # share of the known returns that are less than 1 when they are unfaded
 # How steeply the logarithm of the medians falls, by the spread within a range, where a scan fades a little, and surely.
@@ -73,6 +73,7 @@ class Response(NamedTuple):
         return np.minimum(unfaded / self._lost(metres), np.float32(1)) if self.fades else unfaded
 
     def _lost(self, metres: np.ndarray) -> np.ndarray:
+        """By how much less than unfaded reflectance is at `metres`, of any shape."""
         return np.float32(self.level) * np.maximum(metres, np.float32(self.near)) ** np.float32(self.fades)
 
     def even(self, reported: np.ndarray) -> np.ndarray:
@@ -148,14 +149,12 @@ def _fading(reflectance: np.ndarray, metres: np.ndarray) -> Response:
     far, light = np.log(np.maximum(metres[order], 0.1)), np.log(reflectance[order])
     bins = np.array_split(np.arange(len(order)), BINS)
     low, middle, high = np.array([np.quantile(light[part], (0.25, 0.5, 0.75)) for part in bins]).T
-    fits = []
-    medians = np.array([np.median(far[part]) for part in bins])
-    for near in NEAR:
+    medians, fits = np.array([np.median(far[part]) for part in bins]), []
+    for near in (near for near in NEAR if near == NEAR[0] or np.log(near) < np.median(far)):
         away = np.maximum(medians, np.log(near))
         away -= away.mean()
         slope = -(away @ middle) / max(away @ away, 0.1)
-        if near == NEAR[0] or np.log(near) < np.median(far):
-            fits.append((np.var(middle + slope * away), slope, near))
+        fits.append((np.var(middle + slope * away), slope, near))
     _, slope, near = min(fits)
     shown = slope / max(np.median(high - low), NARROWEST)
     fades = float(np.clip(slope, 0, MOST) * np.clip((shown - LITTLE) / (SURELY - LITTLE), 0, 1))
