@@ -190,6 +190,14 @@ def test_the_network_of_insides_is_believed_where_it_sees_floors_or_furniture(sa
     assert not image.label[~image.mask].any()
 
 
+@pytest.mark.parametrize(("which", "found"), [("other-ground", "building"), ("road", "car")])
+def test_a_network_of_its_own_may_say_which_scans_are_of_insides(which: str, found: str):
+    """The other one, that names what is there, would say no of the first, in which it sees walls alone."""
+    networks = sure("building"), sure(which)
+    (image,) = named(sure("car"), [kerb(WIDE)], AS_STREETS, WIDE, inside=networks[0], indoors=networks[1])
+    assert image.label is not None and (image.label[image.mask] == CLASS_NUMBER[found]).all()
+
+
 def test_the_lovasz_softmax_is_one_less_the_iou_of_sure_answers():
     label = torch.tensor([1] * 60 + [2] * 40)
     said = torch.tensor([1] * 50 + [2] * 50)  # IoU 50 / 60 and 40 / 50

@@ -54,6 +54,7 @@ class Model:
     classes: int = within(0, 0, 1000)  # cascade: SemanticKITTI classes that it names for each pixel, 0 = none
     class_channels: int = within(32, 8, 8192)  # cascade: width of the network that names them
     inside_channels: int = within(0, 0, 8192)  # cascade: width of what names the insides of buildings, 0 = none
+    indoors_channels: int = within(0, 0, 8192)  # cascade: width of what says which scans are of such, 0 = that network
     drawn_channels: int = within(0, 0, 8192)  # cascade: width of what names scans in the making, 0 = none
     noisiest: float = within(8.0, 8, 30)  # cascade: -log_snr of the noise that its coarse network draws grids from
     guide_channels: int = within(0, 0, 8192)  # cascade: width of the network that guides the coarse one, 0 = none

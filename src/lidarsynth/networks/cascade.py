@@ -32,7 +32,8 @@ class Cascade(nn.Module):
     likeliest  a fill that has learned the image of least error alone, which completion gives; `fill` draws samples
     observer   a fill that has learned what a sensor reports of surfaces alone, which `realise` gives
     classes    says of each return what it is of
-    inside     the same of scans that were taken inside a building, and which are
+    inside     the same of scans that were taken inside a building
+    indoors    says which scans are; `inside` does, where there is none
     drawn      the same of scans in the making, whose surfaces are smoother than any recorded one's
     judge      says of drawn grids what the odds are that they are a street's
     """
@@ -51,11 +52,12 @@ class Cascade(nn.Module):
         judge: GridJudge | None = None,
         inside: ClassUNet | None = None,
         drawn: ClassUNet | None = None,
+        indoors: ClassUNet | None = None,
     ):
         super().__init__()
         self.coarse, self.fill, self.guide, self.columns, self.between = coarse, fill, guide, columns, between
         self.beams, self.likeliest, self.observer, self.classes = beams, likeliest, observer, classes
-        self.judge, self.inside, self.drawn = judge, inside, drawn
+        self.judge, self.inside, self.drawn, self.indoors = judge, inside, drawn, indoors
 
     @property
     def surest(self) -> FillUNet:

@@ -57,7 +57,9 @@ def build(experiment: Experiment, sensor: Sensor) -> Cascade:
     judge = GridJudge(model.judge_channels, model.judge_openness) if model.judge_channels else None
     inside = ClassUNet(model.inside_channels) if model.classes and model.inside_channels else None
     drawn = ClassUNet(model.drawn_channels, classes=model.classes) if model.classes and model.drawn_channels else None
-    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, classes, judge, inside, drawn)
+    indoors = ClassUNet(model.indoors_channels) if inside is not None and model.indoors_channels else None
+    named = classes, judge, inside, drawn, indoors
+    return Cascade(coarse, fill, guide, columns, between, beams, likeliest, observer, *named)
 
 
 def _check(model: Model) -> None:
@@ -95,7 +97,8 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     that is as wide.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
-    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside", "drawn"):
+    for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside", "drawn",
+                 "indoors"):  # fmt: skip
         if getattr(network, part) is not None and getattr(weights, part) is not None:
             load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)

@@ -306,7 +306,7 @@ class CascadeModel(AnySensorModel):
         assert self.network.classes is not None
         own, told = self.experiment.model.own_classes, (self.network.classes, images, self.response, self.sensor)
         inside, more = (self.network.inside, RIDERS) if recorded and not own else (None, None if recorded else RARER)
-        return named(*told, self.precision, least, more, inside=inside)
+        return named(*told, self.precision, least, more, inside=inside, indoors=self.network.indoors)
 
     def _between(
         self, metres: np.ndarray, reflectance: np.ndarray, rows: np.ndarray, columns: np.ndarray, rng: Each, kinds: list

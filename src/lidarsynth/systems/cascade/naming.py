@@ -119,6 +119,7 @@ def named(
     more: Mapping[str, float | np.ndarray] | None = None,
     alone: bool = False,
     inside: ClassUNet | None = None,
+    indoors: ClassUNet | None = None,
 ) -> list[RangeImage]:
     """The images of one sensor, which reports as `response` says, with the class of each return, 1 to 19, and 0 where
     there is none, or where the network is less sure of it than `least`.
@@ -126,6 +127,7 @@ def named(
     more    is added to the logits of these classes, of each row (H,) or of all
     alone   each pixel by itself, instead of with those beside it on its surface
     inside  says of images of the insides of buildings what is there, furniture of class 0
+    indoors  says which images are of such; `inside` does, if not given
     """
     if sensor.width <= NARROWEST:
         raise ValueError(f"sensor {sensor.name}: expected more than {NARROWEST} columns to name classes by, found "
@@ -138,8 +140,10 @@ def named(
         for image in images:
             bright = response.unfaded(image)
             told = class_inputs_of(bright, response.even(bright.reflectance), rays, device)
-            chances = None if inside is None else _inside(inside, network, told, image)
-            chances = _outside(network, told, image, off, alone) if chances is None else chances
+            if inside is not None and _is_inside(indoors or inside, told, image):
+                chances = _inside(inside, network, told, image)
+            else:
+                chances = _outside(network, told, image, off, alone)
             labels.append(_likeliest(chances, least) * image.mask)
     return [replace(image, label=label) for image, label in zip(images, labels, strict=True)]
 
@@ -167,19 +171,27 @@ def _outside(network: ClassUNet, told: Tensor, image: RangeImage, off: np.ndarra
     return logits.softmax(0) if alone else of_surfaces(logits.softmax(0), _metres(image))
 
 
-def _inside(network: ClassUNet, streets: ClassUNet, told: Tensor, image: RangeImage) -> Tensor | None:
-    """(20, H, W) chances of what is inside buildings, 0 being furniture, if by these the image is of one; else None.
+def _is_inside(network: ClassUNet, told: Tensor, image: RangeImage) -> bool:
+    """Whether the image is of the inside of a building, by what the network sees in it."""
+    label = _inside_logits(network, told, image).numpy().argmax(0)
+    count = np.bincount(label[image.mask], minlength=len(CLASS_NUMBER))
+    within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
+    telling = within + without
+    return bool(telling > SOME * count.sum() and within > MOSTLY * telling)
+
+
+def _inside(network: ClassUNet, streets: ClassUNet, told: Tensor, image: RangeImage) -> Tensor:
+    """(20, H, W) chances of what is inside buildings, 0 being furniture.
 
     streets  the network of streets, which has its say on people
     """
-    logits = _without(_logits(network, told, image.shape), _fair(inside_weights()))
-    count = np.bincount(logits.numpy().argmax(0)[image.mask], minlength=len(logits))
-    within, without = (count[[CLASS_NUMBER[word] for word in words]].sum() for words in (INDOORS, OUTDOORS))
-    telling = within + without
-    if telling <= SOME * count.sum() or within <= MOSTLY * telling:
-        return None
-    chances = of_surfaces(logits.softmax(0), _metres(image))
+    chances = of_surfaces(_inside_logits(network, told, image).softmax(0), _metres(image))
     return of_pieces(chances, _outside(streets, told, image, _fair(weights())), _metres(image))
+
+
+def _inside_logits(network: ClassUNet, told: Tensor, image: RangeImage) -> Tensor:
+    """(20, H, W) of a network of the insides of buildings."""
+    return _without(_logits(network, told, image.shape), _fair(inside_weights()))
 
 
 def _metres(image: RangeImage) -> Tensor:
