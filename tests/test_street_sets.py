@@ -10,16 +10,18 @@ import pytest
 
 from lidarsynth.cli.main import main
 from lidarsynth.data import street_sets
+from lidarsynth.data.dataset import CachedImages
 from lidarsynth.data.layouts.calibration import AXES, PROJECTION
 from lidarsynth.data.layouts.kitti import in_view, label_line
 from lidarsynth.data.layouts.nuscenes_tables import quaternion
 from lidarsynth.data.nuscenes import nuscenes
+from lidarsynth.data.sources import cache_source
 from lidarsynth.data.street_sets import LAYOUTS, chunks, write_streets
 from lidarsynth.files.formats import read
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, same_rays
 from lidarsynth.streets import drawing
 from lidarsynth.streets.areas import Density
 from lidarsynth.streets.edition import EDITION
@@ -198,6 +200,18 @@ def test_nuscenes_reads_back(tmp_path: Path, frames: list[Frame]):
     samples = {row["token"]: row for row in tables["sample"]}
     for row in tables["sample_annotation"]:
         assert row["sample_token"] in samples and row["num_lidar_pts"] > 0
+
+
+def test_a_cache_of_a_nuscenes_set_is_of_the_sensor_that_it_was_cast_for(tmp_path: Path, frames: list[Frame]):
+    folder = written(tmp_path / "set", "nuscenes")
+    assert list(cache_source("nuscenes", folder, tmp_path / "cache"))[-1] == (2, 2)
+    images = CachedImages(tmp_path / "cache")
+    assert same_rays(images.sensor, SENSORS["vlp-16"].resized(width=1024))  # as --sensor vlp-16 has it
+    row = (images[0].range > 0).nonzero()[0]
+    assert set(row) == set(frames[0].scan.ring)
+    (folder / "streets.json").write_text("{}")  # somebody's own
+    assert list(cache_source("nuscenes", folder, tmp_path / "other"))[-1] == (2, 2)
+    assert CachedImages(tmp_path / "other").sensor.name == "hdl-32e"
 
 
 def test_nuscenes_boxes_are_where_the_points_are(tmp_path: Path, frames: list[Frame]):
