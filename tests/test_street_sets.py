@@ -26,6 +26,7 @@ from lidarsynth.streets import drawing
 from lidarsynth.streets.areas import Density
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+from lidarsynth.verbs.json_kinds import json_lines
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
@@ -298,6 +299,8 @@ def test_a_smaller_number_leaves_a_larger_set_whole(tmp_path: Path, layout: str)
 def test_tracks_are_of_the_stamps_and_boxes_of_when_they_were_seen(tmp_path: Path, frames: list[Frame]):
     sequence = written(tmp_path / "set", "semantickitti") / "sequences" / "00"
     tracks = json.loads((sequence / "tracks.json").read_text())
+    told = {"kind": f"tracks of one labelled drive: {len(tracks)} road users in 7 frames"}
+    assert json_lines(sequence / "tracks.json") == told
     record, moved = json.loads((sequence / "boxes" / "000003.json").read_text()), 0.0
     there = {box.instance: box for box in LabelledStreets(0, 1, SENSOR, Options(frames=7))[3].boxes}
     for box in record["boxes"]:
