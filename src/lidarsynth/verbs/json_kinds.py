@@ -74,7 +74,9 @@ def _boxes_alone(values: Mapping[str, Any]) -> Lines:
 
 def _tracks(values: Mapping[str, Any]) -> Lines:
     frames = {frame for one in values.values() for frame in one["frames"]}
-    return {"kind": f"tracks of one labelled drive: {plural(len(values), 'road user')} in {plural(len(frames), 'frame')}"}
+    return {
+        "kind": f"tracks of one labelled drive: {plural(len(values), 'road user')} in {plural(len(frames), 'frame')}"
+    }
 
 
 def _generated(values: Mapping[str, Any]) -> Lines:
