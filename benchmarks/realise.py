@@ -153,7 +153,8 @@ def table(
     network = load_parts(WORD)[1]
     assert isinstance(network, RangeNet)
     protocol, plain = get_protocol(WORD), pairs[0][0].shape == (64, 1024)
-    judge = Judge(protocol, load_networks(protocol, 1024)) if plain else None
+    several = len(pairs) > 1  # one scan has no covariance
+    judge = Judge(protocol, load_networks(protocol, 1024)) if plain and several else None
     for name, images in made(pairs, model, gan).items():
         distance = "-" if judge is None else f"{frechet(judge, images, others):.2f}"
         labelled = plain and all(image.label is not None for image in images)

@@ -13,7 +13,7 @@ from lidarsynth.data.street_sets import write_streets
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import with_fields
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.streets.floors import SMALLEST, Opening, draw_rooms, wall, walls_between
 from lidarsynth.streets.frame import FURNITURE, LabelledStreets, Options
 from lidarsynth.streets.furniture import KINDS
@@ -123,6 +123,13 @@ def test_labelled_sets_have_instances_and_furniture(tmp_path):
             people += box.kind == "person" and box.points > 0
         assert (nuscenes.classes(frame)[raw == FURNITURE] == 29).all()  # static.other
     assert people > 3
+
+
+def test_who_is_seen_through_a_window_is_not_hidden():
+    frame = LabelledStreets(5, 6, SENSORS["os1-64"].resized(width=512), Options(inside=True))[3]
+    boxes = [box for box in frame.boxes if box.points]
+    assert [(box.kind, box.points > 20) for box in boxes] == [("person", True)]  # all through panes
+    assert 0.2 < boxes[0].occlusion < 0.9
 
 
 @pytest.mark.parametrize("asked", [{"frames": 5}, {"weather": Weather(rain=3.0)}, {"overlap": False}])

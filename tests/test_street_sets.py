@@ -10,20 +10,23 @@ import pytest
 
 from lidarsynth.cli.main import main
 from lidarsynth.data import street_sets
+from lidarsynth.data.dataset import CachedImages
 from lidarsynth.data.layouts.calibration import AXES, PROJECTION
 from lidarsynth.data.layouts.kitti import in_view, label_line
 from lidarsynth.data.layouts.nuscenes_tables import quaternion
 from lidarsynth.data.nuscenes import nuscenes
+from lidarsynth.data.sources import cache_source
 from lidarsynth.data.street_sets import LAYOUTS, chunks, write_streets
 from lidarsynth.files.formats import read
 from lidarsynth.files.labels import read_labels
 from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.scan import Scan
-from lidarsynth.lidar.sensor import SENSORS, Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor, same_rays
 from lidarsynth.streets import drawing
 from lidarsynth.streets.areas import Density
 from lidarsynth.streets.edition import EDITION
 from lidarsynth.streets.frame import Frame, LabelledStreets, Options
+from lidarsynth.verbs.json_kinds import json_lines
 
 pytest.importorskip("embreex", reason="lidarsynth[synthetic] is not installed")
 
@@ -200,6 +203,18 @@ def test_nuscenes_reads_back(tmp_path: Path, frames: list[Frame]):
         assert row["sample_token"] in samples and row["num_lidar_pts"] > 0
 
 
+def test_a_cache_of_a_nuscenes_set_is_of_the_sensor_that_it_was_cast_for(tmp_path: Path, frames: list[Frame]):
+    folder = written(tmp_path / "set", "nuscenes")
+    assert list(cache_source("nuscenes", folder, tmp_path / "cache"))[-1] == (2, 2)
+    images = CachedImages(tmp_path / "cache")
+    assert same_rays(images.sensor, SENSORS["vlp-16"].resized(width=1024))  # as --sensor vlp-16 has it
+    row = (images[0].range > 0).nonzero()[0]
+    assert set(row) == set(frames[0].scan.ring)
+    (folder / "streets.json").write_text("{}")  # somebody's own
+    assert list(cache_source("nuscenes", folder, tmp_path / "other"))[-1] == (2, 2)
+    assert CachedImages(tmp_path / "other").sensor.name == "hdl-32e"
+
+
 def test_nuscenes_boxes_are_where_the_points_are(tmp_path: Path, frames: list[Frame]):
     """From LIDAR_TOP's own frame through calibration and ego pose to the global frame, as the devkit goes."""
     folder = written(tmp_path / "set", "nuscenes")
@@ -284,6 +299,8 @@ def test_a_smaller_number_leaves_a_larger_set_whole(tmp_path: Path, layout: str)
 def test_tracks_are_of_the_stamps_and_boxes_of_when_they_were_seen(tmp_path: Path, frames: list[Frame]):
     sequence = written(tmp_path / "set", "semantickitti") / "sequences" / "00"
     tracks = json.loads((sequence / "tracks.json").read_text())
+    told = {"kind": f"tracks of one labelled drive: {len(tracks)} road users in 7 frames"}
+    assert json_lines(sequence / "tracks.json") == told
     record, moved = json.loads((sequence / "boxes" / "000003.json").read_text()), 0.0
     there = {box.instance: box for box in LabelledStreets(0, 1, SENSOR, Options(frames=7))[3].boxes}
     for box in record["boxes"]:

@@ -26,7 +26,8 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import PROJECTIONS, columns_of, project_thinned
 from lidarsynth.lidar.recognition import recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, with_points
-from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
+from lidarsynth.lidar.sensor import WORDS, Sensor, from_dict, get_sensor
+from lidarsynth.lidar.small_file import read_json
 from lidarsynth.lidar.view import placement
 from lidarsynth.streets.edition import EDITION
 
@@ -160,7 +161,7 @@ def cache_source(
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
     reader = _reader(name, Path(root), split, intensity, transform, rings)
-    word = sensor or own.sensor or _recognised(reader)
+    word = sensor or _told(name, Path(root)) or _recognised(reader)
     width = _width(width, word, own.width)
     spec, columns = _sensor(word, width), columns_of(projection, width, get_sensor(word).width)
     image = Projected(reader, spec, projection, columns, own.resizing)
@@ -206,7 +207,20 @@ def cache_synthetic(
         yield done, count
 
 
-def _width(given: int | None, sensor: str, source: int | None) -> int:
+def _told(name: str, root: Path) -> str | Sensor | None:
+    """The source's own sensor; of a set that `streets` has written in that layout, the one that it was cast for."""
+    from lidarsynth.data.street_sets import RECORD
+
+    own, record = SOURCES[name], root / RECORD
+    settings = read_json(record) if own.told and record.is_file() else None
+    if not isinstance(settings, dict) or not isinstance(settings.get("sensor"), dict):
+        return own.sensor
+    cast = from_dict(settings["sensor"], str(record))
+    known = WORDS.get(cast.name)
+    return cast.name if known is not None and known.resized(width=cast.width) == cast else cast
+
+
+def _width(given: int | None, sensor: str | Sensor, source: int | None) -> int:
     """The given width, else the source's for a sensor that we name, else the sensor's own."""
     if given is not None:
         return given
@@ -302,7 +316,7 @@ def _sensors(reader: Reader, numbers: range) -> Iterator[tuple[str | None, str, 
             yield *recognise(reader[i], name), name
 
 
-def _sensor(name: str, width: int) -> Sensor:
+def _sensor(name: str | Sensor, width: int) -> Sensor:
     if width < 4:
         raise ValueError(f"expected --width of at least 4, found {width}")
     return get_sensor(name).resized(width=width)

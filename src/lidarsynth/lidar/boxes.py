@@ -19,7 +19,8 @@ class Box:
     centre      (3,) m, of the box; size: length, width, height in m; yaw: rad, of its front, counter-clockwise from x
     velocity    (3,) m/s over ground
     place, heading, world_velocity: centre, yaw and velocity in the world's frame; spin: rad/s, of its yaw
-    points      how many returns are labelled with it; occlusion: share of its first hits that others hide, 0 to 1
+    points      how many returns are labelled with it; occlusion: share of its first hits that others hide, 0 to 1; what
+                is seen through another's pane is not hidden
     late        s after the stamp at which it was where the box stands, None = the stamp: centre, place, yaw and heading
                 are of that time, so that centre - late * velocity is where it is at the stamp
     """

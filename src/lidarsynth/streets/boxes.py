@@ -40,14 +40,17 @@ def boxes_of(
     near = np.flatnonzero(moment.present & (near | (points[1:] > 0)))
     first = np.where(turn.first >= 0, world.thing[turn.first], -1)
     hits = np.bincount(first.ravel() + 1, minlength=len(world.things) + 1)
+    behind = numbers[(numbers > 0) & (first != np.append(-1, actors.thing)[numbers])]  # seen through panes of others
+    through = np.bincount(behind, minlength=len(actors) + 1)
     found, frames = [], attitudes(sensor, poses)
     after = _lateness(numbers, late, here) if as_seen and late is not None else None
     now = moment if after is None else moment.later(after)
     shown_at = now.place + _about(actors.middle, now.yaw)
     centres = (shown_at - to_world[:3, 3]) @ to_world[:3, :3]
     for actor in near.tolist():
-        met = hits[actors.thing[actor] + 1]
-        alone = met + _hidden(bodies, actor, moment, sensor, turn, first, frames, late, here[actor]) if met else 0
+        met = hits[actors.thing[actor] + 1] + through[actor + 1]
+        hidden = _hidden(bodies, actor, moment, sensor, turn, first, frames, late, here[actor]) if met else 0
+        alone = met + hidden - through[actor + 1]
         front = np.array([np.cos(now.yaw[actor]), np.sin(now.yaw[actor]), 0]) @ to_world[:3, :3]
         shown = met / alone if alone else 0.0
         found.append(Box(

@@ -31,6 +31,8 @@ def json_lines(path: Path) -> Lines | None:
         if set(needed) <= keys:
             with suppress(LookupError, TypeError, AttributeError, ValueError):  # somebody else's of the same words
                 return told(values)
+    if keys and all(isinstance(one, Mapping) and isinstance(one.get("frames"), Mapping) for one in values.values()):
+        return _tracks(values)
     if keys & {"elevations", "beams"}:
         return None
     listed = ", ".join(list(values)[:6]) if keys else type(values).__name__
@@ -68,6 +70,13 @@ def _boxes(values: Mapping[str, Any]) -> Lines:
 
 def _boxes_alone(values: Mapping[str, Any]) -> Lines:
     return {"kind": f"boxes of one scan: {len(values['boxes'])}, of {values['points']} points"}
+
+
+def _tracks(values: Mapping[str, Any]) -> Lines:
+    frames = {frame for one in values.values() for frame in one["frames"]}
+    return {
+        "kind": f"tracks of one labelled drive: {plural(len(values), 'road user')} in {plural(len(frames), 'frame')}"
+    }
 
 
 def _generated(values: Mapping[str, Any]) -> Lines:
