@@ -562,6 +562,22 @@ def test_samples_are_judged_again_by_other_networks_or_rules(changed: str, point
     assert len(counts) == (1 if changed == "neither" else 2)
 
 
+def test_scans_are_completed_again_where_the_file_of_their_sensor_says_something_else(tmp_path: Path):
+    """Rings make rows, so that the images stay the same, bit by bit, where beams are found to stand elsewhere."""
+    (tmp_path / "scans").mkdir()
+    scan = street(1).to_scan()
+    write(tmp_path / "scans" / "1.ply", replace(scan, ring=np.nonzero(street(1).mask)[0].astype(np.int64)))
+    text = f'data = "{tmp_path}/scans"\nsensor = "{tmp_path}/my.toml"\nprotocol = "iln-2022"\n'
+    config = written(tmp_path / "b.toml", f'{text}projection = "unfolding"\n{METHODS}')
+    found = []
+    for sensor in (SENSOR, replace(SENSOR, elevations=tuple(np.linspace(10, -40, 16)))):
+        (tmp_path / "my.toml").write_text(sensor_toml(sensor))
+        benchmark("upsampling", config, tmp_path / "out", no_model)
+        found.append(results(tmp_path / "out")["bilinear"]["reports"]["iln-2022"]["values"])
+    assert found[0]["range MAE"] == found[1]["range MAE"]
+    assert found[0]["voxel IoU"] != found[1]["voxel IoU"]
+
+
 def test_completions_are_judged_again_by_other_rules(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
     for step in (0, 0, 1):
