@@ -31,7 +31,7 @@ from lidarsynth.evaluation.accumulation import Loaded
 from lidarsynth.evaluation.protocols import PROTOCOLS, R2DM_UPSAMPLING
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
-from lidarsynth.files.formats import write
+from lidarsynth.files.formats import read_image, write
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
@@ -267,6 +267,17 @@ def test_a_stopped_benchmark_goes_on_and_changed_settings_begin_anew(data: Path,
     stored(tmp_path / "other", [street(i) for i in (0, 9, 2, 3)])
     benchmark("upsampling", config, tmp_path / "out", lambda word: again, data=str(tmp_path / "other"))
     assert again.calls[7:] == [1], "only the scan that is another one is filled anew"
+
+
+def test_scans_that_were_cut_off_are_made_anew(data: Path, tmp_path: Path):
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
+    benchmark("upsampling", config, tmp_path / "out", no_model)
+    path = next((tmp_path / "out" / "scans").glob("*/000000.npz"))
+    whole = read_image(path).range
+    for left in (path.read_bytes()[:500], b""):
+        path.write_bytes(left)
+        benchmark("upsampling", config, tmp_path / "out", no_model)
+        np.testing.assert_array_equal(read_image(path).range, whole)
 
 
 def test_another_experiment_takes_another_folder(data: Path, tmp_path: Path):
