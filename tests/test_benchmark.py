@@ -31,7 +31,7 @@ from lidarsynth.evaluation.accumulation import Loaded
 from lidarsynth.evaluation.protocols import PROTOCOLS, R2DM_UPSAMPLING
 from lidarsynth.experiment.folder import save
 from lidarsynth.experiment.presets import preset
-from lidarsynth.files.formats import write
+from lidarsynth.files.formats import read_image, write
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
@@ -267,6 +267,17 @@ def test_a_stopped_benchmark_goes_on_and_changed_settings_begin_anew(data: Path,
     stored(tmp_path / "other", [street(i) for i in (0, 9, 2, 3)])
     benchmark("upsampling", config, tmp_path / "out", lambda word: again, data=str(tmp_path / "other"))
     assert again.calls[7:] == [1], "only the scan that is another one is filled anew"
+
+
+def test_scans_that_were_cut_off_are_made_anew(data: Path, tmp_path: Path):
+    config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
+    benchmark("upsampling", config, tmp_path / "out", no_model)
+    path = next((tmp_path / "out" / "scans").glob("*/000000.npz"))
+    whole = read_image(path).range
+    for left in (path.read_bytes()[:500], b""):
+        path.write_bytes(left)
+        benchmark("upsampling", config, tmp_path / "out", no_model)
+        np.testing.assert_array_equal(read_image(path).range, whole)
 
 
 def test_another_experiment_takes_another_folder(data: Path, tmp_path: Path):
@@ -560,6 +571,22 @@ def test_samples_are_judged_again_by_other_networks_or_rules(changed: str, point
         monkeypatch.setattr(setups, "load_networks", lambda *_, **more: Loaded({}, {"rangenet": "other"}, {}))
     benchmark("generation", points, tmp_path / "out", no_model)
     assert len(counts) == (1 if changed == "neither" else 2)
+
+
+def test_scans_are_completed_again_where_the_file_of_their_sensor_says_something_else(tmp_path: Path):
+    """Rings make rows, so that the images stay the same, bit by bit, where beams are found to stand elsewhere."""
+    (tmp_path / "scans").mkdir()
+    scan = street(1).to_scan()
+    write(tmp_path / "scans" / "1.ply", replace(scan, ring=np.nonzero(street(1).mask)[0].astype(np.int64)))
+    text = f'data = "{tmp_path}/scans"\nsensor = "{tmp_path}/my.toml"\nprotocol = "iln-2022"\n'
+    config = written(tmp_path / "b.toml", f'{text}projection = "unfolding"\n{METHODS}')
+    found = []
+    for sensor in (SENSOR, replace(SENSOR, elevations=tuple(np.linspace(10, -40, 16)))):
+        (tmp_path / "my.toml").write_text(sensor_toml(sensor))
+        benchmark("upsampling", config, tmp_path / "out", no_model)
+        found.append(results(tmp_path / "out")["bilinear"]["reports"]["iln-2022"]["values"])
+    assert found[0]["range MAE"] == found[1]["range MAE"]
+    assert found[0]["voxel IoU"] != found[1]["voxel IoU"]
 
 
 def test_completions_are_judged_again_by_other_rules(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -11,7 +11,7 @@ import torch
 
 import lidarsynth as ls
 from lidarsynth.cli.main import main
-from lidarsynth.evaluation import accumulation
+from lidarsynth.evaluation import accumulation, statistics
 from lidarsynth.evaluation.evaluate import gather_part
 from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.evaluation.protocols import BEV_1, LIDARGEN, STREET_1
@@ -423,3 +423,16 @@ def test_a_tensor_of_another_shape_is_named(shape: tuple[int, ...], protocol: st
     for sides in ((folder, real), (real, folder)):
         with pytest.raises(ValueError, match=r"other/0\.pth: expected .*found"):
             ls.evaluate(*sides, protocol)
+
+
+def test_statistics_that_another_version_gathered_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Their definition says what is computed of images, and not how scans become these."""
+    images, files = [street(i) for i in range(4)], [tmp_path / f"{name}.safetensors" for name in ("then", "now")]
+    for file, rules in zip(files, (statistics.GATHERED - 1, statistics.GATHERED), strict=True):
+        with monkeypatch.context() as patched:
+            patched.setattr(statistics, "GATHERED", rules)
+            gather_part(images, "1/1", file, side="reference")
+    told = [[note for note in ls.evaluate(images, file).warnings if "another" in note] for file in files]
+    assert [len(notes) for notes in told] == [1, 0] and told[0][0].startswith(f"{files[0]}: expected statistics")
+    with pytest.raises(ValueError, match="gathered as by this version"):  # or their numbers would pass for this one's
+        gather_part(files[0], "1/1", tmp_path / "again.safetensors")

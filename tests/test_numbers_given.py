@@ -1,5 +1,6 @@
 """What metrics are given as arrays or tensors: with gradients, of odd types, masked, or no numbers at all."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 import lidarsynth as ls
 from lidarsynth.evaluation.evaluate import gather_part
+from lidarsynth.lidar.depth import to_x_0
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import get_sensor
 from lidarsynth.metrics.bev import bev_histograms
@@ -70,6 +72,28 @@ def test_what_is_no_array_of_plain_numbers_is_refused(name: str):
     for given in (*odd, torch.tensor(POSITIVE) + 1j, torch.tensor(POSITIVE, device="meta"), None, "abc"):
         with pytest.raises(ValueError, match="expected an array or tensor of plain numbers, found a"):
             judge(given)
+
+
+def test_one_of_a_reversed_set_is_taken():
+    """numpy counts an array as in order whose only row steps backwards, torch does not."""
+    held, whole = Moments(3), Moments(3)
+    for row in np.split(POSITIVE[::-1], len(POSITIVE)):
+        held.update(row)
+    whole.update(POSITIVE)
+    assert np.allclose(held.mean, whole.mean)
+    scans = POSITIVE.reshape(2, 15, 3)
+    assert torch.equal(bev_histograms(scans[::-1][:1]), bev_histograms(scans[1:]))
+
+
+def test_images_of_one_beam_may_be_turned_over():
+    sensor = ls.Sensor("one", (-1.0,), width=64)
+    half = np.full((1, 64), 0.5, np.float32)
+    image = RangeImage(10 * half, half, np.ones((1, 64), bool), sensor)
+    known = np.arange(64)[None] % 2 == 0
+    turned = replace(image, range=image.range[::-1], reflectance=image.reflectance[::-1])
+    assert torch.equal(to_x_0(turned), to_x_0(image))
+    filled = [ls.load("nearest").complete(one, pixels) for one, pixels in ((image, known), (turned, known[::-1]))]
+    np.testing.assert_array_equal(filled[0].range, filled[1].range)
 
 
 def test_moments_of_features_with_gradients_hold_none():

@@ -219,6 +219,7 @@ def test_a_loaded_official_model_saves_and_loads_as_ours(edited, tmp_path, fixtu
         ({"ema_weights/model.coords": "del"}, r"expected model.coords \(1, 2, H, W\) .* found None"),
         ({"ema_weights/model.coords": torch.zeros(1, 2, 16, 64)}, "elevations that fall from row to row"),
         ({"ema_weights/model.in_conv.bias": "x"}, r"tensors by name, found 'model.in_conv.bias' str"),
+        ({"cfg/data/train_depth": torch.zeros(2)}, r"cfg.data.train_depth .*\[True\], found tensor"),
         ({"cfg": "del"}, r"expected .* with cfg, weights and ema_weights, found 5 keys \['weights', 'ema_weights'"),
         ({"ema_weights": [1, 2]}, "with cfg, weights and ema_weights, found 6 keys"),
     ],
@@ -229,6 +230,12 @@ def test_other_checkpoints_are_refused_by_the_name_of_the_field(edited, changes,
     with pytest.raises(ValueError, match=message) as caught:
         read_official(path)
     assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("changes", [{"cfg/training": None}, {"cfg/data/dataset": ["kitti_360"]}])
+def test_what_a_network_does_not_need_may_be_anything(edited, changes):
+    experiment, _ = read_official(edited(changes))
+    assert (experiment.card.data == "not known") == ("cfg/data/dataset" in changes)
 
 
 class Foreign:

@@ -18,10 +18,10 @@ from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.setup import OnDone, Setup
 from lidarsynth.benchmark.sources import located
 from lidarsynth.benchmark.store import Seconds, Store
-from lidarsynth.evaluation.evaluate import GATHERED, evaluate
+from lidarsynth.evaluation.evaluate import evaluate
 from lidarsynth.evaluation.image_sets import ImageSet, image_set, sensor_of
 from lidarsynth.evaluation.protocols import get_protocol
-from lidarsynth.evaluation.statistics import definition
+from lidarsynth.evaluation.statistics import GATHERED, definition
 from lidarsynth.lidar.depth import from_x_0
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor, get_sensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -70,12 +71,14 @@ class Corrupted:
         return self.images.names[: self.count]
 
     def stamps(self, on_image: Callable[[int], object] | None = None) -> dict[int, str]:
-        """What is told and what is to be found, scan by scan: 16 hex digits of the truth and the known pixels."""
+        """What is told and what is to be found, scan by scan: 16 hex digits of the truth, the known pixels, and the
+        sensor, as its file says it now."""
         found = {}
         for i in range(len(self)):
             truth, known = self[i]
             content = [np.ascontiguousarray(v).tobytes() for v in (truth.range, truth.reflectance, truth.mask, known)]
-            found[i] = blake2b(b"".join(content), digest_size=8).hexdigest()
+            told = json.dumps(truth.sensor.to_dict()).encode()
+            found[i] = blake2b(b"".join([*content, told]), digest_size=8).hexdigest()
             if on_image:
                 on_image(i + 1)
         return found

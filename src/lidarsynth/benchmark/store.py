@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -76,7 +77,8 @@ class Store:
         if not isinstance(seconds, dict) or seconds.keys() != set(Seconds._fields):
             return {}
         told = all(isinstance(value, int | float) for value in seconds.values())
-        return record if told and (self.folder / f"{i:06d}.npz").is_file() else {}
+        whole = zipfile.is_zipfile(self.folder / f"{i:06d}.npz")  # a loss of power may leave a part, or none
+        return record if told and whole else {}
 
 
 def open_store(folder: Path, name: str, settings: dict[str, Any]) -> Store:

@@ -15,11 +15,10 @@ from lidarsynth.benchmark.rows import Declined, Row, fill_store, timed
 from lidarsynth.benchmark.setup import Setup
 from lidarsynth.benchmark.sources import Corrupted
 from lidarsynth.benchmark.store import Seconds, Store
-from lidarsynth.evaluation.evaluate import GATHERED
 from lidarsynth.evaluation.image_sets import emptied
 from lidarsynth.evaluation.pairs import Pairs, classes_of
 from lidarsynth.evaluation.protocols import get_protocol
-from lidarsynth.evaluation.statistics import definition
+from lidarsynth.evaluation.statistics import GATHERED, definition
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.metrics.reconstruction import reconstruction_errors
 from lidarsynth.systems.interpolation.model import interpolated

@@ -36,14 +36,13 @@ from lidarsynth.evaluation.parts import ENDING, merged, statistics_files
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
-from lidarsynth.evaluation.statistics import Statistics, definition, load_statistics, save_statistics
+from lidarsynth.evaluation.statistics import GATHERED, Statistics, definition, load_statistics, save_statistics
 from lidarsynth.lidar.sensor import GRIDS, Sensor, get_sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
 from lidarsynth.lidar.whole_file import write_whole
 from lidarsynth.networks.device import check_device
 from lidarsynth.weights.download import cache_folder
 
-GATHERED = 3  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 THINNED = "thinned"  # scans in less than 1024 columns, since they are drawn as training images are
 Role: TypeAlias = Literal["samples", "real"]
 Samples: TypeAlias = "str | Path | Sequence[str | Path] | Numbered"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lidarsynth.evaluation.protocol import EvaluationProtocol
-from lidarsynth.evaluation.statistics import Statistics, load_statistics
+from lidarsynth.evaluation.statistics import GATHERED, Statistics, load_statistics
 
 ENDING = ".safetensors"  # of a file of statistics
 NAMED = 8  # parts that lack, of a note
@@ -27,7 +27,7 @@ def statistics_files(source: object) -> list[Path]:
 
 
 def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statistics, tuple[str, ...]]:
-    """One set of statistics of several files, and a warning where parts are lacking.
+    """One set of statistics of several files, and warnings where parts are lacking, or were gathered by other rules.
 
     Parts come in the order of their numbers, however the files are named and given: which features the subsets of the
     squared MMD draw depends on their order. Wholes, which have none, stay as they are given.
@@ -51,8 +51,21 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
             total.merge(loaded[i][0])
         except ValueError as error:
             raise ValueError(f"{files[first]} and {files[i]}: {error}") from None
+    unlike = [file for file, (_, metadata) in zip(files, loaded, strict=True) if _by_other_rules(metadata)]
+    told = (_gathered_otherwise(unlike),) if unlike else ()
     if shared and len(shared) < (n := shared[0][1]):
         lacking = [f"{i}/{n}" for i in range(1, n + 1) if (i, n) not in shared]
         more = f" and {len(lacking) - NAMED} more" if len(lacking) > NAMED else ""
-        return total, (f"expected all parts of the images, found none of {', '.join(lacking[:NAMED])}{more}",)
-    return total, ()
+        return total, (f"expected all parts of the images, found none of {', '.join(lacking[:NAMED])}{more}", *told)
+    return total, told
+
+
+def _by_other_rules(metadata: Mapping[str, str]) -> bool:
+    """Whether a program gathered them by whose rules the same files may have been drawn or counted otherwise."""
+    return metadata.get("gathered") != str(GATHERED)
+
+
+def _gathered_otherwise(files: Sequence[Path]) -> str:
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return (f"{files[0]}{more}: expected statistics gathered as by this version, found those of another, which may "
+            "have drawn or counted the same scans otherwise: --part gathers them anew")  # fmt: skip

@@ -33,6 +33,7 @@ from lidarsynth.metrics.sharpness import Sharpness
 from lidarsynth.networks.device import usual_torch
 
 FORMAT = "lidarsynth statistics 1"
+GATHERED = 3  # goes up where the same files come to be gathered otherwise: what was kept before is then made anew
 Networks = Mapping[str, nn.Module]  # kind -> a network in evaluation mode; those a protocol names and that are there
 
 
@@ -302,6 +303,7 @@ def save_statistics(path: Path, statistics: Statistics, extra: Mapping[str, str]
         "format": FORMAT,
         "protocol": statistics.protocol.name,
         "definition": definition(statistics.protocol),
+        "gathered": str(GATHERED),
         "role": statistics.role,
         "sensor": json.dumps(statistics.sensor.to_dict()),
         "weights": json.dumps(statistics.weights),

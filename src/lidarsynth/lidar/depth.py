@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.scan import RangeImage, laid_out
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 
 OVERSHOOT = 0.05  # what comes out of a network may pass its limits by so much, and is clipped; other codes by far more
@@ -79,7 +79,7 @@ def decode(code: Tensor, sensor: Sensor, codec: str = "log") -> Tensor:
 
 def to_x_0(image: RangeImage, codec: str = "log") -> Tensor:
     """RangeImage -> x_0 (2, H, W) float32 in [-1, 1]: range code, reflectance; -1 in both where nothing returned."""
-    parts = (np.require(part, np.float32, ["C", "W"]) for part in (image.range, image.reflectance))
+    parts = (laid_out(part, np.float32) for part in (image.range, image.reflectance))
     distance, reflectance = map(torch.from_numpy, parts)
     return 2 * torch.stack([encode(distance, image.sensor, codec), reflectance]) - 1
 

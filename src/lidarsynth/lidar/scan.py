@@ -375,3 +375,10 @@ class RangeImage:
             instance=number,
             boxes=self.boxes if number is None else counted(self.boxes, number),
         )
+
+
+def laid_out(array: np.ndarray, dtype: np.dtype | type | None = None) -> np.ndarray:
+    """The array as torch takes it, a copy where it has to be: in C order, writable, and no axis backwards, which numpy
+    passes over where one of length 1 is."""
+    array = np.require(array, dtype, ["C", "W"])
+    return array.copy() if min(array.strides, default=0) < 0 else array

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsynth.lidar.scan import ODD
+from lidarsynth.lidar.scan import ODD, laid_out
 
 Array: TypeAlias = np.ndarray | Tensor
 Random: TypeAlias = np.random.Generator | np.random.RandomState
@@ -56,7 +56,7 @@ def as_numbers(values: Array) -> Tensor:
         values = values.astype(np.int32 if values.dtype.itemsize == 2 else np.int64)
     if values.dtype.kind == "f" and values.dtype.itemsize > 8:
         values = values.astype(np.float64)
-    return torch.from_numpy(np.require(values, values.dtype.newbyteorder("="), requirements=["C", "W"]))
+    return torch.from_numpy(laid_out(values, values.dtype.newbyteorder("=")))
 
 
 def as_numpy(values: Array) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from lidarsynth.lidar.columns import as_scanned
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.recognition import recognise
-from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
+from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, laid_out
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 
 
@@ -21,7 +21,7 @@ def known_pixels(image: RangeImage, known: np.ndarray | None) -> np.ndarray:
         raise ValueError(f"known must be {image.shape} bool, got a {type(known).__name__}")
     if known.shape != image.shape or known.dtype != np.bool_:
         raise ValueError(f"known must be {image.shape} bool, got {known.shape} {known.dtype}")
-    return np.require(known, requirements=["C", "W"])
+    return laid_out(known)
 
 
 def of_rays(image: RangeImage, sensor: Sensor) -> RangeImage:

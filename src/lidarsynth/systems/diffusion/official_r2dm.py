@@ -63,11 +63,11 @@ def experiment_of(checkpoint: dict[str, Any], coords: Tensor | None, name: str) 
     cfg, changes = checkpoint["cfg"], {}
     for field in dict.fromkeys([*FIELDS, *VALUES]):
         group, _, key = field.partition(".")
-        if group == "training" and key not in cfg.get(group, ()):
+        if group == "training" and not (isinstance(told := cfg.get(group), dict) and key in told):
             continue  # makes no difference to what the network says
         value = _read(cfg, field)
         if field in VALUES:
-            if value not in list(VALUES[field]):
+            if isinstance(value, Tensor) or value not in list(VALUES[field]):
                 raise ValueError(f"expected cfg.{field} to be one of {list(VALUES[field])}, found {value!r:.60}")
             value = VALUES[field][value]
         if field in FIELDS:
@@ -76,7 +76,9 @@ def experiment_of(checkpoint: dict[str, Any], coords: Tensor | None, name: str) 
     found = None if coords is None else tuple(coords.shape)
     if coords is None or found != (1, 2, *np.atleast_1d(resolution)):
         raise ValueError(f"expected model.coords (1, 2, H, W) with cfg.data.resolution {resolution}, found {found}")
-    learned_from, licence = LICENCES.get(cfg["data"].get("dataset"), ("not known", "not known"))
+    dataset = cfg["data"].get("dataset")
+    known = isinstance(dataset, str) and dataset in LICENCES
+    learned_from, licence = LICENCES[dataset] if known else ("not known", "not known")
     card = Card(licence, learned_from, (f"official R2DM checkpoint, {checkpoint.get('global_step')} steps",))
     drawn, width = int(_read(cfg, "data.projection").rpartition("-")[2]), coords.shape[3]
     data = Data(
