@@ -82,6 +82,18 @@ def test_a_sensor_close_to_the_ground_keeps_its_lowest_beams():
     assert recognise(low)[0] == "vlp-16"
 
 
+@pytest.mark.parametrize("beams", [(3, 1, -1, -3), (2, -3, -8), (1.3, -2.2), (5.1, 0.9, -0.7, -2.6, -9.8)])
+def test_a_few_beams_that_lie_near_those_of_a_sensor_by_chance_are_not_its(beams):
+    assert recognise(turn(Sensor("own", tuple(map(float, beams)))))[0] is None
+
+
+@pytest.mark.parametrize("name", ["hdl-32e", "os1-64", "os1-128", "pandar64", "hdl-64e-kitti"])
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_a_few_beams_of_a_sensor_are_its(name: str, count: int):
+    rows = slice(10, 10 + 5 * count, 5)
+    assert recognise(turn(SENSORS[name], rows=rows))[0] == name
+
+
 def test_empty_beams_towards_the_sky_do_no_harm():
     assert recognise(turn(SENSORS["pandar64"], rows=slice(3, None)))[0] == "pandar64"
 

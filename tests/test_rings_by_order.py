@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 import lidarsynth as ls
+from lidarsynth.lidar.frame import check_frame
+from lidarsynth.lidar.learning import learn_sensor
 from lidarsynth.lidar.own_beams import own_beams
 from lidarsynth.lidar.projection import pixel_of_points, ring_of_points
 from lidarsynth.lidar.recognition import first_row, rings_in_order
+from lidarsynth.streets.reader import SyntheticStreets
 
 
 def by_rings(sensor: ls.Sensor, start: float, way: int, noise: float = 0.0) -> tuple[ls.Scan, np.ndarray]:
@@ -107,3 +110,31 @@ def test_a_stray_ring_is_found_whatever_its_number():
         found = own_beams(replace(scan, ring=(ring + first).astype(np.int32)), sheet)
         assert found.elevations[-1] == pytest.approx(unit.elevations[-1], abs=0.05)
         assert found.elevations[:-1] == sheet.elevations[:-1]
+
+
+def to_each_side(index: int, sensor: ls.Sensor) -> ls.Scan:
+    """A street, ring after ring from behind on, in which beams look 4.2 degrees to either side, as of a VLP-32C."""
+    scan, sides = SyntheticStreets(5, 16, sensor)[index], np.radians([1.4, -4.2, 4.2, -1.4])
+    x, y, z = scan.xyz.T
+    far, side = np.hypot(x, y), sides[scan.ring % 4]
+    azimuth = np.arctan2(y, x)
+    order = np.lexsort((-azimuth, scan.ring))
+    xyz = np.stack([far * np.cos(azimuth + side), far * np.sin(azimuth + side), z], 1).astype(np.float32)
+    return replace(scan, xyz=xyz, ring=None, label=None)[order]
+
+
+def test_beams_that_look_to_either_side_are_in_their_own_frame_and_tell_their_sensor():
+    """An order that mixed two beams in each ring had the sensor stand a metre aside, and taught beams between beams."""
+    sensor = ls.get_sensor("vlp-32c")
+    for index in (2, 8):
+        scan = to_each_side(index, sensor)
+        assert check_frame(scan).warning() is None
+        learned = np.array(learn_sensor([scan], "own").sensor.elevations)
+        assert np.abs(learned[:, None] - sensor.elevations).min(axis=1).max() < 0.05 and len(learned) >= 28
+
+
+def test_a_turn_that_begins_aside_teaches_no_more_beams_than_there_are():
+    sensor = ls.Sensor("own", tuple(np.linspace(12, -22, 20).tolist()))
+    scan, _ = by_rings(sensor, np.pi / 2, 1)
+    learned = learn_sensor([scan], "own")
+    assert learned.merged == 0 and np.allclose(learned.sensor.elevations, sensor.elevations, atol=0.01)

@@ -110,8 +110,8 @@ def fit_ring(xyz: np.ndarray, height: float | None = None) -> Ring:
     rho = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
     values, inverse = xyz[:, 2] / rho, 1 / rho
     slope, lift, error, scale = float(np.median(values)), height or 0.0, np.inf, 1.0
-    if height is None:  # starting from a nearly right line: medians of the near and of the far half
-        far = rho > np.median(rho)
+    far = rho > np.median(rho)
+    if height is None and far.any():  # starting from a nearly right line: medians of the near and of the far half
         near_value, far_value = float(np.median(values[~far])), float(np.median(values[far]))
         gap = float(np.median(inverse[~far]) - np.median(inverse[far]))
         lift = (near_value - far_value) / gap if gap > 1e-3 else 0.0

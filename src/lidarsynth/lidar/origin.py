@@ -14,7 +14,7 @@ import numpy as np
 from lidarsynth.lidar.cones import Cones, fit_cones, onto_z
 from lidarsynth.lidar.crowding import ORIGINS, stand_of_beams
 from lidarsynth.lidar.motion import straighten
-from lidarsynth.lidar.recognition import recognise, rings_by_elevation, rings_in_order
+from lidarsynth.lidar.recognition import mixes_beams, recognise, rings_by_elevation, rings_in_order
 from lidarsynth.lidar.scan import Scan
 
 RAISED = 0.6  # metres; beams of an HDL-64E leave up to 0.2 m above its origin
@@ -83,7 +83,8 @@ def turned(scan: Scan, rotation: np.ndarray, beside: Sequence[float] = (0.0,)) -
 
 def _in_order(xyz: np.ndarray, beside: Sequence[float]) -> np.ndarray | None:
     rings = (rings_in_order(xyz - np.array([0, y, 0], np.float32)) for y in beside)
-    return next((ring for ring in rings if ring is not None), None)
+    ring = next((ring for ring in rings if ring is not None), None)
+    return None if ring is None or mixes_beams(xyz, ring) else ring
 
 
 def _several(ring: np.ndarray | None) -> np.ndarray | None:

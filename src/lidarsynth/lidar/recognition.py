@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import factorial
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,15 @@ UNIT = 0.5  # degrees: one sensor of a kind may differ from its data sheet by th
 # Metres above the beams' origin that a frame may have its own, by which near rings look degrees off: an Ouster's 0.04.
 LIFTS = np.linspace(-0.1, 0.1, 9)
 SUBSET = 0.12  # of the beams' spacing: the error when a scan has some beams only; chance gives 0.25
+LUCK = 0.003  # chance that so few beams of nobody's lie so near those of one sensor: of 3 the error is at most 0.044
 STRAY = 0.02  # of a usual ring: a first or last one of fewer points is none
 ENOUGH = 256  # points of a ring, evenly from all of it: their median is the ring's to a few thousandths of a degree
 POINTS = 8_000  # of a scan are enough, where each is compared with each beam
 SOME = 30_000  # of a scan tell what its rings are
+# Degrees off their ring's median, the share of points that are, and how many times that of crowds: of rings by an order
+# that begins elsewhere or is of beams that each look to another side it is 0.24 to 0.49, and of crowds at most 0.013.
+# Of KITTI's scans and of streets it is that of crowds, or less, or below 0.001.
+ASTRAY, MIXED, CLEARER = 0.1, 0.05, 10
 # For scans without rings, the least `share_on_beams`. Of train scans and streets of seven sensors it is 0.98 and more,
 # with a carrier's 10 m/s taken out mostly above 0.22; for 400 random sensors of nobody at most 0.17.
 POINTWISE = 0.25
@@ -42,7 +48,8 @@ def recognise(
     Rings come from `scan.ring`, else from the order of the points (KITTI's files hold one ring after the other). A scan
     of at least nine tenths of a sensor's beams matches it beam by beam within half a degree; one of fewer beams must
     meet them ten times better than the spacing, so every fourth ring of an HDL-64E is an HDL-64E and no VLP-16. Without
-    rings the points must lie on beams, or crowd on as many. `path` begins the reason.
+    rings the points must lie on beams, or crowd on as many. `path` begins the reason. Of less than ten rings, the fewer
+    the nearer these must be (`_nearness`).
     """
     where = "" if path is None else f"{path}: "
     if len(scan) < 100:
@@ -175,7 +182,9 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
     """(N,) int ring of each point where the file holds ring after ring, the highest first, else None.
 
     Each ring is one turn, so the azimuth jumps by a turn once between two rings, always in the same direction. The
-    turn may begin ahead (KITTI) or behind (our own images): the seam with fewer jumps is the right one.
+    turn may begin ahead (KITTI) or behind (our own images): the seam with fewer jumps is the right one. None, too, of a
+    turn that begins elsewhere, or of beams that each look to another side, where elevations crowd and these rings mix
+    them.
     """
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     best: np.ndarray | None = None
@@ -186,7 +195,27 @@ def rings_in_order(xyz: np.ndarray) -> np.ndarray | None:
         if 3 <= jumps.sum() < 256 and others.sum() <= 0.02 * jumps.sum():
             ring = _without_strays(np.concatenate([[0], np.cumsum(jumps)]))
             best = ring if best is None or ring[-1] < best[-1] else best
-    return best
+    return None if best is None or mixes_beams(xyz, best) else best
+
+
+def mixes_beams(xyz: np.ndarray, ring: np.ndarray) -> bool:
+    """Whether points (N, 3) beyond FAR crowd on beams of which rings (N,) each hold points of several."""
+    part = slice(None, None, max(1, len(xyz) // POINTS))
+    far = np.hypot(xyz[part, 0], xyz[part, 1]) > FAR
+    points, ring = xyz[part][far], ring[part][far]
+    if (crowd := rings_by_elevation(points)) is None:
+        return False
+    elevation = elevations_of(points)
+    least = max(MIXED, CLEARER * _share_astray(elevation, crowd))
+    return least < 1 and _share_astray(elevation, ring) > least
+
+
+def _share_astray(elevation: np.ndarray, ring: np.ndarray) -> float:
+    """The share of points, of degrees (N,), that are ASTRAY from the median of their ring (N,)."""
+    order = np.lexsort((elevation, ring))
+    _, first, own, count = np.unique(ring[order], return_index=True, return_inverse=True, return_counts=True)
+    elevation = elevation[order]
+    return float((np.abs(elevation - elevation[first + count // 2][own]) > ASTRAY).mean())
 
 
 def _without_strays(ring: np.ndarray) -> np.ndarray:
@@ -212,7 +241,7 @@ def _by_rings(
         name = min(errors, key=lambda n: errors[n])
         return name, f"{found}, {errors[name]:.2f} from the {among[name].height} beams of {name}"
     errors = {} if whole else {name: _subset_error(beams, s) for name, s in among.items()}
-    shares = {name: e for name, e in errors.items() if e is not None and e < SUBSET}
+    shares = {name: e for name, e in errors.items() if e is not None and e < _nearness(len(beams))}
     if shares:
         name = min(shares, key=lambda n: shares[n])
         return name, f"{found}, on {len(beams)} of the {among[name].height} beams of {name}"
@@ -261,6 +290,13 @@ def _whole_error(beams: np.ndarray, middle: np.ndarray, sensor: Sensor) -> float
 def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:
     """Mean distance of the rings from the nearest beams, in units of the spacing there; None if two meet one beam."""
     return None if len(beams) >= 0.9 * sensor.height or sensor.height < 32 else _off_beams(beams, sensor)
+
+
+def _nearness(rings: int) -> float:
+    """The mean distance from beams, in units of their spacing, below which so many rings are a sensor's: SUBSET, or
+    where rings that lie anywhere, each 0 to 1/2 off, would be nearer by LUCK, (2 n error)^n / n! (Irwin-Hall)."""
+    few = min(rings, 10)  # of as many it is SUBSET already
+    return min(SUBSET, (LUCK * factorial(few)) ** (1 / few) / (2 * few))
 
 
 def _off_beams(beams: np.ndarray, sensor: Sensor) -> float | None:
