@@ -42,7 +42,7 @@ fuzz: $(STAMP)
 	$(BIN)/python tests/fuzz.py --minutes $(MINUTES) --seed $(SEED)
 
 # Those alone that need neither scans nor a model of yours.
-BENCHMARKS := $(filter-out $(foreach name,any_sensor frames realise learn_layout learn_drawn learn_judge,benchmarks/$(name).py),\
+BENCHMARKS := $(filter-out $(foreach name,any_sensor frames realise learn_layout learn_drawn learn_judge learn_inside odd_things,benchmarks/$(name).py),\
                 $(sort $(wildcard benchmarks/*.py)))
 bench: $(STAMP)
 	for script in $(BENCHMARKS); do $(BIN)/python $$script || exit 1; done
