@@ -27,6 +27,7 @@ from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.cascade.patterns import pattern
 from lidarsynth.systems.cascade.scores import absolute_errors, energy_score, expected_errors, misnamed
 from lidarsynth.systems.cascade.training import fit_standard
+from lidarsynth.systems.table import build_network, transfer
 from lidarsynth.training import monitor
 from lidarsynth.training.options import Options
 from lidarsynth.verbs.training import run
@@ -368,3 +369,16 @@ def test_no_crops_have_gradients_of_nothing():
     losses = cascade_training._of_none(network)
     torch.cat([losses, network.weight.new_zeros(1)]).mean().backward()
     assert losses.shape == (0,) and all(not p.grad.any() for p in network.parameters())
+
+
+def test_what_names_insides_alone_starts_as_what_tells_them_from_streets():
+    """Where a network of its own told which scans are of insides, the one that names them need not know streets."""
+    source = with_fields(TINY, {"model.indoors_channels": 8})
+    weights, both, alone = build_network(source), build_network(source), build_network(TINY)
+    for network, record in ((both, source), (alone, TINY)):
+        transfer(network, record, weights, source, "weights")
+    first = {name: value for name, value in weights.state_dict().items() if name.endswith("stem.weight")}
+    assert not torch.equal(first["inside.stem.weight"], first["indoors.stem.weight"])
+    assert_close(both.state_dict()["inside.stem.weight"], first["inside.stem.weight"])
+    assert_close(both.state_dict()["indoors.stem.weight"], first["indoors.stem.weight"])
+    assert_close(alone.state_dict()["inside.stem.weight"], first["indoors.stem.weight"])

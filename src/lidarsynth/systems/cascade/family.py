@@ -94,13 +94,16 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     """All weights, of equally wide networks; the sensor may differ, and what not all have starts fresh.
 
     A fill for the least error, where the weights have none of its own, starts as their only one; so does an observer
-    that is as wide.
+    that is as wide. What names insides, where it has to say by itself which scans are of such, starts as what says so.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
     for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside", "drawn",
                  "indoors"):  # fmt: skip
-        if getattr(network, part) is not None and getattr(weights, part) is not None:
-            load_weights(getattr(network, part), getattr(weights, part).state_dict(), name)
+        source = getattr(weights, part)
+        if part == "inside" and network.indoors is None and weights.indoors is not None:
+            source = weights.indoors  # the other has seen no streets
+        if getattr(network, part) is not None and source is not None:
+            load_weights(getattr(network, part), source.state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)
     _start(network.observer, (weights.observer, weights.fill), name)
 
