@@ -9,6 +9,7 @@ import pytest
 
 from lidarsynth.data import ouster
 from lidarsynth.data.capture import Datagram
+from lidarsynth.evaluation.image_sets import image_set
 from lidarsynth.files.fields import FileError
 
 ALTITUDES, COLUMNS, METRES = [60.0, 30.0, 0.0, -30.0], 32, 5.0
@@ -44,3 +45,13 @@ def test_beams_of_an_ouster_may_begin_above_its_centre(tmp_path: Path):
 def test_a_matrix_of_too_few_numbers_is_refused(tmp_path: Path):
     with pytest.raises(FileError, match=r"dome.json: expected Ouster metadata, found: cannot reshape array of size 4"):
         metadata(tmp_path / "dome.json", [1, 0, 0, 4])
+
+
+@pytest.mark.parametrize("name", ["drive.pcap", "drive.mcap", "."])
+def test_a_recording_that_is_to_be_judged_is_told_as_one(name: str, tmp_path: Path):
+    for each in ("drive.pcap", "drive.mcap"):
+        (tmp_path / each).write_bytes(b"")
+    with pytest.raises(ValueError, match=r"found a bag or capture, of whose scans `lidarsynth project` makes a folder"):
+        image_set(tmp_path / name)
+    with pytest.raises(ValueError, match="found no such file or folder"):
+        image_set(tmp_path / "none.pcap")
