@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 import numpy as np
 
 from lidarsynth.experiment.record import Experiment
-from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.plural import plural
+from lidarsynth.lidar.recognition import lies_on, recognise, same_kind
 from lidarsynth.lidar.scan import RangeImage, Scan, as_scan, check_image
 from lidarsynth.lidar.sensor import Sensor, get_sensor
 from lidarsynth.lidar.unseen import SPARSE, caution, few_beams
