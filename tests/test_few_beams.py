@@ -1,5 +1,6 @@
 """Points on hardly any beams of the sensor that is named are told, also where `--rings` takes them of others."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from lidarsynth.lidar.sensor import SENSORS, Sensor, get_sensor
 from lidarsynth.lidar.unseen import few_beams
 from lidarsynth.lidar.view import misfit, placement
 from lidarsynth.streets.reader import SyntheticStreets
+from lidarsynth.systems.notes import hardly_told
 from lidarsynth.weights.load import load
 
 
@@ -78,6 +80,30 @@ def test_few_beams_are_told_of_whichever_scan_of_a_folder(verb: str, tmp_path: P
     main([*verb.split(), str(tmp_path / "[0-4].ply"), *words])
     told = [line for line in capsys.readouterr().err.splitlines() if "many beams" in line]
     assert len(told) == 1 and f"{tmp_path / '4.ply'}: expected {SAID.format('3 elevations')}" in told[0]
+
+
+HARDLY = r"^expected a sensor of 3 beams and more, found one of {}: .* four classes in ten are right$"
+
+
+@pytest.mark.parametrize("verb", ["complete", "label"])
+def test_a_sensor_of_one_or_two_beams_is_told_to_be_hardly_enough(verb: str, tmp_path: Path, capsys):
+    """Such are completed worse than by interpolation, which was not said; it says nothing of itself."""
+    (tmp_path / "two.toml").write_text('name = "two"\nwidth = 256\nelevations = [-2.0, -6.0]\n')
+    write(tmp_path / "a.ply", SyntheticStreets(5, 1, Sensor("two", (-2.0, -6.0), 256)).image(0).to_scan())
+    words = ["--sensor", str(tmp_path / "two.toml"), "--no-picture"]
+    for model in ("default", "nearest") if verb == "complete" else ("default",):
+        main([verb, str(tmp_path / "a.ply"), *words, "--model", model, "--out", str(tmp_path / f"{model}.ply")])
+        said = "expected a sensor of 3 beams and more, found one of 2 beams" in capsys.readouterr().err
+        assert said == (model == "default")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_model_in_python_tells_of_a_sensor_of_one_or_two_beams(count: int):
+    sensor = Sensor("few", (-2.0, -6.0, -9.0)[:count], 256)
+    scan, model = SyntheticStreets(5, 1, sensor)[0], load("default").into(sensor)
+    text = hardly_told(model, scan)
+    assert text is None if count == 3 else re.match(HARDLY.format("1 beam" if count == 1 else "2 beams"), str(text))
+    assert hardly_told(load("nearest").into(sensor), scan) is None
 
 
 def test_a_model_in_python_warns_of_few_beams():

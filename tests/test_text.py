@@ -23,6 +23,9 @@ ROWS = "1 2 3 0.5\n4 5 6 0.25\n"
         "2\n" + ROWS,
         ROWS,
         "intensity\tz\ty\tx\n0.5\t3\t2\t1\n0.25\t6\t5\t4\n",
+        "x;y;z;intensity\n1,0;2;3,0;5,0e-1\n4;5;6;0,25\n",  # decimal commas
+        '"x"\t"y"\t"z"\t"intensity"\n"1"\t"2"\t"3"\t"0,5"\n"4"\t"5"\t"6"\t"0,25"\n',
+        "1 2 3 0,5\n4 5 6 0,25\n",
     ],
 )
 def test_every_way_of_writing_the_same_points(text: str, tmp_path):

@@ -56,6 +56,8 @@ PROFILES: dict[str, Profile] = {
                       {"reflectivity": (3, "u1"), "signal": (8, "<u2"), "ambient": (12, "<u2")}),
     "RNG15_RFL8_NIR8": Profile(32, 32, (12, 0), 4, ("<u2", 0x7FFF, 0.008),
                       {"reflectivity": (2, "u1"), "ambient": (3, "u1")}),
+    "RNG15_RFL8_NIR8_DUAL": Profile(32, 32, (12, 0), 8, ("<u2", 0x7FFF, 0.008),
+                      {"reflectivity": (2, "u1"), "ambient": (3, "u1")}),
 }  # fmt: skip
 
 
@@ -69,6 +71,7 @@ class Metadata:
     origin               metres from the lidar's axis to the beams' origins
     to_sensor            (4, 4) lidar frame -> sensor frame, metres
     profile              of the packets
+    lift                 metres from the lidar's centre up to the beams' origins
     """
 
     name: str
@@ -79,6 +82,7 @@ class Metadata:
     origin: float
     to_sensor: np.ndarray
     profile: str
+    lift: float = 0.0
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -122,15 +126,16 @@ def _metadata(flat: dict[str, Any], name: str) -> Metadata:
     altitudes, azimuths = flat["beam_altitude_angles"], flat["beam_azimuth_angles"]
     if not (isinstance(altitudes, list) and len(altitudes) == len(azimuths) >= 4):
         raise ValueError(f"{len(altitudes)} altitudes and {len(azimuths)} azimuths of beams")
-    beam = flat.get("beam_to_lidar_transform")
-    origin = float(beam[3] if beam else flat.get("lidar_origin_to_beam_origin_mm", ORIGIN)) / 1000
+    aside = float(flat.get("lidar_origin_to_beam_origin_mm", ORIGIN))
+    beam = np.array(flat.get("beam_to_lidar_transform") or [1, 0, 0, aside, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+    origin, _, lift = (beam.astype(np.float64).reshape(4, 4)[:3, 3] / 1000).tolist()
     matrix = np.array(flat.get("lidar_to_sensor_transform", [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, LIFT, 0, 0, 0, 1]))
     matrix = matrix.astype(np.float64).reshape(4, 4) * np.array([1, 1, 1, 0.001])
     matrix[3, 3] = 1
     columns = int(flat.get("columns_per_frame") or MODES[flat.get("lidar_mode", "1024x10")])
     profile = str(flat.get("udp_profile_lidar", "LEGACY"))
     return Metadata(name, tuple(map(float, altitudes)), tuple(map(float, azimuths)), columns,
-                    int(flat.get("columns_per_packet", 16)), origin, matrix, profile)  # fmt: skip
+                    int(flat.get("columns_per_packet", 16)), origin, matrix, profile, lift)  # fmt: skip
 
 
 def is_metadata(path: str | Path) -> bool:
@@ -156,7 +161,7 @@ def metadata_beside(path: Path, where: str) -> Path:
 
 def sensor_of(metadata: Metadata, name: str | None = None) -> Sensor:
     """The sensor that the metadata describes: its beams, columns, and the height of their origin in its frame."""
-    lift = float(metadata.to_sensor[2, 3])
+    lift = float(metadata.to_sensor[2, 3] + metadata.to_sensor[2, 2] * metadata.lift)
     pairs = sorted(set(metadata.altitudes), reverse=True)
     return Sensor(name or metadata.name, tuple(pairs), metadata.columns, 0.3, 240.0, (lift,) * len(pairs))
 
@@ -288,13 +293,14 @@ def points_of(distance: np.ndarray, metadata: Metadata) -> np.ndarray:
     """(H, W, 3) metres in the sensor frame of ranges (H, W) metres, column by column as measured.
 
     The encoder's angle falls from 0 at column 0; a beam stands `azimuths` beside it, and leaves `origin` off the axis:
-    x = (r - n) cos(e + a) cos(phi) + n cos(e) (Ouster's software manual, "Lidar range to XYZ").
+    x = (r - |n|) cos(e + a) cos(phi) + n_x cos(e), and so `lift` above the centre, n = (n_x, n_z)
+    (Ouster's software manual, "Lidar range to XYZ").
     """
     encoder = 2 * np.pi * (1 - np.arange(metadata.columns) / metadata.columns)
     angle = encoder[None, :] - np.radians(metadata.azimuths)[:, None]
     elevation, n = np.radians(metadata.altitudes)[:, None], metadata.origin
-    travel = distance - n
+    travel = distance - np.hypot(n, metadata.lift)
     x = travel * np.cos(angle) * np.cos(elevation) + n * np.cos(encoder)
     y = travel * np.sin(angle) * np.cos(elevation) + n * np.sin(encoder)
-    points = np.stack([x, y, travel * np.sin(elevation)], axis=-1)
+    points = np.stack([x, y, travel * np.sin(elevation) + metadata.lift], axis=-1)
     return points @ metadata.to_sensor[:3, :3].T + metadata.to_sensor[:3, 3]

@@ -14,7 +14,9 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from torch import Tensor
 
+from lidarsynth.data.bags import is_bag
 from lidarsynth.data.cache_files import is_cache
+from lidarsynth.data.capture import is_capture
 from lidarsynth.data.dataset import INDEX, CachedImages
 from lidarsynth.data.folder import check_readable, scans_below
 from lidarsynth.evaluation.protocol import Clouds
@@ -172,6 +174,10 @@ def _taken(given: object, name: str) -> Item:
         raise ValueError(f"{name}: {error}") from None
 
 
+def _is_recording(path: Path) -> bool:
+    return is_bag(path) or is_capture(path)
+
+
 def _files(path: Path) -> list[Path]:
     """The readable files under a folder, sorted, or the file itself. Hidden files and folders are left out, and what a
     folder of scans may hold beside them, as the other verbs do."""
@@ -183,6 +189,8 @@ def _files(path: Path) -> list[Path]:
     files = [file for file in files if not any(part[0] == "." for part in file.relative_to(path).parts)]
     if not files:
         found = "none" if path.is_dir() else "another file" if path.is_file() else "no such file or folder"
+        if path.exists() and any(map(_is_recording, (path, *(path.iterdir() if path.is_dir() else ())))):
+            found = "a bag or capture, of whose scans `lidarsynth project` makes a folder of images"
         raise ValueError(f"{path}: expected a cache, or samples ({', '.join(known)}), found {found}")
     stems = [file.with_name(stem_of(file.name)) for file in files]
     if doubled := [stem for stem, count in Counter(stems).items() if count > 1]:

@@ -16,6 +16,7 @@ HEADER_LINES = 64
 TRUTHS = {"true": "1", "false": "0"}
 OUSTER = {"x1": "x", "y1": "y", "z1": "z", "row": "ring"}  # of ouster-cli's csv, where two returns have numbers
 BLOCK = 1 << 16  # lines
+WITH_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")  # a number as most of Europe's spreadsheets write it
 DIGITS = 18  # of a count of points, at most
 
 
@@ -88,6 +89,8 @@ def _lines(data: bytes) -> list[str]:
     first = [row.strip() for row in rows[:HEADER_LINES]]
     tabs = next((row.count("\t") for row in first if _separator(row) == "\t" and _names(row.split("\t"))), 0)
     lines = [line for line in (_without_blanks(row, tabs) for row in rows) if line]
+    if any(map(_has_decimal_commas, lines[:HEADER_LINES])):
+        lines = [line.replace(",", ".") for line in lines]
     if len(lines) > MAX_POINTS:
         raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {len(lines)} lines")
     return lines
@@ -95,6 +98,14 @@ def _lines(data: bytes) -> list[str]:
 
 def _separator(line: str) -> str | None:
     return next((s for s in SEPARATORS if s is not None and s in line), None)
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Whether a line is of numbers with decimal commas, between which `;`, a tab or blanks stand."""
+    if "," not in line or "." in line:
+        return False
+    cells = _words(line, ";" if ";" in line else None)
+    return len(cells) >= 3 and all(cell == "" or WITH_COMMA.fullmatch(cell) for cell in cells)
 
 
 def _words(line: str, separator: str | None) -> list[str]:

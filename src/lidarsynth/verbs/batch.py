@@ -23,14 +23,14 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution, few_beams, filled_before
+from lidarsynth.lidar.unseen import caution, filled_before
 from lidarsynth.lidar.view import placement
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
 from lidarsynth.streets.wanted import wanted
 from lidarsynth.systems.filling import Filling
-from lidarsynth.systems.notes import IN_PYTHON, beyond_image, bound
+from lidarsynth.systems.notes import IN_PYTHON, beyond_image, bound, hardly_told
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.completion import Filled, complete_scan, named_sensor, taken_away, upsample_scan
 from lidarsynth.verbs.inputs import Input, Loaded, back_in_place, message_fields, without_places
@@ -295,10 +295,7 @@ def _caution(scan: Scan, job: Job, work: Work, model: ScanModel | None, alone: b
 
 def _few_beams(scan: Scan, job: Job, model: ScanModel | None) -> str | None:
     """That a scan, whichever of many, has so few beams that the result is a guess; a range image of it is none."""
-    if model is None:
-        return None
-    own = model.sensor if bound(model) else None
-    return few_beams(scan.xyz, own if job.sensor is None else get_sensor(job.sensor))
+    return None if model is None else hardly_told(model, scan, job.sensor)
 
 
 def _in_one_line(path: Path, warning: str | None, *more: str | None) -> str | None:
