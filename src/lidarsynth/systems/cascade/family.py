@@ -99,11 +99,11 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
     for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside", "drawn",
                  "indoors"):  # fmt: skip
-        source = getattr(weights, part)
+        start = getattr(weights, part)
         if part == "inside" and network.indoors is None and weights.indoors is not None:
-            source = weights.indoors  # the other has seen no streets
-        if getattr(network, part) is not None and source is not None:
-            load_weights(getattr(network, part), source.state_dict(), name)
+            start = weights.indoors  # the other has seen no streets
+        if getattr(network, part) is not None and start is not None:
+            load_weights(getattr(network, part), start.state_dict(), name)
     _start(network.likeliest, (weights.surest,), name)
     _start(network.observer, (weights.observer, weights.fill), name)
 

@@ -58,6 +58,7 @@ from lidarsynth.systems.cascade.request import calls, resolved, warn_of_height
 from lidarsynth.systems.cascade.response import AS_STREETS, Response, response_of, tried
 from lidarsynth.systems.cascade.shading import shaded
 from lidarsynth.systems.cascade.silent import silent_rows, with_silent
+from lidarsynth.systems.cascade.sparse import filled_in, named_as
 from lidarsynth.systems.cascade.speckle import ELSEWHERE, SHARE, calm
 from lidarsynth.systems.cascade.surfaces import paved
 from lidarsynth.systems.cascade.unit import as_streets
@@ -224,12 +225,14 @@ class CascadeModel(AnySensorModel):
         return observed(scan, image, answer[0], projection)
 
     def named(self, scan: Scan | np.ndarray, sensor: Sensor | str | None = None, least: float = 0.0) -> RangeImage:
-        """The image of `label`, with the classes of its pixels."""
+        """The image of `label`, with the classes of its pixels; what a thinned one lacks is filled in before."""
         scan, projection, model = as_scan(scan), self.experiment.data.projection, self.with_labels()
         model = model.labelling(scan) if sensor is None else model.into(sensor)
         pixels = pixel_of_points(scan, model.sensor, projection)
         image = check_seen(project(scan, model.sensor, projection, pixels=pixels), len(scan))
-        (image,) = model._as_found(image, image.mask)._named([image], least, recorded=True)
+        whole = filled_in(replace(model, labelled=False), image)
+        (answer,) = model._as_found(image, image.mask)._named([whole], least, recorded=True)
+        image = named_as(image, answer)
         return replace(image, completed=replace(scan, label=class_of_points(scan.xyz, image, pixels)))
 
     def generation_steps(self, steps: int | None = None, sampler: str | None = None) -> int:
