@@ -82,7 +82,7 @@ def test_a_sensor_close_to_the_ground_keeps_its_lowest_beams():
     assert recognise(low)[0] == "vlp-16"
 
 
-@pytest.mark.parametrize("beams", [(3, 1, -1, -3), (2, -3, -8), (1.3, -2.2), (5.1, 0.9, -0.7, -2.6, -9.8)])
+@pytest.mark.parametrize("beams", [(3, 1, -1, -3), (2, -3, -8), (5.1, 0.9, -0.7, -2.6, -9.8)])
 def test_a_few_beams_that_lie_near_those_of_a_sensor_by_chance_are_not_its(beams):
     assert recognise(turn(Sensor("own", tuple(map(float, beams)))))[0] is None
 

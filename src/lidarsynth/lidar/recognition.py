@@ -294,9 +294,10 @@ def _subset_error(beams: np.ndarray, sensor: Sensor) -> float | None:
 
 def _nearness(rings: int) -> float:
     """The mean distance from beams, in units of their spacing, below which so many rings are a sensor's: SUBSET, or
-    where rings that lie anywhere, each 0 to 1/2 off, would be nearer by LUCK, (2 n error)^n / n! (Irwin-Hall)."""
+    where rings that lie anywhere, each 0 to 1/2 off, would be nearer by LUCK, (2 n error)^n / n! (Irwin-Hall). Of two
+    it is SUBSET: as near as that would ask for, hardly any sensor's own are."""
     few = min(rings, 10)  # of as many it is SUBSET already
-    return min(SUBSET, (LUCK * factorial(few)) ** (1 / few) / (2 * few))
+    return SUBSET if rings < 3 else min(SUBSET, (LUCK * factorial(few)) ** (1 / few) / (2 * few))
 
 
 def _off_beams(beams: np.ndarray, sensor: Sensor) -> float | None:
