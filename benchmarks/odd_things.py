@@ -18,20 +18,14 @@ from lidarsynth.streets import furniture, interiors
 from lidarsynth.streets.floors import Room
 from lidarsynth.streets.furniture import GOODS, LABEL, WOOD
 from lidarsynth.streets.interiors import Site
-from lidarsynth.streets.shapes import Mesh, box, frustum, join, moved
+from lidarsynth.streets.shapes import Mesh, frustum, join, moved
 
 MATERIALS = (*WOOD, *GOODS, "paint", "glass", "sign", "skin", "cloth", "tyre", "lamp", "stone")
 IN_ROOMS, ALONE, IN_HALLS = 0.06, 0.08, 0.012  # of a kind per square metre: beside furniture, in its place, in halls
 Kind = Callable[[np.random.Generator], Mesh]
 
 
-def _stuff(rng: np.random.Generator) -> str:
-    return str(rng.choice(MATERIALS))
-
-
-def _block(size: tuple[float, float, float], low: float, material: str, x: float = 0.0, y: float = 0.0) -> Mesh:
-    length, width, height = size
-    return box((x - length / 2, x + length / 2), (y - width / 2, y + width / 2), (low, low + height), material, LABEL)
+_block, _stuff = furniture._block, partial(furniture._stuff, of=MATERIALS)
 
 
 def _ellipsoid(half: tuple[float, float], low: float, high: float, material: str, rings: int = 6) -> Mesh:

@@ -67,4 +67,6 @@ def test_scans_without_reflectance_that_are_thinned_are_named_too():
 
 def test_kittis_own_car_is_no_lack():
     image = SyntheticStreets(98_012, 16).image(0)
-    assert share_beside(image.mask, hidden(image.sensor)) > 0.9
+    share = share_beside(image.mask, hidden(image.sensor))
+    assert share > 0.9
+    assert share > share_beside(image.mask, np.zeros(image.shape, bool)) + 0.005  # were its rays counted

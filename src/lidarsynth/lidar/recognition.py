@@ -48,8 +48,8 @@ def recognise(
     Rings come from `scan.ring`, else from the order of the points (KITTI's files hold one ring after the other). A scan
     of at least nine tenths of a sensor's beams matches it beam by beam within half a degree; one of fewer beams must
     meet them ten times better than the spacing, so every fourth ring of an HDL-64E is an HDL-64E and no VLP-16. Without
-    rings the points must lie on beams, or crowd on as many. `path` begins the reason. Of less than ten rings, the fewer
-    the nearer these must be (`_nearness`).
+    rings the points must lie on beams, or crowd on as many. `path` begins the reason. Of three to nine rings, the
+    fewer the nearer these must be (`_nearness`).
     """
     where = "" if path is None else f"{path}: "
     if len(scan) < 100:
