@@ -13,19 +13,23 @@ CHANCE = 1e-3  # that what is not blocked never returned in so many places
 # Degrees: rays that look higher may meet nothing wherever a street leads; of these only runs whose edges stand still
 # are believed, where in this share of a turn beside them returns are at least half of what is usual for the row.
 LEVEL, BESIDE, USUAL = -5.0, 0.002, 0.5
+# Of rays that look lower: those are blocked that return in fewer scans than one in ten, and those beside them, within
+# this share of a turn, that return half as often as is usual for the row at most, if others do within it.
+RARELY, EDGE = 0.1, 0.006
 SECTOR = 1 / 12  # of a turn: where no beam at all returned in as much, and some are blocked, the sensor does not look
 
 
 def blocked_runs(
     seen: np.ndarray, elevations: np.ndarray, tilt: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[tuple[int, int, int], ...]:
-    """(row, first column, last column) of rays that never returned, in rows that return elsewhere; a run may wrap.
+    """(row, first column, last column) of rays that never return, in rows that return elsewhere; a run may wrap.
 
     seen        (scans, H, W) bool, which rays returned in each scan
     elevations  (H,) degrees of the rows
     tilt        degrees of the sensor against the ground, which may raise a row by as much
 
-    None where there are too few scans to tell, or all are of nearly one place. Rays that look up need the more of them,
+    None where there are too few scans to tell, or all are of nearly one place. Of rays that look down those that hardly
+    return are such, too, as where scans were moved to one moment. Rays that look up need the more of them,
     and sharp edges: above the end of a street there is always sky. A wide sector without any return, of which some rows
     are blocked, is none of the view of the others, either.
     """
@@ -42,11 +46,29 @@ def blocked_runs(
         high = elevations[row] > LEVEL - raised
         if (1 - usual) ** many > CHANCE or (high and many < SCANS):
             continue
-        for first, last in _empty_runs(share == 0):
+        found = np.zeros(width, bool)
+        for first, last in _empty_runs(share == 0 if high or _chance(usual, many) > CHANCE else share < RARELY):
             beside = [share[(edge + steps) % width].mean() for edge, steps in ((first, -near), (last, near))]
-            if (last - first) % width + 1 >= RUN * width and (not high or min(beside) >= USUAL * usual):
-                runs.append((int(row), first, last))
+            size = (last - first) % width + 1
+            if size >= RUN * width and (not high or min(beside) >= USUAL * usual):
+                left, right = (0 if high else _more(share, edge, way, USUAL * usual) for edge, way in ((first, -1), (last, 1)))
+                found[np.arange(first - left, first + size + right) % width] = True
+        runs.extend((int(row), first, last) for first, last in _empty_runs(found))
     return tuple(sorted({*runs, *_unseen_sectors(view, len(elevations), runs)}))
+
+
+def _chance(usual: float, many: float) -> float:
+    """At most, that of `many` rays which usually return so often fewer than `RARELY` do, by Chernoff's bound."""
+    usual = min(max(usual, RARELY), 1 - 1e-6)
+    return float(np.exp(-many * (RARELY * np.log(RARELY / usual) + (1 - RARELY) * np.log((1 - RARELY) / (1 - usual)))))
+
+
+def _more(share: np.ndarray, edge: int, way: int, usual: float) -> int:
+    """Columns beyond the edge of a run, to the left (-1) or right (1), before the first that returns as `usual`, (W,)
+    shares; 0 where that is too far away, as where nothing ends."""
+    reach = max(round(EDGE * len(share)), 1)
+    beyond = share[(edge + way * np.arange(1, reach + 2)) % len(share)] >= usual
+    return int(beyond.argmax())  # 0 of none, too
 
 
 def _unseen_sectors(view: np.ndarray, rows: int, runs: list[tuple[int, int, int]]) -> Iterator[tuple[int, int, int]]:

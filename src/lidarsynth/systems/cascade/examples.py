@@ -23,6 +23,7 @@ from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
 from lidarsynth.streets.hdl64e import hidden, unevenness
+from lidarsynth.streets.kittis_car import outline_of, outlined
 from lidarsynth.systems.cascade.lessons import AS_FAR, FARTHEST, HEIGHT, WIDTH, Lessons, lessons, to_height
 from lidarsynth.systems.cascade.losing import losing
 from lidarsynth.systems.cascade.patterns import every_column, pattern
@@ -177,7 +178,7 @@ def crop(
     sensor, rows = _window(image.sensor, rng, first)
     columns = (int(rng.integers(sensor.width)) + np.arange(WIDTH)) % sensor.width
     scale = math.exp(rng.uniform(-SCALE, SCALE)) if rng.random() < 0.7 else 1.0
-    blocked = hidden(image.sensor)[rows]
+    blocked = outlined(image.sensor, outline_of(image.sensor, image, image.mask))[rows]
     told_sensor = sensor if rng.random() < 0.7 else replace(sensor, tilt=(0.0, 0.0))
     told_sensor = replace(told_sensor, mount=told_sensor.mount * scale)
     unaware = rng.random() < 0.3

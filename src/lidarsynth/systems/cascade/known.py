@@ -16,7 +16,8 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.coarse_unet import COLUMNS, ROWS
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of
-from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.streets.hdl64e import dimness
+from lidarsynth.streets.kittis_car import Outline, outlined
 
 ANOTHER, STEP, LOWEST = 0.2, 0.05, 0.2  # share of a mount by which another is told; metres
 
@@ -53,9 +54,10 @@ def standing(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Sensor:
 
 
 @lru_cache(maxsize=2)  # every scan of a folder asks for the same
-def rays_told(sensor: Sensor) -> Rays:
-    """The rays of a sensor's padded image, with those that its carrier blocks and what is known of its beams."""
-    return rays_of(sensor, hidden(sensor), dimness=dimness(sensor))
+def rays_told(sensor: Sensor, car: Outline | None = None) -> Rays:
+    """The rays of a sensor's padded image, with those that its carrier blocks, of KITTI's car as a scan shows it, and
+    what is known of its beams."""
+    return rays_of(sensor, outlined(sensor, car), dimness=dimness(sensor))
 
 
 def unanswered(image: RangeImage, size: tuple[int, int]) -> Known:

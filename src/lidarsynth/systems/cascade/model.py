@@ -24,7 +24,8 @@ from lidarsynth.networks.coarse_unet import ROWS, grid_rays
 from lidarsynth.networks.device import each_usually
 from lidarsynth.networks.fill_unet import ANYHOW, SNAP, Filled, Known
 from lidarsynth.networks.rays import Rays, decode_range, padded
-from lidarsynth.streets.hdl64e import hidden, unevenness, written_out
+from lidarsynth.streets.hdl64e import unevenness, written_out
+from lidarsynth.streets.kittis_car import Outline, outline_of, outlined
 from lidarsynth.systems.any_sensor import AnySensorModel
 from lidarsynth.systems.cascade.beneath import certain
 from lidarsynth.systems.cascade.confidence import confidence, signals
@@ -82,7 +83,7 @@ class CascadeModel(AnySensorModel):
     own              whether scans are completed, and made denser, in the sensor that made them: until `into`
     labelled         whether its images have classes: after `with_labels`
     precision        of the matrix products of the fill, and of the coarse stage in generation: fp32 | bf16
-    response         how the sensor reports what it sees, as found out from the scan at hand
+    response, car    how the sensor reports what it sees, and where KITTI's car is, as found out from the scan at hand
     grain            how much of each kind of noise its samples take
     layouts          drawn for each generated scan, of which one is kept, by its odds as a street's: see `choosing`
     """
@@ -93,6 +94,7 @@ class CascadeModel(AnySensorModel):
     labelled: bool = False
     precision: str = "fp32"
     response: Response = AS_STREETS
+    car: Outline | None = None
     grain: Grain = GENERATED
     layouts: int = CHOICE
     description: ClassVar[Description] = DESCRIPTION
@@ -188,7 +190,7 @@ class CascadeModel(AnySensorModel):
         rng, lit = generators(how.seed, 1), bool(recorded.reflectance.any())
         own = replace(self._as_found(recorded, known), grain=SPECKLE)
         image, unit = as_streets(own.response.unfaded(recorded), known, own.response, self.tuned)
-        known = known | (self._blocked & ~image.mask)
+        known = known | (own._blocked & ~image.mask)
         metres, reflectance, told = image.range, own.response.even(image.reflectance), known
         if how.method == "repaint":
             grid_of(self.sensor)  # refuses those that are smaller
@@ -196,11 +198,11 @@ class CascadeModel(AnySensorModel):
             parts = Told(metres, reflectance, told), own.sensor, dim, rays_at, rng, how, on_step
             slopes = np.tan(np.radians(np.asarray(own.sensor.elevations)))
             metres, reflectance, told = with_planes(with_holes_drawn(self.network, *parts), known, slopes)
-            told &= known | ~silent_rows(known, image.mask, self._blocked)[:, None]  # those are no holes
+            told &= known | ~silent_rows(known, image.mask, own._blocked)[:, None]  # those are no holes
         noise = None if how.method == "conditional" else rng
         if noise is None:
             reflectance = calm(reflectance, image, known, SHARE if own.response == AS_STREETS else ELSEWHERE)
-            rays, fill = own.response.told(rays_told(own.sensor)), self.network.surest
+            rays, fill = own.response.told(rays_told(own.sensor, own.car)), self.network.surest
             with torch.autocast(self._device.type, torch.bfloat16, enabled=self.precision == "bf16"):
                 own = replace(own, response=tried(own.response, fill, image, known, reflectance, rays, self.tuned))
         filled = own._fill(metres[None], reflectance[None], told[None], lit, noise)[0]
@@ -283,9 +285,8 @@ class CascadeModel(AnySensorModel):
         if len(rows) < self.sensor.height:
             told = np.stack([a.range for a in some[0]]), shades_of(some[0], some[-1])
             some = [own._between(*told, rows, np.arange(own.sensor.width), noise, rng) for noise in noises]
-        drawn, calm = some[0], some[-1]
-        whole = [replace(a, sensor=self.sensor, confidence=None, new=None) for a in drawn]  # nothing was measured
-        return whole, shades_of(drawn, calm)
+        whole = [replace(a, sensor=self.sensor, confidence=None, new=None) for a in some[0]]  # nothing was measured
+        return whole, shades_of(some[0], some[-1])
 
     def sketched(self, images: Sequence[RangeImage], seed: int = 0) -> list[RangeImage]:
         """What generation would draw if the layouts of these images (H, W), in metres, of the model's sensor, had been
@@ -297,8 +298,7 @@ class CascadeModel(AnySensorModel):
         places, rng, sensor = grid_of(self.sensor), generators(checked_seed(seed), len(images)), self.sensor
         rays_of = partial(self._grid_rays, count=len(images))
         with one_thread():
-            parts = told_of(images, *places), places, rays_of, sensor, unevenness(sensor), rng
-            grid = detailed(self.network, *parts)
+            grid = detailed(self.network, told_of(images, *places), places, rays_of, sensor, unevenness(sensor), rng)
         return textured(*self._whole(*grid, rng), rng)
 
     def _named(self, images: list[RangeImage], least: float = 0.0, recorded: bool = False) -> list[RangeImage]:
@@ -322,9 +322,9 @@ class CascadeModel(AnySensorModel):
     def doubts(self, image: RangeImage, known: np.ndarray) -> Tensor:
         """(7, H, W) signals of `confidence.signals` of the most likely image, given the pixels `known` (H, W) bool."""
         image = image.keep(known)
-        own, told = self._as_found(image, known), known | (self._blocked & ~image.mask)
+        own = self._as_found(image, known)
         image, _ = as_streets(own.response.unfaded(image), known, own.response, self.tuned)
-        shades = own.response.even(image.reflectance)[None]
+        shades, told = own.response.even(image.reflectance)[None], known | (own._blocked & ~image.mask)
         pixels = known_of(image.range[None], shades, told[None], True, padded(self.sensor))
         return signals(*own._network(pixels, None, doubt=True))[0, :, : self.sensor.height, : self.sensor.width]
 
@@ -354,8 +354,7 @@ class CascadeModel(AnySensorModel):
         """
         weights = self.experiment.confidence if rng is None else None  # a sample is one of many
         reach = ANYHOW if rng is not None and surely is None else SNAP  # what has a range gets its class's roughness
-        classify = kinds is not None and bool(self.experiment.model.classes)
-        bend = BEND if kinds is None else BEND / 2
+        classify, bend = kinds is not None and bool(self.experiment.model.classes), BEND / (1 if kinds is None else 2)
         filled, rays = self._network(known, rng, weights is not None, classify, reach, bend)
         filled = certain(filled, known, self._blocked if recorded else None)
         logit = filled.logit if surely is None or rng is None else filled.logit + logistic(filled.logit, rng)
@@ -378,7 +377,7 @@ class CascadeModel(AnySensorModel):
         bend: float = BEND,
     ) -> tuple[Filled, Rays]:
         """What the fill makes of (B, 1, H', W') padded pixels, and the rays it was told."""
-        rays, device = self.response.told(rays_told(self.sensor)), self._device
+        rays, device = self.response.told(rays_told(self.sensor, self.car)), self._device
         noise, lost = drawn(self.grain, known, rays, rng)
         lost = None if lost is None else lost.to(device)
         known = Known(*(part.to(device) for part in known))
@@ -388,12 +387,13 @@ class CascadeModel(AnySensorModel):
             return fill(known, rays, noise.to(device), classify, doubt, reach, lost, bend), rays
 
     def _as_found(self, image: RangeImage, known: np.ndarray) -> CascadeModel:
-        """With what the known returns tell of the sensor: how high it stands, and how it reports reflectance."""
-        return replace(self, sensor=standing(self.sensor, image, known), response=response_of(image, known, self.tuned))
+        """With what the known returns tell: how the sensor stands and reports reflectance, and where KITTI's car is."""
+        seen, response = (self.sensor, image, known), response_of(image, known, self.tuned)
+        return replace(self, sensor=standing(*seen), car=outline_of(*seen), response=response)
 
     @property
     def _blocked(self) -> np.ndarray:
-        return hidden(self.sensor)
+        return outlined(self.sensor, self.car)
 
     @property
     def _device(self) -> torch.device:
