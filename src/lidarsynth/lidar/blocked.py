@@ -46,14 +46,13 @@ def blocked_runs(
         high = elevations[row] > LEVEL - raised
         if (1 - usual) ** many > CHANCE or (high and many < SCANS):
             continue
-        found = np.zeros(width, bool)
-        for first, last in _empty_runs(share == 0 if high or _chance(usual, many) > CHANCE else share < RARELY):
+        empty = share == 0
+        if not high and _chance(usual, many) < CHANCE:
+            empty = _with_edges(share < RARELY, share < USUAL * usual, RUN * width, max(round(EDGE * width), 1))
+        for first, last in _empty_runs(empty):
             beside = [share[(edge + steps) % width].mean() for edge, steps in ((first, -near), (last, near))]
-            size = (last - first) % width + 1
-            if size >= RUN * width and (not high or min(beside) >= USUAL * usual):
-                left, right = (0 if high else _more(share, edge, way, USUAL * usual) for edge, way in ((first, -1), (last, 1)))
-                found[np.arange(first - left, first + size + right) % width] = True
-        runs.extend((int(row), first, last) for first, last in _empty_runs(found))
+            if (last - first) % width + 1 >= RUN * width and (not high or min(beside) >= USUAL * usual):
+                runs.append((int(row), first, last))
     return tuple(sorted({*runs, *_unseen_sectors(view, len(elevations), runs)}))
 
 
@@ -63,12 +62,23 @@ def _chance(usual: float, many: float) -> float:
     return float(np.exp(-many * (RARELY * np.log(RARELY / usual) + (1 - RARELY) * np.log((1 - RARELY) / (1 - usual)))))
 
 
-def _more(share: np.ndarray, edge: int, way: int, usual: float) -> int:
-    """Columns beyond the edge of a run, to the left (-1) or right (1), before the first that returns as `usual`, (W,)
-    shares; 0 where that is too far away, as where nothing ends."""
-    reach = max(round(EDGE * len(share)), 1)
-    beyond = share[(edge + way * np.arange(1, reach + 2)) % len(share)] >= usual
-    return int(beyond.argmax())  # 0 of none, too
+def _with_edges(rare: np.ndarray, seldom: np.ndarray, least: float, reach: int) -> np.ndarray:
+    """(W,) bool: runs of at least so many `rare` columns, with gaps of up to two `seldom` ones, and the seldom ones
+    beside them where these are no more than `reach` on a side: a wider margin is none of an edge that stands still."""
+    width, found = len(rare), np.zeros(len(rare), bool)
+    beside = [np.roll(rare, step) for step in (1, 2, -1, -2)]
+    closed = rare | seldom & (beside[0] & (beside[2] | beside[3]) | beside[1] & beside[2])
+    runs = [run for run in _empty_runs(closed) if (run[1] - run[0]) % width + 1 >= least]
+    for first, last in runs:
+        left, right = (_until(~seldom, edge, way, reach) for edge, way in ((first, -1), (last, 1)))
+        found[np.arange(first - left, first + (last - first) % width + 1 + right) % width] = True
+    return found
+
+
+def _until(usual: np.ndarray, edge: int, way: int, reach: int) -> int:
+    """Columns beyond an edge, to the left (-1) or right (1), before the first that is `usual` (W,); 0 where that is
+    farther than `reach`."""
+    return int(usual[(edge + way * np.arange(1, reach + 2)) % len(usual)].argmax())  # 0 of none, too
 
 
 def _unseen_sectors(view: np.ndarray, rows: int, runs: list[tuple[int, int, int]]) -> Iterator[tuple[int, int, int]]:

@@ -6,14 +6,16 @@ Fitted to 111 real KITTI scans of 2011_09_26 and the object benchmark: where few
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage
+from lidarsynth.lidar.sector import runs_of
 from lidarsynth.lidar.sensor import SENSORS, Sensor
-from lidarsynth.streets.hdl64e import NAME, hidden, is_kittis
+from lidarsynth.streets.hdl64e import NAME, hidden, is_kittis, written_out
 
 WIDTH = 1024  # columns of what follows
 TOP = 42  # the highest row of them
@@ -65,12 +67,18 @@ class Outline(NamedTuple):
 @lru_cache(maxsize=64)
 def outlined(sensor: Sensor, outline: Outline | None) -> np.ndarray:
     """(H, W) bool: rays that end on the carrier, of KITTI's car as a scan shows it. Read only."""
-    if outline is None or outline.cast:
+    if outline is None or outline.cast or not is_kittis(sensor):
         return hidden(sensor)
     parts = _parts(sensor, outline.moved)
     rays = (parts > 0) & ~np.isin(parts, outline.gone) | sensor.blocked_rays()
     rays.flags.writeable = False
     return rays
+
+
+def seen_written_out(sensor: Sensor, outline: Outline | None) -> Sensor:
+    """`hdl64e.written_out` with the car as a scan shows it."""
+    blocked = runs_of(outlined(sensor, outline))
+    return written_out(sensor) if outline is None else replace(written_out(sensor), blocked=blocked)
 
 
 def outline_of(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Outline | None:

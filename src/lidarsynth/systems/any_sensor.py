@@ -13,7 +13,7 @@ from lidarsynth.lidar.projection import pixel_of_points
 from lidarsynth.lidar.recognition import lies_on, recognise
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
-from lidarsynth.systems.denser import TIMES, beam_step, denser, spread
+from lidarsynth.systems.denser import TIMES, denser, spread
 from lidarsynth.systems.filling import Filling, whole
 from lidarsynth.systems.notes import IN_PYTHON, Points, taken
 from lidarsynth.systems.scan_model import OnStep, ScanModel
@@ -89,7 +89,7 @@ class AnySensorModel(ScanModel, ABC):
         scan, times = taken(scan), TIMES if times is None else whole("times", times)
         own, how = self.suited_to(scan).sensor if sensor_in is None else get_sensor(sensor_in), self.resolved(how)
         sparse = check_seen(self.into(own).image_of(scan), len(scan))
-        beams, dense, every = denser(own, beam_step(sparse), times)
+        beams, dense, every = denser(own, sparse, times)
         sparse = sparse if beams == own else self.into(beams).image_of(scan)
         model = self.into(dense)
         image, known = spread(sparse, dense, every)

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import Sensor
-from lidarsynth.streets.hdl64e import written_out
+from lidarsynth.streets.kittis_car import outline_of, seen_written_out
 
 TIMES = 4  # as many beams
 ANSWERS = 0.02  # of the rays of a beam
@@ -35,15 +35,16 @@ def beam_step(sparse: RangeImage) -> tuple[int, int]:
     return step, int(beams[0]) % step if len(beams) else 0
 
 
-def denser(sensor: Sensor, held: tuple[int, int], times: int) -> tuple[Sensor, Sensor, int]:
-    """(of, dense, every): `times` as many beams as a scan of the sensor holds, `held` as `beam_step` says; beam i of
-    the sensor `of`, in which the scan's image is, is beam `every` * i of `dense`.
+def denser(sensor: Sensor, sparse: RangeImage, times: int) -> tuple[Sensor, Sensor, int]:
+    """(of, dense, every): `times` as many beams as a scan of the sensor holds, whose image is `sparse`; beam i of the
+    sensor `of`, in which the scan's image is to be, is beam `every` * i of `dense`.
 
     Raises ValueError for `times` below 2.
     """
-    step, first = held
+    step, first = beam_step(sparse)
+    told = seen_written_out(sensor, outline_of(sensor, sparse, sparse.mask))
     if times > 1 and times % step == 0:
         times //= step
-        return sensor, written_out(sensor).denser(times) if times > 1 else sensor, times
-    some = written_out(sensor).rows(range(first, sensor.height, step)) if step > 1 else sensor
-    return some, written_out(some).denser(times), times
+        return sensor, told.denser(times) if times > 1 else sensor, times
+    some = told.rows(range(first, sensor.height, step)) if step > 1 else sensor
+    return some, (some if step > 1 else told).denser(times), times

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from lidarsynth.networks.fill_unet import NOISES, Known
 from lidarsynth.networks.rays import COLUMNS, Rays, decode_range, padded, rays_of
 from lidarsynth.streets.hdl64e import dimness, hidden
+from lidarsynth.streets.kittis_car import Outline, outlined
 from lidarsynth.systems.cascade.beneath import certain
 from lidarsynth.systems.cascade.confidence import confidence
 from lidarsynth.systems.cascade.floating import onto_surfaces
@@ -36,7 +37,7 @@ class FillGraph(nn.Module):
         super().__init__()
         self.model, self.open_columns, sensor = model, open_columns, model.sensor
         self.fill = model.network.surest
-        blocked = hidden(sensor)
+        blocked = outlined(sensor, Outline())  # KITTI's car as scans that are not moved show it
         rays = rays_of(sensor, blocked, dimness=dimness(sensor))
         if open_columns:
             rays = Rays(*(part[..., :1] for part in rays))
