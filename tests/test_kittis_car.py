@@ -7,8 +7,9 @@ import pytest
 
 import lidarsynth as ls
 from lidarsynth.lidar.blocked import blocked_runs
-from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.projection import pixel_of_points, project
 from lidarsynth.lidar.scan import RangeImage, Scan
+from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.streets.hdl64e import hidden
 from lidarsynth.streets.kittis_car import Outline, outline_of, outlined
@@ -101,6 +102,16 @@ def test_denser_beams_know_the_car_as_the_scan_shows_it():
     dense = ls.load("default").upsample(image.to_scan(), sensor_in="hdl-64e-kitti", times=2)
     own = dense.sensor.blocked_rays()[::2]
     np.testing.assert_array_equal(own, outlined(KITTI, outline_of(KITTI, image, image.mask)))
+
+
+@pytest.mark.parametrize("place", ["-4.2/1.9", "-3.6/1.4", "-4.2/-1.9"])
+def test_what_is_inserted_has_no_return_where_the_scan_shows_the_car(place: str):
+    scan = ground(~PARTS).to_scan()
+    road = replace(scan, label=np.full(len(scan), CLASS_NUMBER["road"]))
+    found = ls.load("default").insert(road, f"person@{place}/0", seed=1).scan
+    new = found[found.extra["new"] == 1]
+    row, column = pixel_of_points(new, KITTI, "auto")
+    assert len(new) > 600 and not PARTS[row, column].any()
 
 
 def carrier(rng: np.random.Generator, scans: int) -> np.ndarray:

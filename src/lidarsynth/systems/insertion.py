@@ -21,6 +21,7 @@ from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.streets.actors import KINDS
 from lidarsynth.streets.hdl64e import Lasers, hidden, lasers
+from lidarsynth.streets.kittis_car import outline_of, outlined
 from lidarsynth.streets.lone import alone
 from lidarsynth.streets.objects import library
 from lidarsynth.streets.raycast import FewTriangles
@@ -133,7 +134,8 @@ def placed(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Ge
         own = named.label if own is None else np.where(own > 0, own, named.label)
     image = check_seen(project(replace(scan, label=own.astype(np.int64)), sensor), len(scan))
     row, _ = pixel_of_points(scan, model.sensor, "auto")
-    rays, lost = _rays(scan, model.sensor, row, lost_rays(scan, model.sensor, row))
+    blocked = outlined(model.sensor, outline_of(sensor, image, image.mask))
+    rays, lost = _rays(scan, model.sensor, row, lost_rays(scan, model.sensor, row), blocked)
     around = Surroundings(levelled(sensor, scan.xyz), own, axis_of(canvas_of(image)))
     put: list[Thing] = []
     for thing in things:
@@ -145,10 +147,10 @@ def placed(model: Names, scan: Scan, things: Sequence[Wanted], rng: np.random.Ge
     return Placed(rays, lost, put, model.sensor, response_of(image, image.mask))
 
 
-def _rays(scan: Scan, sensor: Sensor, row: np.ndarray, lost: LostRays) -> tuple[Rays, LostRays]:
-    """The rays of a scan, row (N,) of each point, and the lost ones that nothing on the carrier blocks."""
+def _rays(scan: Scan, sensor: Sensor, row: np.ndarray, lost: LostRays, blocked: np.ndarray) -> tuple[Rays, LostRays]:
+    """The rays of a scan, row (N,) of each point, and the lost ones that nothing on the carrier blocks, (H, W) bool."""
     column = ((np.pi - lost.azimuth) / (2 * np.pi) * sensor.width).astype(int) % sensor.width
-    free = ~hidden(sensor)[lost.row, column]
+    free = ~blocked[lost.row, column]
     lost = LostRays(*(part[free] for part in lost))
     row = np.concatenate([row, lost.row])
     offset = np.asarray(sensor.offsets or [0.0] * sensor.height, np.float32)
