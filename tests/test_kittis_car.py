@@ -27,10 +27,11 @@ def ground(open_to: np.ndarray) -> RangeImage:
     return RangeImage(metres, 0.3 * (metres > 0), metres > 0, KITTI)
 
 
-def moved(image: RangeImage, speed: float) -> RangeImage:
-    """The points where they were as the car, which went on while the sensor turned to the right, looked ahead."""
+def moved(image: RangeImage, speed: float, ahead: float = 0.0) -> RangeImage:
+    """The points where they were as the sensor of the car, which went on while it turned to the right, looked at an
+    azimuth, in radians."""
     xyz = KITTI.points(image.range)[image.mask].astype(np.float64)
-    xyz[:, 0] += speed * TURN * -np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi)
+    xyz[:, 0] += speed * TURN * (ahead - np.arctan2(xyz[:, 1], xyz[:, 0])) / (2 * np.pi)
     ring = np.nonzero(image.mask)[0]
     return project(Scan(xyz.astype(np.float32), np.full(len(xyz), 0.3, np.float32), ring=ring), KITTI, "unfolding")
 
@@ -48,6 +49,11 @@ def test_a_scan_tells_whether_its_points_were_moved(part: str):
         found = outline_of(KITTI, image, known(image, part))
         assert found is not None and not found.gone and not found.cast
         assert found.moved == pytest.approx(speed * TURN / (2 * np.pi), abs=0.03)
+    for ahead in (np.pi, -np.pi):
+        image = moved(still, SPEED, ahead)
+        found = outline_of(KITTI, image, known(image, part))
+        assert found is not None and found.ahead == ahead
+        assert found.moved == pytest.approx(SPEED * TURN / (2 * np.pi), abs=0.03)
     image = moved(still, SPEED)
     shown = outlined(KITTI, outline_of(KITTI, image, known(image, part)))
     assert (shown & image.mask).sum() < 0.3 * (PARTS & image.mask).sum(), "nearly all of it is where nothing returned"

@@ -19,7 +19,8 @@ from lidarsynth.streets.hdl64e import NAME, hidden, is_kittis, written_out
 
 WIDTH = 1024  # columns of what follows
 TOP = 42  # the highest row of them
-MOVED = tuple(round(0.02 * step, 2) for step in range(23))  # metres per radian: up to 27 m/s
+# Metres per radian, up to 27 m/s, and radians to the left, as in `Outline`.
+MOTIONS = ((0.0, 0.0), *((round(0.02 * step, 2), ahead) for ahead in (0.0, np.pi, -np.pi) for step in range(1, 23)))
 STEEP = 5.0  # degrees below the horizon at least, by which the ground that a beam meets is told
 SURE = (1.1, 8)  # returns where none can be, of what is usual: more than so many times those of another, and some more
 BESIDE = 8  # columns
@@ -53,13 +54,15 @@ _PARTS = (
 class Outline(NamedTuple):
     """How a scan shows the car.
 
-    moved  metres per radian of azimuth by which its points were moved on, so that all are where they were as the
-           sensor looked ahead: the speed, of a turn of 0.1 s by 62.8 radians a second; 0 as recorded
+    moved  metres per radian of azimuth by which its points were moved on, so that all are where they were at one
+           moment: the speed, of a turn of 0.1 s by 62.8 radians a second; 0 as recorded
+    ahead  radians to the left at which the sensor looked at that moment: 0, or pi and -pi as a turn began and ended
     gone   numbers of the parts that are not there
     cast   whether it is as streets have it
     """
 
     moved: float = 0.0
+    ahead: float = 0.0
     gone: tuple[int, ...] = ()
     cast: bool = False
 
@@ -69,7 +72,7 @@ def outlined(sensor: Sensor, outline: Outline | None) -> np.ndarray:
     """(H, W) bool: rays that end on the carrier, of KITTI's car as a scan shows it. Read only."""
     if outline is None or outline.cast or not is_kittis(sensor):
         return hidden(sensor)
-    parts = _parts(sensor, outline.moved)
+    parts = _parts(sensor, outline.moved, outline.ahead)
     rays = (parts > 0) & ~np.isin(parts, outline.gone) | sensor.blocked_rays()
     rays.flags.writeable = False
     return rays
@@ -86,18 +89,18 @@ def outline_of(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Outline 
     if not is_kittis(sensor):
         return None
     returned = np.asarray(known & image.mask)[TOP:]
-    found = [int(returned[_parts(sensor, moved)[TOP:] > 0].sum()) for moved in MOVED]
+    found = [int(returned[_parts(sensor, *motion)[TOP:] > 0].sum()) for motion in MOTIONS]
     best, cast = int(np.argmin(found)), int(returned[hidden(sensor)[TOP:]].sum())
     best = best if _more(found[0], found[best]) else 0
     if _more(found[best], cast):
         return Outline(cast=True)
-    parts = _parts(sensor, MOVED[best])[TOP:]
+    parts = _parts(sensor, *MOTIONS[best])[TOP:]
     count, beside = len(_PARTS) + 1, _beside(parts)
     size, there = np.bincount(parts.ravel(), minlength=count), np.bincount(parts[returned], minlength=count)
     free, near = np.bincount(beside.ravel(), minlength=count), np.bincount(beside[returned], minlength=count)
     usual = size * near / np.maximum(free, 1)
     gone = np.flatnonzero((there > GONE * usual) & (usual >= SURE[1]))
-    return Outline(MOVED[best], tuple(gone[gone > 0].tolist()))
+    return Outline(*MOTIONS[best], tuple(gone[gone > 0].tolist()))
 
 
 def _more(found: int, other: int) -> bool:
@@ -114,13 +117,13 @@ def _recorded(height: int, width: int) -> np.ndarray:
     return parts
 
 
-@lru_cache(maxsize=64)
-def _parts(sensor: Sensor, moved: float) -> np.ndarray:
-    """The same of points that are moved by as many metres per radian."""
+@lru_cache(maxsize=256)
+def _parts(sensor: Sensor, moved: float, ahead: float) -> np.ndarray:
+    """The same of points that are moved by as many metres per radian, to where the sensor looked `ahead`."""
     columns, width = np.arange(sensor.width), sensor.width
     azimuth = np.pi - (columns + 0.5) * (2 * np.pi / width)
     away = SENSORS[NAME].mount / np.tan(np.radians(np.maximum(-np.asarray(sensor.elevations), STEEP)))
-    left = moved * azimuth * np.sin(azimuth) / away[:, None] * (width / (2 * np.pi))
+    left = moved * (azimuth - ahead) * np.sin(azimuth) / away[:, None] * (width / (2 * np.pi))
     return np.take_along_axis(_recorded(sensor.height, width), (columns + np.rint(left).astype(int)) % width, 1)
 
 
