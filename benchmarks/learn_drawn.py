@@ -153,7 +153,8 @@ def main() -> None:
     start = model.network.classes if model.network.drawn is None else model.network.drawn
     before = right(start, scans[:held])
     model.network.drawn = learned(start, scans[held:], args.steps, lambda line: print(line, flush=True))
-    record = with_fields(model.experiment, {"model.drawn_channels": model.experiment.model.class_channels})
+    channels = model.experiment.model.class_channels  # and no results, which are of other weights
+    record = with_fields(model.experiment, {"model.drawn_channels": channels, "card.results": ()})
     replace(model, experiment=record).save(args.out)
     print(f"{args.out}: {args.scans} scans, {args.steps} steps: {before} -> {right(model.network.drawn, scans[:held])}")
 

@@ -129,7 +129,7 @@ def main() -> None:
     start = network.indoors if own else network.inside
     assert start is not None
     setattr(network, args.part, learned(start, args.part, of, args.steps, lambda line: print(line, flush=True)))
-    record = model.experiment
+    record = with_fields(model.experiment, {"card.results": ()})  # those of other weights
     if args.part == "indoors":
         record = with_fields(record, {"model.indoors_channels": record.model.inside_channels})
     replace(model, experiment=record).save(args.out)

@@ -133,6 +133,7 @@ def main() -> None:
     judge.slopes, explained = owed(model.network, judge, args.sensors, args.seed + 1)
     model.network.judge = judge
     fields = {"model.judge_channels": args.width, "model.judge_openness": judge.slopes}
+    fields |= {"card.results": ()}  # those of other weights
     replace(model, experiment=with_fields(model.experiment, fields)).save(args.out)
     print(f"{args.out}: {args.grids} grids, {args.steps} steps: area {of_all:.3f}, best of {CHOICE} {of_best:.3f}; "
           f"openness explains {100 * explained:.0f} % of the odds")  # fmt: skip

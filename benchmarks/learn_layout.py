@@ -168,7 +168,8 @@ def main() -> None:
     before = judged(network, args.part, images[:held])
     after = learned(network, args.part, images[held:], args.steps, lambda line: print(line, flush=True))
     setattr(network, args.part, after.requires_grad_(False))
-    model.save(args.out)
+    card = replace(model.experiment.card, results=())  # those of other weights
+    replace(model, experiment=replace(model.experiment, card=card)).save(args.out)
     now = judged(network, args.part, images[:held])
     print(f"{args.out}: {args.scans} scans, {args.steps} steps: {before} -> {now}")
 

@@ -589,6 +589,25 @@ def test_scans_are_completed_again_where_the_file_of_their_sensor_says_something
     assert found[0]["voxel IoU"] != found[1]["voxel IoU"]
 
 
+def test_scans_of_another_sensor_than_the_images_they_are_drawn_into_are_told(tmp_path: Path):
+    """Of a file that names no sensor, images are the protocol's, and of the scans' beams little is in them."""
+    (tmp_path / "scans").mkdir()
+    sensor = Sensor("my-lidar", tuple(np.linspace(15.0, -25.0, 23)), width=360)
+    write(tmp_path / "scans" / "1.ply", street(1, sensor))
+    (tmp_path / "my.toml").write_text(sensor_toml(sensor))
+    found = []
+    for name, line in (("none", ""), ("named", f'sensor = "{tmp_path}/my.toml"\n')):
+        config = written(tmp_path / f"{name}.toml", f'data = "{tmp_path}/scans"\n{line}{METHODS}')
+        text = benchmark("upsampling", config, tmp_path / name, no_model)
+        record = json.loads((tmp_path / name / "results.json").read_text())
+        found.append((re.findall(r"^- note: (.*)$", text, re.M), record["data"]["notes"]))
+    (told, kept), named = found
+    assert (
+        "the scans that hdl-64e sees" in told[0] and "`sensor` in the file names theirs" in told[0] and len(kept) == 1
+    )
+    assert named == ([], [])
+
+
 def test_completions_are_judged_again_by_other_rules(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')
     for step in (0, 0, 1):

@@ -99,6 +99,14 @@ def test_a_copy_of_the_reference_is_told(protocol: str, tmp_path: Path):
     assert not any(told in note for note in ls.evaluate(other, real, protocol).warnings)
 
 
+@pytest.mark.parametrize("protocol", ["iln-2022", "street-upsampling-1", "lidm-reconstruction-2024"])
+def test_pairs_of_the_same_images_in_another_order_are_told(protocol: str):
+    real = [street(seed) for seed in range(3)]
+    assert told(ls.evaluate(real, real, protocol), SAME) and not told(ls.evaluate(real, real, protocol), "order")
+    report = ls.evaluate([real[1], real[0], real[2]], real, protocol)
+    assert told(report, SAME) == [f"{SAME} in another order: 2 of 3 are compared with another image"]
+
+
 def test_files_beside_scans_are_not_judged(tmp_path: Path):
     folder = saved(tmp_path / "sequence", range(2), "ply")
     (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")

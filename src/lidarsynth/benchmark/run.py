@@ -16,7 +16,7 @@ from lidarsynth.benchmark.record import check_same, record_of
 from lidarsynth.benchmark.rows import Row
 from lidarsynth.benchmark.setup import Load, Setup, open_setup
 from lidarsynth.benchmark.sources import corrupted, located
-from lidarsynth.benchmark.tables import page
+from lidarsynth.benchmark.tables import in_the_file, page
 from lidarsynth.benchmark.upsampling import Problem, upsampling_row
 from lidarsynth.evaluation.accumulation import OnImages
 from lidarsynth.evaluation.image_sets import emptied, image_set, sensor_of
@@ -116,8 +116,10 @@ def upsampling(setup: Setup, config: Upsampling) -> Outcome:
         about["published" if len(names) == 1 else f"published, {name}"] = (
             told or f"in parentheses, {PUBLISHED[name].source}" if name in PUBLISHED else "none"
         )
+    if told := data.notes(config.sensor):
+        about["note"] = in_the_file("; ".join(told))
     record = {"source": data.images.source, "names": list(data.names), "sensor": sensor.name, "scans": len(data),
-              "sha256": sha256("".join(problem.stamps.values()).encode()).hexdigest()}  # fmt: skip
+              "notes": list(told), "sha256": sha256("".join(problem.stamps.values()).encode()).hexdigest()}  # fmt: skip
     return Outcome(found, about, record, *_filled_pictures(setup, problem, found))
 
 

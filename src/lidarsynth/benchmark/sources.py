@@ -14,6 +14,7 @@ from lidarsynth.benchmark.config import Upsampling, protocols_of
 from lidarsynth.data.sources import SYNTHETIC, cache_synthetic
 from lidarsynth.evaluation.accumulation import OnImages
 from lidarsynth.evaluation.image_sets import ImageSet, image_set, sensor_of
+from lidarsynth.evaluation.notes import other_frames, out_of_images, tensors_taken, unlike_metres, unlike_sensors
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.lidar.corruption import corrupt
 from lidarsynth.lidar.projection import PROJECTIONS
@@ -82,6 +83,15 @@ class Corrupted:
             if on_image:
                 on_image(i + 1)
         return found
+
+    def notes(self, named: str | None) -> tuple[str, ...]:
+        """What is unlike in the scans and the images that they are taken as, as `evaluate` says it of a reference.
+
+        named  the sensor of points and tensors that the file names, if it does
+        """
+        sides = {"the scans": self.images}
+        told = unlike_sensors(sides, self.sensor) + out_of_images(sides, self.sensor)
+        return told + tensors_taken(sides, self.sensor, named) + unlike_metres(sides) + other_frames(sides)
 
     def shown(self, number: int | None) -> int:
         """The scan of the figure: the given one, or the first with labels of the first hundred, or the first."""

@@ -156,8 +156,13 @@ def notes(rows: Sequence[Row], columns: Sequence[Column], protocol: str) -> list
     for warning in dict.fromkeys(text for row in judged for text in row.reports[protocol].get("warnings", ())):
         warned = [row.name for row in judged if warning in row.reports[protocol].get("warnings", ())]
         whose = "" if len(warned) == len(judged) else f"{', '.join(warned)}: "
-        lines.append(f"- {_escaped(whose + warning)}")
+        lines.append(f"- {_escaped(whose + in_the_file(warning))}")
     return lines
+
+
+def in_the_file(note: str) -> str:
+    """A note of `evaluate`, whose option is a key of a benchmark's file."""
+    return note.replace("--sensor", "`sensor` in the file")
 
 
 def _escaped(text: str) -> str:

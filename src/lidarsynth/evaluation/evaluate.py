@@ -277,7 +277,7 @@ def _judge_pairs(run: _Run, samples: Samples, reference: Samples, seed: int) -> 
     report = pairs.report(loaded.missing, loaded.weights)
     sources = {"samples": judged.source, "reference": truth.source}
     warnings = report.warnings + run.notes(judged, truth, sensor) + unlike_pairs(judged.names, truth.names)
-    warnings += one_set(judged, truth, report.hashes, run.protocol)
+    warnings += one_set(judged, truth, report.hashes, run.protocol, pairs.unlike)
     return replace(report, sources=sources, warnings=warnings, images=_size_of(sensor))
 
 

@@ -228,15 +228,24 @@ def other_frames(sides: Sides) -> tuple[str, ...]:
 
 
 def one_set(
-    judged: ImageSet | None, truth: ImageSet | None, hashes: Mapping[str, str], protocol: EvaluationProtocol
+    judged: ImageSet | None,
+    truth: ImageSet | None,
+    hashes: Mapping[str, str],
+    protocol: EvaluationProtocol,
+    unlike: int = 0,
 ) -> tuple[str, ...]:
-    """A note where both sides are the same images: of one place, or copies, by the hashes of what was read."""
+    """A note where both sides are the same images: of one place, or copies, by the hashes of what was read.
+
+    unlike  how many are compared with another image, by a protocol of pairs
+    """
     one, other = ((images.stamp, images.names, images.source) if images else ("", (), "") for images in (judged, truth))
     same, p = "samples and reference are the same images", protocol
     apart = p.reproject or ("samples" in p.gated) != ("real" in p.gated) or (p.clouds and p.clouds.redrawn)
     copies = one[:2] == other[:2] if apart else one == other  # a copy that was damaged since has the same index, too
     if not (copies and one[0]) and hashes["samples"] != hashes["reference"]:
         return ()
+    if unlike and hashes["samples"] == hashes["reference"]:
+        return (f"{same} in another order: {unlike} of {len(judged or ())} are compared with another image",)
     if apart:
         return (
             f"{same}, and {p.title} takes the reference otherwise than samples: distances are what that costs, or 0",

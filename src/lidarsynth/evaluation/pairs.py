@@ -40,7 +40,7 @@ class Pairs:
     """Errors of images that arrive with their truth. `classes` is a RangeNet in evaluation mode, or None.
 
     `seen`, where given, keeps the classes of each truth by its hash, for others that are compared with the same ones.
-    `others` are the sensors, in words, of pairs of unlike beams.
+    `others` are the sensors, in words, of pairs of unlike beams; `unlike` is how many pairs are not one image twice.
     Of bounded size but for a few numbers per pair; `merge` adds what another process gathered, `state` and `restore`
     are for files.
     """
@@ -57,6 +57,7 @@ class Pairs:
         self.voxels: list[list[float]] | None = [] if any(row.measure in VOXELS for row in protocol.rows) else None
         self.confusion = np.zeros((len(CLASSES), len(CLASSES)), np.int64)
         self.others: list[str] = []
+        self.unlike = 0
         self._lit = [0, 0]  # images with any reflectance, of results and of truths
         self._digests = [0, 0]
 
@@ -72,7 +73,7 @@ class Pairs:
             self._lit = [n + bool(i.reflectance.any()) for n, i in zip(self._lit, (result, truth), strict=True)]
             if not same_beams(result.sensor, truth.sensor):
                 self.others.append(f"{result.sensor.name} against {truth.sensor.name}")
-            self._add_digests([hash_of(result), hash_of(truth)])
+            self._add_pair(hash_of(result), hash_of(truth))
         if self.classes and results:
             self.confusion += confusion_matrix(self._labels_of_truths(truths), self._labels(results))
 
@@ -81,7 +82,7 @@ class Pairs:
         assert self.chamfer is not None
         for result, truth in zip(results, truths, strict=True):
             self.chamfer.append(_chamfer(result.xyz, truth.xyz))
-            self._add_digests([hash_of_points(result), hash_of_points(truth)])
+            self._add_pair(hash_of_points(result), hash_of_points(truth))
 
     def _points(self, result: RangeImage, truth: RangeImage) -> list[np.ndarray]:
         clouds = self.protocol.clouds
@@ -98,6 +99,10 @@ class Pairs:
         """How many pairs so far."""
         return len(self.errors if self.chamfer is None else self.chamfer)
 
+    def _add_pair(self, result: int, truth: int) -> None:
+        self.unlike += result != truth
+        self._add_digests([result, truth])
+
     def _add_digests(self, digests: Sequence[int]) -> None:
         self._digests = [(own + its) % (1 << 128) for own, its in zip(self._digests, digests, strict=True)]
 
@@ -112,7 +117,7 @@ class Pairs:
         errors = [list(asdict(e).values()) for e in self.errors]
         digests = [f"{digest:032x}" for digest in self._digests]
         state = {"errors": errors, "confusion": self.confusion.tolist(), "lit": self._lit, "digests": digests}
-        state["others"] = self.others
+        state |= {"others": self.others, "unlike": self.unlike}
         more = {"chamfer": self.chamfer, "voxels": self.voxels}
         return state | {name: values for name, values in more.items() if values is not None}
 
@@ -122,6 +127,7 @@ class Pairs:
         self.confusion += np.array(state["confusion"], np.int64)
         self._lit = [own + its for own, its in zip(self._lit, state["lit"], strict=True)]
         self.others += state["others"]
+        self.unlike += state["unlike"]
         if self.chamfer is not None:
             self.chamfer += state["chamfer"]
         if self.voxels is not None:

@@ -98,7 +98,8 @@ def _lack(row: Row, samples: Statistics, real: Statistics, missing: Mapping[str,
         if kind not in statistics.moments:
             return f"the statistics of the {name} have no {kind} features; {missing.get(kind, 'make them again')}"
         if kind == "rangenet" and not statistics.lit:
-            return f"the {name} have no return with a reflectance, which {kind} needs"
+            verb = "has" if name == "reference" else "have"
+            return f"the {name} {verb} no return with a reflectance, which {kind} needs"
     if samples.weights.get(kind) != real.weights.get(kind):
         return f"samples and reference were made with different weights of {kind}"
     return ""
