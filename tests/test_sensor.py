@@ -226,6 +226,9 @@ def test_a_file_is_read_again_after_it_changed(tmp_path):
         ("beams = 4\ntop = 1\nbottom = '-9'", r"mine.toml: expected numbers in the sensor's fields, found \[1, '-9'\]"),
         ("beams = true\ntop = 1\nbottom = 0", r"expected beams of 1 to 1024, found True"),
         ("elevations = [1]\ntilt = '12'", r"mine.toml: expected numbers in the sensor's fields, found '12'"),
+        ("elevations = [1]\ntilt = 5", r"expected .* found 5 as tilt, where a list belongs: \[pitch, roll\]"),
+        ("elevations = [1]\noffsets = 2.5", r"mine.toml: expected .* found 2.5 as offsets, where a list belongs$"),
+        ("beams = 4\ntop = 1\nbottom = [2]", r"mine.toml: expected .* found \[1, \[2\]\] as top and bottom$"),
         ("elevations = [1]\nmount = true", r"expected numbers in the sensor's fields, found True as mount"),
         ("elevations = [1]\nwidth = true", r"mine.toml: expected a whole number of columns as width, found True"),
         ("elevations = [1]\nedges = 'false'", r"mine.toml: expected true or false as edges, found 'false'"),
@@ -276,3 +279,10 @@ def test_a_mount_that_is_no_number_gets_one_line():
         with pytest.raises(ValueError, match=r"sensor mine: expected numbers, .* as mount") as refused:
             Sensor("mine", (1.0, 0.0), mount=wrong)  # type: ignore[arg-type]
         assert "\n" not in str(refused.value)
+
+
+def test_one_number_for_a_list_is_told_from_python_too():
+    with pytest.raises(ValueError, match=r"sensor mine: expected numbers.* 4.0 as offsets, where a list belongs$"):
+        Sensor("mine", (1.0, 0.0), offsets=4.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"sensor mine: expected numbers.* 4.0 as tilt, .* belongs: \[pitch, roll\]$"):
+        Sensor("mine", (1.0, 0.0), tilt=4.0)  # type: ignore[arg-type]

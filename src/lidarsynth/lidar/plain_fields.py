@@ -32,20 +32,27 @@ def evenly_spaced(beams: Any, top: Any, bottom: Any, source: str) -> list[float]
     """Elevations of `beams` from top to bottom, in degrees. Raises ValueError, which begins with the source."""
     if not (_is(int, beams) and 1 <= beams <= 1024):
         raise ValueError(f"{source}: expected beams of 1 to 1024, found {beams!r}")
-    first, last = numbers([top, bottom], source)
+    first, last = numbers([top, bottom], source, "top and bottom")
     if not np.isfinite([first, last]).all():
         raise ValueError(f"{source}: expected finite top and bottom, found {first} and {last}")
     return np.linspace(first, last, beams).tolist()
 
 
-def numbers(values: Any, source: str) -> list[float]:
-    """A list of numbers. Raises ValueError, which begins with the source, for what is none: digits in a text, too."""
+def numbers(values: Any, source: str, field: str) -> list[float]:
+    """A list of numbers. Raises ValueError, which begins with the source and names the field, for what is none: digits
+    in a text, too."""
     try:
         if isinstance(values, str) or any(isinstance(value, (str, *TRUTH)) for value in values):
             raise TypeError
         return [float(value) for value in values]
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{source}: expected numbers in the sensor's fields, found {values!r:.60}") from None
+        found = f"{values!r:.60} as {field}" + (list_of(field) if _is(Real, values) else "")
+        raise ValueError(f"{source}: expected numbers in the sensor's fields, found {found}") from None
+
+
+def list_of(field: str) -> str:
+    """What is said of one number in the place of a list."""
+    return ", where a list belongs" + (": [pitch, roll]" if field == "tilt" else "")
 
 
 def _is(kind: type, value: Any) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsynth.lidar.angles import unit_vectors
-from lidarsynth.lidar.plain_fields import METRES, check_plain, evenly_spaced, numbers
+from lidarsynth.lidar.plain_fields import METRES, check_plain, evenly_spaced, list_of, numbers
 from lidarsynth.lidar.sector import listed_runs, runs_outside
 from lidarsynth.lidar.small_file import read_json, read_toml
 
@@ -96,6 +96,8 @@ class Sensor:
         """Tuples of Python's own numbers, which compare, hash and are written as JSON, of lists and arrays too."""
         try:
             for name in ("elevations", "offsets", "tilt", "dimness"):
+                if isinstance(value := getattr(self, name), Real):
+                    raise TypeError(f"{value!r:.60} as {name}{list_of(name)}")
                 object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
             for name in METRES:
                 if isinstance(value := getattr(self, name), np.generic):
@@ -251,11 +253,11 @@ def from_dict(values: dict, source: str = "sensor", name: str | None = None) -> 
     if "elevations" not in values:
         raise ValueError(f"{source}: expected elevations, or beams with top and bottom, found {sorted(values)}")
     check_plain(values, source)
-    lists = {key: numbers(values.get(key, ()), source) for key in ("elevations", "offsets", "dimness")}
+    lists = {key: numbers(values.get(key, ()), source, key) for key in ("elevations", "offsets", "dimness")}
     order = sorted(range(len(lists["elevations"])), key=lambda i: -lists["elevations"][i])
     for key, told in lists.items():  # each number goes with its beam
         values[key] = tuple(told[i] for i in order) if len(told) == len(order) else tuple(told)
-    values["tilt"] = tuple(numbers(values.get("tilt", (0.0, 0.0)), source))
+    values["tilt"] = tuple(numbers(values.get("tilt", (0.0, 0.0)), source, "tilt"))
     values["blocked"] = listed_runs(values.get("blocked", ()), source)
     if view is not None and values.get("width", Sensor.width) > 0:  # else it is refused as no width
         values["blocked"] += runs_outside(view, len(order), values.get("width", Sensor.width), source)
