@@ -127,7 +127,7 @@ class Pairs:
         self.confusion += np.array(state["confusion"], np.int64)
         self._lit = [own + its for own, its in zip(self._lit, state["lit"], strict=True)]
         self.others += state["others"]
-        self.unlike += state["unlike"]
+        self.unlike += state.get("unlike", 0)  # those of before did not count
         if self.chamfer is not None:
             self.chamfer += state["chamfer"]
         if self.voxels is not None:
