@@ -81,7 +81,7 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
     Beams are fitted over all scans, z = tan(e) rho + h, with h = 0 unless heights halve the residual; a row's height is
     the neighbours' where its own points cannot tell it. Rings of one beam are one row. Scans half of whose rings are
     OTHER degrees or more off are another sensor's, and left out. Columns come from the azimuths' steps, mount and tilt
-    from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what never returned in five
+    from the ground (medians over the scans, if half of them are ALIKE), blocked rays from what hardly returned in five
     scans or more, of several places. Raises ValueError without rings, with too few points, or where most beams are
     wider than SMEARED, or where most of what elevations crowd into are none.
     """
