@@ -537,6 +537,16 @@ def test_a_run_that_is_refused_leaves_nothing(cache: Path, tmp_path: Path):
         assert not (tmp_path / "out").exists()
 
 
+def test_a_run_that_goes_on_with_other_validation_images_says_so(cache: Path, tmp_path: Path):
+    other, out, again = tmp_path / "other", tmp_path / "out", tmp_path / "elsewhere"
+    list(write_cache(other, lambda i: noise_image(i + 90, SENSOR), 4, SENSOR, {"name": "noise"}))
+    shutil.copytree(other, again)
+    list(run(tiny(1), cache, out, validation=other, options=QUIET))
+    for validation, said in ((again, False), (None, False), (cache, True), ("synthetic", True)):
+        first = next(iter(run(tiny(2), cache, out, validation=validation, options=QUIET)))
+        assert ("judged.csv hold numbers of both" in first.note) is said, validation
+
+
 @pytest.mark.parametrize(
     ("word", "batch", "accumulate", "said"),
     [

@@ -35,7 +35,7 @@ def caution(
     if 0 < len(scan) < SPARSE:
         said.append(f"expected a turn of a sensor, found {plural(len(scan), 'point')}: most of what is put between is "
                     "a guess; of default's a least confidence of 0.5 leaves most out")  # fmt: skip
-    elif around and len(scan) and (wide := widest_gap(scan.xyz)) > WIDE + max(map(_never_seen, (sensor, image))):
+    elif around and len(scan) and (wide := widest_gap(scan.xyz)) > WIDE + _never_seen(image or sensor):
         said.append(f"expected points all around, found hardly any in {wide} degrees of the turn: what is put there is "
                     "a guess; of default's a least confidence of 0.8 leaves most out, repaint draws one")  # fmt: skip
     if not alone:

@@ -141,7 +141,7 @@ def run(
     options = options or Options()
     out, accelerator = Path(out), accelerator_of(options)
     images = open_images(data, experiment)
-    begun = start_of(images, data, weights)
+    begun = start_of(images, data, weights, validation)
     with only_writer(out, "training") if accelerator.is_main_process else nullcontext():
         yield from _run(experiment, images, data, out, begun, validation, options, resume, accelerator)
 

@@ -26,22 +26,28 @@ class Start:
     images       how many of what, in words: what a card says of them, and not where they lie on this disk
     fingerprint  of the images of caches, 16 hex digits, wherever the folders lie; "" of streets
     weights      as they were asked for, or None
+    judged       which images it is judged on: as `fingerprint`, or the word of streets; "" where none are named
     """
 
     images: str
     fingerprint: str = ""
     weights: str | None = None
+    judged: str = ""
 
 
-def start_of(images: TrainingImages, data: str | Path, weights: str | None) -> Start:
-    """Of open images, and the words of them and of the weights. Raises ValueError where `data` is no cache."""
+def start_of(
+    images: TrainingImages, data: str | Path, weights: str | None, validation: str | Path | None = None
+) -> Start:
+    """Of open images, and the words of them, of the weights and of what is judged. Raises ValueError where `data` or
+    `validation` is no cache."""
     if isinstance(images, Streets):
         count = "endless"
     else:
         count = f"{images.scans if isinstance(images, SeveralCaches) else len(images):,}"
     details = [f"{key} {value}" for key, value in images.source.items() if key not in ("name", *PLACE)]
     words = ", ".join([f"{count} images of {images.source['name']}", *details])
-    return Start(words, "" if isinstance(images, Streets) else _fingerprint(data), weights)
+    judged = "" if validation is None else str(validation) if words_of(validation) else _fingerprint(validation)
+    return Start(words, "" if isinstance(images, Streets) else _fingerprint(data), weights, judged)
 
 
 def _fingerprint(data: str | Path) -> str:
@@ -107,6 +113,9 @@ def check_start(out: Path, start: Start, card: Card) -> str:
     if start.weights not in (None, found.weights):
         raise ValueError(f"{out}: expected its own run, begun from {found.weights or 'no weights'}, found --from "
                          f"{start.weights}; leave it away, or another folder begins a new run")  # fmt: skip
+    if found.judged and start.judged and found.judged != start.judged:
+        return (f"{out}: expected the validation images that the run began with, found others: its curves and "
+                "judged.csv hold numbers of both")  # fmt: skip
     return ""
 
 
