@@ -80,8 +80,8 @@ def outlined(sensor: Sensor, outline: Outline | None) -> np.ndarray:
 
 def seen_written_out(sensor: Sensor, outline: Outline | None) -> Sensor:
     """`hdl64e.written_out` with the car as a scan shows it."""
-    blocked = runs_of(outlined(sensor, outline))
-    return written_out(sensor) if outline is None else replace(written_out(sensor), blocked=blocked)
+    told = written_out(sensor)
+    return told if outline is None else replace(told, blocked=runs_of(outlined(sensor, outline)))
 
 
 def outline_of(sensor: Sensor, image: RangeImage, known: np.ndarray) -> Outline | None:
