@@ -330,7 +330,7 @@ def test_what_a_benchmark_imports_is_there(path: Path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("lidarsynth."):
             there = importlib.import_module(node.module)
-            for alias in node.names:  # of a package also its modules, which are none of its names until they are imported
+            for alias in node.names:  # of a package its modules, too, which are names once they are imported
                 with contextlib.suppress(ModuleNotFoundError):
                     importlib.import_module(f"{node.module}.{alias.name}")
             assert [alias.name for alias in node.names if not hasattr(there, alias.name)] == []
