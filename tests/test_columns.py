@@ -1,5 +1,6 @@
 """A turn has as many columns as the sensor fired in it, whatever its table says; images of scans of others stay."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,43 @@ def test_fewer_columns_leave_none_empty_and_lose_no_point():
     assert own == sensor.resized(width=512)
     assert project(scan, sensor).mask.any(axis=0).mean() < 0.6
     assert occupied(scan, own, pixel_of_points(scan, own)).sum() > 0.98 * len(scan)
+
+
+def read_coarsely(firings: int, count: float, beams: int = 24, gone: float = 0.0) -> tuple[Scan, Sensor]:
+    """A round room as a sensor of nobody's fires into it, azimuths cut to whole counts of an encoder, and that sensor."""
+    elevation = np.linspace(5, -20, beams)
+    azimuth = np.floor(np.arange(firings) * 360 / firings / count) * count - 180 + count / 3
+    ring, turn = np.repeat(np.arange(beams), firings), np.radians(np.tile(azimuth, beams))
+    up = np.radians(elevation[ring])
+    xyz = 10 * np.stack([np.cos(turn) * np.cos(up), np.sin(turn) * np.cos(up), np.sin(up)], 1)
+    keep = np.random.default_rng(3).random(len(xyz)) >= gone
+    scan = Scan(xyz.astype(np.float32), np.full(len(xyz), 0.5, np.float32), ring=ring)[keep]
+    return scan, Sensor("nobodys", tuple(elevation.tolist()), firings)
+
+
+@pytest.mark.parametrize("gone", [0.0, 0.1])
+def test_azimuths_that_are_read_coarsely_tell_how_often_a_sensor_fires(gone: float):
+    scan, _ = read_coarsely(2149, 0.09, gone=gone)
+    assert scan.ring is not None
+    assert 2 * np.pi / azimuth_step(scan.xyz, scan.ring) == pytest.approx(2149, abs=8)
+
+
+def test_each_firing_of_a_sensor_of_ones_own_has_a_column_though_azimuths_are_read_coarsely():
+    scan, sensor = read_coarsely(2149, 0.09)
+    known = replace(sensor, name="hdl-64e")  # whose images stay as published
+    assert project(scan, known).mask.mean() < 0.95
+    row, column = pixel_of_points(scan, sensor)
+    assert project(scan, sensor).mask.mean() > 0.99
+    own = (1 - np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) / np.pi) / 2 * sensor.width
+    assert np.abs(column + 0.5 - own).max() < 2
+    np.testing.assert_array_equal(row, scan.ring)
+
+
+@pytest.mark.parametrize("columns", [1024, 2140])
+def test_more_firings_than_columns_push_none_around_the_turn(columns: int):
+    scan, sensor = read_coarsely(2149, 0.001)
+    column = pixel_of_points(scan, replace(sensor, width=columns))[1]
+    np.testing.assert_array_equal(column, pixel_of_points(scan, replace(sensor, width=columns, name="hdl-64e"))[1])
 
 
 def test_points_that_tell_no_columns_leave_the_table_as_it_is():

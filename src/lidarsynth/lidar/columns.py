@@ -15,6 +15,7 @@ FINEST = 2 * np.pi / 8192  # radians: closer points are of one firing, of which 
 DENSER, LEAST = 2.0, 30
 POINTS, MANY = 12_000, 1024  # of a scan are enough, in whole rings; rings: others count no beams
 ENOUGH = 1000  # steps that tell columns
+ALIKE, COARSE = 0.2, 0.08  # of the median step; of so many steps, as many half as long are no chance
 # So many of the steps of up to three columns are within a quarter of one, two or three. Of 129 HDL-64E scans 0.75 and
 # more are, of half of them 0.85; of four other recordings 0.91; of points kept at random at most 0.71.
 MULTIPLES, OFF, STEADY = 3, 0.25, 0.75
@@ -24,8 +25,11 @@ PADDED = 16  # columns: images of networks have multiples of it
 
 
 def azimuth_step(xyz: np.ndarray, ring: np.ndarray) -> float:
-    """Radians between neighbouring columns: the median step along the rings, steps over lost points left out, and such
+    """Radians between neighbouring columns: the mean step along the rings, steps over lost points left out, and such
     that the fullest ring, had it returned as often all around, is at least half full.
+
+    Steps are those about as long as the median one, and half as long where many are: of azimuths that are read
+    coarsely, as KITTI's in 0.09 degrees, two to a firing or, of each seventh, one. Others are of near points, of noise.
 
     xyz (N, 3), ring (N,) int from 0
     """
@@ -36,15 +40,15 @@ def step_and_whether(xyz: np.ndarray, ring: np.ndarray) -> tuple[float, bool]:
     """`azimuth_step`, and whether steps are of whole columns: not those of points at random, or of noise."""
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     step = _steps(azimuth, ring)
-    found = _step_of(step, azimuth, ring)
-    return found, _steady(step, found)
+    mean = _mean_step(step, azimuth, ring)
+    return _step_of(step, mean), _steady(step, mean)
 
 
 def columns_by_steps(xyz: np.ndarray, ring: np.ndarray) -> int | None:
     """Columns of a whole turn by `azimuth_step`, though part of it or of its points be lost; None where none follow."""
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     step = _steps(azimuth, ring)
-    return round(2 * np.pi / _step_of(step, azimuth, ring)) if len(step) else None
+    return round(2 * np.pi / _step_of(step, _mean_step(step, azimuth, ring))) if len(step) else None
 
 
 def _steps(azimuth: np.ndarray, ring: np.ndarray) -> np.ndarray:
@@ -54,13 +58,23 @@ def _steps(azimuth: np.ndarray, ring: np.ndarray) -> np.ndarray:
     return step[(step > FINEST) & (step < 3)]
 
 
-def _steady(step: np.ndarray, found: float) -> bool:
-    times = step / found
+def _steady(step: np.ndarray, mean: float) -> bool:
+    times = step / mean
     near = times[times < MULTIPLES + 0.5]
     return bool((np.abs(near - np.maximum(near.round(), 1)) < OFF).mean() >= STEADY)
 
 
-def _step_of(step: np.ndarray, azimuth: np.ndarray, ring: np.ndarray) -> float:
+def _step_of(step: np.ndarray, mean: float) -> float:
+    """The step from firing to firing, where the mean of steps up to half as long again is `mean`."""
+    near = step[(step > 0.5 * mean) & (step < 1.5 * mean)]
+    times = step / (np.median(near) if len(near) else mean)
+    whole, half = np.abs(times - 1) < ALIKE, np.abs(times - 0.5) < ALIKE / 4
+    if half.sum() > COARSE * whole.sum():
+        whole |= half
+    return float(np.mean(step[whole])) if whole.any() else mean
+
+
+def _mean_step(step: np.ndarray, azimuth: np.ndarray, ring: np.ndarray) -> float:
     usual = np.median(step)
     degree = np.floor(np.degrees(azimuth)).astype(int) % 360
     count = np.bincount(ring.astype(int) * 360 + degree, minlength=360 * (int(ring.max()) + 1)).reshape(-1, 360)
@@ -85,11 +99,11 @@ def columns_of_turn(scan: Scan, sensor: Sensor) -> int | None:
     step = _steps(azimuth, ring)
     if len(step) < ENOUGH:
         return None
-    found = _step_of(step, azimuth, ring)
-    if not _steady(step, found):
+    mean = _mean_step(step, azimuth, ring)
+    if not _steady(step, mean):
         return None
     usual = full_turn(sensor)
-    share = 2 * np.pi / found / usual
+    share = 2 * np.pi / _step_of(step, mean) / usual
     likely = min(USUAL, key=lambda rate: abs(np.log(share / rate)))
     if abs(np.log(share / likely)) < NEAR:
         return None if likely == 1 else round(usual * likely)
@@ -107,9 +121,9 @@ def columns_sent(scan: Scan, sensor: Sensor, row: np.ndarray) -> int | None:
     azimuth, ring = np.arctan2(scan.xyz[part, 1], scan.xyz[part, 0]), row[part]
     if not len(rows) or not len(step := _steps(azimuth, ring)):
         return usual
-    found = _step_of(step, azimuth, ring)
-    share = 2 * np.pi / found / usual
-    if not _steady(step, found):
+    mean = _mean_step(step, azimuth, ring)
+    share = 2 * np.pi / _step_of(step, mean) / usual
+    if not _steady(step, mean):
         return None
     return usual if FEWEST < share < MOST else max(1, round(usual * share))
 

@@ -13,6 +13,7 @@ from lidarsynth.lidar.cones import Ring, fit_ring
 from lidarsynth.lidar.ground import LOWEST, is_above, lowest_plane, share_below
 from lidarsynth.lidar.motion import straighten
 from lidarsynth.lidar.origin import FEWEST_RINGS, rings_of
+from lidarsynth.lidar.projection import columns_one_by_one
 from lidarsynth.lidar.recognition import (
     EVERYWHERE,
     ONE_RING,
@@ -361,6 +362,5 @@ def _seen(kept: list[tuple[Scan, np.ndarray]], width: int, rows: int) -> np.ndar
     seen = np.zeros((len(kept), rows, width), bool)
     for one, (scan, row) in zip(seen, kept, strict=True):
         inside = row >= 0
-        turn = (1 - np.arctan2(scan.xyz[inside, 1], scan.xyz[inside, 0]) / np.pi) / 2
-        one[row[inside], (turn * width).astype(int).clip(0, width - 1)] = True
+        one[row[inside], columns_one_by_one(scan.xyz[inside], row[inside], width)] = True
     return seen

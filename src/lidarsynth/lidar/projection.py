@@ -14,6 +14,7 @@ RESIZINGS = ("nearest-exact", "nearest")
 # Rows by the order of points are wrong where more than this share of at most so many points lies on other beams, and
 # points lie on beams, within this share of the usual spacing; those of scans put straight for motion do not.
 OTHERS, SOME, ON_BEAM = 0.1, 10_000, 0.08
+ONE_FIRING, MANY, SOON = 0.4, 0.2, 16  # columns between points of one firing at most; share of the points; firings
 
 
 Pixels = tuple[np.ndarray, np.ndarray]  # row and column of each point, as `pixel_of_points` gives them
@@ -191,8 +192,14 @@ def check_from_top(ring: np.ndarray, xyz: np.ndarray) -> None:
 
 
 def pixel_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> Pixels:
-    """Row, as `row_of_points`, and column of each point in the sensor's image, (N,) int64 each."""
-    return row_of_points(scan, sensor, method), _columns(scan.xyz, sensor.width)
+    """Row, as `row_of_points`, and column of each point in the sensor's image, (N,) int64 each.
+
+    In columns of a sensor of the user's own, as many as it fires in a turn, points of two firings are in two columns,
+    also where azimuths that are read coarsely would leave another empty.
+    """
+    row = row_of_points(scan, sensor, method)
+    columns = _columns if sensor.name in WORDS else columns_one_by_one
+    return row, columns(scan.xyz, row, sensor.width)
 
 
 def is_even_grid(sensor: Sensor) -> bool:
@@ -262,11 +269,42 @@ def _rows_of_even_grid(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
     return np.clip(np.floor(row), 0, height - 1).astype(np.intp)
 
 
-def _columns(xyz: np.ndarray, width: int) -> np.ndarray:
+def _columns(xyz: np.ndarray, row: np.ndarray, width: int) -> np.ndarray:
+    return np.minimum((_turns(xyz) * width).astype(np.intp), width - 1)
+
+
+def _turns(xyz: np.ndarray) -> np.ndarray:
+    """(N,) how far around the image points are, 0 to below 1."""
     azimuth = -np.arctan2(xyz[:, 1], xyz[:, 0])
     turn = (azimuth / np.float32(np.pi) + 1) / 2
     turn[turn >= 1] = 0  # straight behind, from the left or from the right, is column 0
-    return np.minimum((turn * width).astype(np.intp), width - 1)
+    return turn
+
+
+def columns_one_by_one(xyz: np.ndarray, row: np.ndarray, width: int) -> np.ndarray:
+    """(N,) columns of points (N, 3) of rows (N,), where one whose column an earlier firing of its row has taken is in
+    the next, and so on where one is free SOON; but for points of more firings than columns, of which many share one.
+
+    KITTI's sensor fires every 0.168 degrees and reads its azimuth in 0.09: of its 2,149 columns 6 % would be empty for
+    that, and as many points hidden by others.
+    """
+    turn = _turns(xyz)
+    column = np.minimum((turn * width).astype(np.intp), width - 1)
+    order = np.argsort(row + turn.astype(np.float64))
+    row, place, first = row[order], turn[order] * width, column[order]
+    begins = np.diff(row, prepend=-2) != 0
+    fires = begins | (np.diff(place, prepend=-width) > ONE_FIRING)
+    shared = fires[1:] & ~begins[1:] & (np.diff(first) == 0)
+    if not shared.any() or shared.mean() > MANY:
+        return column
+    firing = np.cumsum(fires)
+    away = row * (2 * (width + len(row)))  # rows apart, so that none pushes the next
+    taken = np.maximum.accumulate(first - firing + away) + firing - away
+    moved = taken > first
+    stretch = np.cumsum(np.diff(moved, prepend=False))
+    moved &= (np.bincount(stretch) <= SOON)[stretch] & (taken < width)
+    column[order] = np.where(moved, taken, first)
+    return column
 
 
 def _draw(scan: Scan, sensor: Sensor, depth: np.ndarray, pixel: np.ndarray, inside: np.ndarray) -> RangeImage:
