@@ -307,6 +307,22 @@ def test_pairs_of_other_beams_are_told():
     assert not told(ls.evaluate([street(0)], [street(1)], "iln-2022"), "other beams")
 
 
+@pytest.mark.parametrize("protocol", ["r2dm-upsampling-2024", "iln-2022"])
+def test_points_of_a_pair_are_drawn_by_their_rings_as_other_verbs_draw_them(protocol: str):
+    image = street(0, replace(SENSORS["hdl-32e"], width=64))
+    row = np.broadcast_to(np.arange(32)[:, None], image.shape)[image.mask]
+    far, turn = image.range[image.mask], image.sensor.ray_angles()[1][image.mask]
+    low = np.radians(np.array(image.sensor.elevations) - 0.8)[row]  # nearer to the next beam, as calibrations have it
+    directions = np.stack([np.cos(low) * np.cos(turn), np.cos(low) * np.sin(turn), np.sin(low)], axis=1)
+    scan = Scan((far[:, None] * directions).astype(np.float32), image.reflectance[image.mask], ring=row.astype(int))
+    drawn = ls.project(scan, image.sensor)
+    assert np.array_equal(drawn.mask, image.mask) and not np.array_equal(
+        ls.project(scan, image.sensor, "spherical").mask, image.mask
+    )
+    for samples, reference in (([drawn], [scan]), ([scan], [drawn])):
+        assert ls.evaluate(samples, reference, protocol).values["range MAE"] == 0
+
+
 def test_beams_that_differ_by_rounding_are_the_same(tmp_path: Path):
     """A generator of float32 has them, and a file of a sensor says them in six digits."""
     off = 1e-6 * np.random.default_rng(0).uniform(-1, 1, SENSOR.height)
@@ -444,3 +460,24 @@ def test_statistics_that_another_version_gathered_are_told(tmp_path: Path, monke
     assert [len(notes) for notes in told] == [1, 0] and told[0][0].startswith(f"{files[0]}: expected statistics")
     with pytest.raises(ValueError, match="gathered as by this version"):  # or their numbers would pass for this one's
         gather_part(files[0], "1/1", tmp_path / "again.safetensors")
+
+
+def test_files_of_statistics_keep_the_notes_on_their_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Or what is said of a folder would not be said of the same folder whose parts two machines gathered."""
+    shares = [replace(image, range=image.range / 80) for image in map(street, range(4))]
+    other = "lidm-2024"  # which wants sequences that a list does not have
+    straight = ls.evaluate(shares, [street(4), street(5)]).warnings
+    *parts, merged, reference = (tmp_path / f"{name}.safetensors" for name in ("1", "2", "both", "real"))
+    for i, part in enumerate(parts, 1):
+        gather_part(shares, f"{i}/2", part)
+    gather_part(parts, "1/1", merged)
+    gather_part([street(4), street(5)], "1/1", reference, side="reference")
+    for files in (parts, merged):
+        for truth in (reference, [street(4), street(5)]):
+            report = ls.evaluate(files, truth)
+            assert set(report.warnings) == set(straight) and len(told(report, "not shares of a limit")) == 1
+    gather_part([street(4)], "1/1", reference, other, side="reference")
+    assert told(ls.evaluate([street(5)], reference, other), "compares with the sequences")
+    write(tmp_path / "share.npz", shares[0])
+    main(["evaluate", str(tmp_path / "share.npz"), "--part", "1/1", "--out", str(merged)])
+    assert "note: ranges of samples are" in capsys.readouterr().out
