@@ -287,6 +287,13 @@ def test_points_of_a_sensor_that_nobody_knows_are_told_where_the_images_do_not_s
     assert not told(ls.evaluate(camera, camera), "drawn into, found"), "whose frame is what is told of"
 
 
+def test_points_of_a_known_sensor_are_told_where_those_of_ones_own_do_not_see_them():
+    scans = [street(seed, SENSORS["hdl-32e"]).to_scan() for seed in range(2)]
+    narrow, alike = Sensor("narrow", tuple(np.linspace(2, -8, 16))), replace(SENSORS["hdl-32e"], name="alike")
+    assert len(told(ls.evaluate(scans, scans, sensor=narrow), "narrow sees, whose images they are drawn into")) == 2
+    assert not told(ls.evaluate(scans, scans, sensor=alike), "drawn into")
+
+
 def test_several_sensors_are_told_of_merged_parts_too(tmp_path: Path):
     (tmp_path / "mixed").mkdir()
     for i, image in enumerate((street(0), street(1), street(2), street(2, KITTI))):

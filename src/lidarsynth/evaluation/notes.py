@@ -56,12 +56,14 @@ def unlike_sensors(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
 
 
 def out_of_images(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
-    """Notes where points of a side, by some scans of a sensor that is not known, are above or below the view of the
-    one whose images they are drawn into, or on none of its lowest beams; not of points in another frame."""
+    """Notes where points of a side, by some scans, are above or below the view of the sensor whose images they are
+    drawn into, or on none of its lowest beams; not of points in another frame, nor where both sensors are known, of
+    which `unlike_sensors` tells."""
     notes = []
     for side, images in sides.items():
         scans = [scan for scan in _some(images) if isinstance(scan, Scan)] if images else []
-        unknown = [scan for scan in scans if recognise(scan)[0] is None and not check_frame(scan).faults]
+        own = drawn.name not in WORDS
+        unknown = [scan for scan in scans if (own or recognise(scan)[0] is None) and not check_frame(scan).faults]
         told = [text for scan in unknown if (text := out_of_view(scan.xyz, drawn))]
         if told and 2 * len(told) > len(scans):
             notes.append(f"expected points of {side} that {drawn.name} sees, whose images they are drawn into, found "

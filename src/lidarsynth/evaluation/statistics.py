@@ -346,7 +346,7 @@ def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> t
 
 
 def load_metadata(path: Path) -> dict[str, str]:
-    """What `save_statistics` wrote beside the numbers, which are not read. Raises ValueError for what is no such file."""
+    """What `save_statistics` wrote beside the numbers, which are not read. Raises ValueError for no such file."""
     try:
         check_regular(path, LARGEST_WEIGHTS)
         with safe_open(path, "pt") as file:
