@@ -99,6 +99,21 @@ def test_a_copy_of_the_reference_is_told(protocol: str, tmp_path: Path):
     assert not any(told in note for note in ls.evaluate(other, real, protocol).warnings)
 
 
+def test_samples_that_are_scans_of_the_reference_are_told(tmp_path: Path):
+    """As of a reference below the folder of the samples, which is read at any depth."""
+    samples = saved(tmp_path / "samples", range(3))
+    real, other = saved(samples / "real", range(3, 5)), saved(tmp_path / "other", range(5, 8))
+    batch(tmp_path / "batch.npz", range(8, 10))
+    assert told(ls.evaluate(samples, real), "samples are scans of") == [
+        "2 of 5 samples are scans of the reference, too: the sets look nearer than they are"
+    ]
+    assert told(ls.evaluate(real, samples), "2 of 2 samples are scans of the reference, too")
+    (other / "linked.npz").symlink_to(tmp_path / "batch.npz")
+    assert told(ls.evaluate(other, tmp_path / "batch.npz"), "2 of 5 samples are scans of the reference, too")
+    assert not told(ls.evaluate(other, real), "samples are scans of")
+    assert not told(ls.evaluate([street(0)], real), "samples are scans of")
+
+
 @pytest.mark.parametrize("protocol", ["iln-2022", "street-upsampling-1", "lidm-reconstruction-2024"])
 def test_pairs_of_the_same_images_in_another_order_are_told(protocol: str):
     real = [street(seed) for seed in range(3)]

@@ -324,7 +324,7 @@ def gather_part(
     if files := statistics_files(samples):
         statistics, lacking = merged(files, record)
         if lacking or part != "1/1":
-            raise ValueError(*lacking or [f"expected the part 1/1 to merge files of statistics, found {part}"])
+            raise ValueError("; ".join(lacking) or f"expected the part 1/1 to merge files of statistics, found {part}")
         kept = {"source": ", ".join(map(str, files)), "part": part, "notes": json.dumps(notes_of(files))}
         return save_statistics(out, statistics, kept)
     if side == "reference" and 0 in (record.real, record.real_bev):
