@@ -158,7 +158,7 @@ def _square(confusion: np.ndarray) -> np.ndarray:
 
 
 def _check_classes(without: tuple[int, ...], classes: int) -> None:
-    """Raises ValueError for a class that is none: -1, by which others mark what to ignore, would be the last one here."""
+    """Raises ValueError for a class that is none: -1, by which others mark pixels to ignore, would be the last one."""
     if other := [number for number in without if not 0 <= number < classes]:
         raise ValueError(f"expected classes 0-{classes - 1} to leave out, found {other[0]}")
 
