@@ -503,3 +503,13 @@ def test_files_of_statistics_keep_the_notes_on_their_images(tmp_path: Path, caps
     write(tmp_path / "share.npz", shares[0])
     main(["evaluate", str(tmp_path / "share.npz"), "--part", "1/1", "--out", str(merged)])
     assert "note: ranges of samples are" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("notes", ['{"a": 1}', "[1]", "none"])
+def test_notes_that_are_none_are_refused(notes: str, tmp_path: Path):
+    file, kept = tmp_path / "s.safetensors", statistics.Statistics(BEV_1, SENSOR, "samples")
+    statistics.save_statistics(file, kept, {"notes": notes})
+    with pytest.raises(ValueError, match=r"s\.safetensors: expected notes as a list of texts, found another thing"):
+        ls.evaluate(file, [street(0)])
+    statistics.save_statistics(file, kept, {"notes": json.dumps(["one\nline \x1b[2J"])})
+    assert told(ls.evaluate(file, [street(0)]), "one line  [2J")

@@ -74,7 +74,7 @@ def notes_of(files: Sequence[str | Path]) -> tuple[str, ...]:
             notes = None
         if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
             raise ValueError(f"{file}: expected notes as a list of texts, found another thing")
-        found |= dict.fromkeys(notes)
+        found |= dict.fromkeys("".join(c if c.isprintable() else " " for c in note) for note in notes)
     return tuple(found)
 
 
