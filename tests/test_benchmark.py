@@ -332,6 +332,28 @@ def test_rows_that_cannot_be_are_told(data: Path, tiny: Path, tmp_path: Path):
     assert "- N/A, range only: scan 0: expected finite numbers, found NaN or infinity" in text
 
 
+def test_a_scan_without_points_is_named_and_takes_no_other_number_away(data: Path, tiny: Path, tmp_path: Path):
+    """A protocol of points says nothing of it; the whole benchmark ended, without the name of the scan."""
+    images = [street(0), street(1).keep(np.zeros((16, 64), bool))]
+    folder = stored(tmp_path / "scans", images)
+    protocols = 'protocol = ["lidm-reconstruction-2024", "iln-2022"]'
+    model = '[[method]]\nname="tiny"\nmodel="tiny"'
+    config = written(tmp_path / "b.toml", f'data = "{folder}"\n{protocols}\n{model}\n{METHODS}')
+
+    class Refusing(Counted):
+        def complete(self, scan, known, **options):
+            if not scan.mask.any():
+                raise ValueError("expected points, found none")
+            return self.model.complete(scan, known, **options)
+
+    names = CachedImages(folder).name(1)[1:]
+    text = benchmark("upsampling", config, tmp_path / "out", lambda word: Refusing(ls.load(tiny)))
+    assert f"- N/A, tiny: expected points, found none ({'/'.join(names)})" in text
+    assert f"- N/A, CD, m2, EMD: {'/'.join(names)}: expected points between 1 and 56 m, found none of 0" in text
+    found = results(tmp_path / "out")["bilinear"]
+    assert found["reports"]["iln-2022"]["values"]["range MAE"]["value"] > 0 and len(found["errors of each scan"]) == 4
+
+
 def test_classes_judge_and_colour(tmp_path: Path, figures: None):
     data = stored(tmp_path / "data", [street(i) for i in range(2)])
     config = written(tmp_path / "b.toml", f'data = "{data}"\n{METHODS}')

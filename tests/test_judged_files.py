@@ -99,6 +99,21 @@ def test_a_copy_of_the_reference_is_told(protocol: str, tmp_path: Path):
     assert not any(told in note for note in ls.evaluate(other, real, protocol).warnings)
 
 
+def test_samples_that_are_scans_of_the_reference_are_told(tmp_path: Path):
+    """As of a reference below the folder of the samples, which is read at any depth."""
+    samples = saved(tmp_path / "samples", range(3))
+    real, other = saved(samples / "real", range(3, 5)), saved(tmp_path / "other", range(5, 8))
+    batch(tmp_path / "batch.npz", range(8, 10))
+    assert told(ls.evaluate(samples, real), "samples are scans of") == [
+        "2 of 5 samples are scans of the reference, too: the sets look nearer than they are"
+    ]
+    assert told(ls.evaluate(real, samples), "2 of 2 samples are scans of the reference, too")
+    (other / "linked.npz").symlink_to(tmp_path / "batch.npz")
+    assert told(ls.evaluate(other, tmp_path / "batch.npz"), "2 of 5 samples are scans of the reference, too")
+    assert not told(ls.evaluate(other, real), "samples are scans of")
+    assert not told(ls.evaluate([street(0)], real), "samples are scans of")
+
+
 @pytest.mark.parametrize("protocol", ["iln-2022", "street-upsampling-1", "lidm-reconstruction-2024"])
 def test_pairs_of_the_same_images_in_another_order_are_told(protocol: str):
     real = [street(seed) for seed in range(3)]
@@ -287,6 +302,13 @@ def test_points_of_a_sensor_that_nobody_knows_are_told_where_the_images_do_not_s
     assert not told(ls.evaluate(camera, camera), "drawn into, found"), "whose frame is what is told of"
 
 
+def test_points_of_a_known_sensor_are_told_where_those_of_ones_own_do_not_see_them():
+    scans = [street(seed, SENSORS["hdl-32e"]).to_scan() for seed in range(2)]
+    narrow, alike = Sensor("narrow", tuple(np.linspace(2, -8, 16))), replace(SENSORS["hdl-32e"], name="alike")
+    assert len(told(ls.evaluate(scans, scans, sensor=narrow), "narrow sees, whose images they are drawn into")) == 2
+    assert not told(ls.evaluate(scans, scans, sensor=alike), "drawn into")
+
+
 def test_several_sensors_are_told_of_merged_parts_too(tmp_path: Path):
     (tmp_path / "mixed").mkdir()
     for i, image in enumerate((street(0), street(1), street(2), street(2, KITTI))):
@@ -305,6 +327,22 @@ def test_pairs_of_other_beams_are_told():
             of = "hdl-64e-kitti against hdl-64e"
             assert note == f"{told_of} of 2 samples are of other beams than their reference, first {of}"
     assert not told(ls.evaluate([street(0)], [street(1)], "iln-2022"), "other beams")
+
+
+@pytest.mark.parametrize("protocol", ["r2dm-upsampling-2024", "iln-2022"])
+def test_points_of_a_pair_are_drawn_by_their_rings_as_other_verbs_draw_them(protocol: str):
+    image = street(0, replace(SENSORS["hdl-32e"], width=64))
+    row = np.broadcast_to(np.arange(32)[:, None], image.shape)[image.mask]
+    far, turn = image.range[image.mask], image.sensor.ray_angles()[1][image.mask]
+    low = np.radians(np.array(image.sensor.elevations) - 0.8)[row]  # nearer to the next beam, as calibrations have it
+    directions = np.stack([np.cos(low) * np.cos(turn), np.cos(low) * np.sin(turn), np.sin(low)], axis=1)
+    scan = Scan((far[:, None] * directions).astype(np.float32), image.reflectance[image.mask], ring=row.astype(int))
+    drawn = ls.project(scan, image.sensor)
+    assert np.array_equal(drawn.mask, image.mask) and not np.array_equal(
+        ls.project(scan, image.sensor, "spherical").mask, image.mask
+    )
+    for samples, reference in (([drawn], [scan]), ([scan], [drawn])):
+        assert ls.evaluate(samples, reference, protocol).values["range MAE"] == 0
 
 
 def test_beams_that_differ_by_rounding_are_the_same(tmp_path: Path):
@@ -444,3 +482,34 @@ def test_statistics_that_another_version_gathered_are_told(tmp_path: Path, monke
     assert [len(notes) for notes in told] == [1, 0] and told[0][0].startswith(f"{files[0]}: expected statistics")
     with pytest.raises(ValueError, match="gathered as by this version"):  # or their numbers would pass for this one's
         gather_part(files[0], "1/1", tmp_path / "again.safetensors")
+
+
+def test_files_of_statistics_keep_the_notes_on_their_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Or what is said of a folder would not be said of the same folder whose parts two machines gathered."""
+    shares = [replace(image, range=image.range / 80) for image in map(street, range(4))]
+    other = "lidm-2024"  # which wants sequences that a list does not have
+    straight = ls.evaluate(shares, [street(4), street(5)]).warnings
+    *parts, merged, reference = (tmp_path / f"{name}.safetensors" for name in ("1", "2", "both", "real"))
+    for i, part in enumerate(parts, 1):
+        gather_part(shares, f"{i}/2", part)
+    gather_part(parts, "1/1", merged)
+    gather_part([street(4), street(5)], "1/1", reference, side="reference")
+    for files in (parts, merged):
+        for truth in (reference, [street(4), street(5)]):
+            report = ls.evaluate(files, truth)
+            assert set(report.warnings) == set(straight) and len(told(report, "not shares of a limit")) == 1
+    gather_part([street(4)], "1/1", reference, other, side="reference")
+    assert told(ls.evaluate([street(5)], reference, other), "compares with the sequences")
+    write(tmp_path / "share.npz", shares[0])
+    main(["evaluate", str(tmp_path / "share.npz"), "--part", "1/1", "--out", str(merged)])
+    assert "note: ranges of samples are" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("notes", ['{"a": 1}', "[1]", "none"])
+def test_notes_that_are_none_are_refused(notes: str, tmp_path: Path):
+    file, kept = tmp_path / "s.safetensors", statistics.Statistics(BEV_1, SENSOR, "samples")
+    statistics.save_statistics(file, kept, {"notes": notes})
+    with pytest.raises(ValueError, match=r"s\.safetensors: expected notes as a list of texts, found another thing"):
+        ls.evaluate(file, [street(0)])
+    statistics.save_statistics(file, kept, {"notes": json.dumps(["one\nline \x1b[2J"])})
+    assert told(ls.evaluate(file, [street(0)]), "one line  [2J")

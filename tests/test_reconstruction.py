@@ -107,6 +107,16 @@ def test_a_label_that_is_none_is_named(label: float, side: int):
         confusion_matrix(*(both if side else both[::-1]), 4)
 
 
+@pytest.mark.parametrize("judge", [class_iou, mean_iou, accuracy])
+@pytest.mark.parametrize("number", [-1, 20, 255])
+def test_a_class_to_leave_out_that_is_none_is_refused(judge, number: int):
+    """-1, by which others ignore pixels, left out the last class without a word."""
+    with pytest.raises(ValueError, match=rf"expected classes 0-19 to leave out, found {number}$"):
+        judge(np.eye(20), (0, number))
+    with pytest.raises(ValueError, match="expected at least one class to judge, found all 2 left out"):
+        mean_iou(np.eye(2), (0, 1))
+
+
 def test_numbers_that_make_no_sense_are_refused():
     points = np.ones((4, 3))
     for size in (0, -0.1, np.nan):

@@ -72,7 +72,10 @@ def upsampling_row(setup: Setup, problem: Problem, group: str, method: Upsamplin
     def make(numbers: range) -> tuple[list[RangeImage], Seconds]:
         truth, known = data[numbers.start]
         before = truth.keep(known)
-        filled, seconds = timed(lambda: fill(before, known, config.seed + numbers.start))
+        try:
+            filled, seconds = timed(lambda: fill(before, known, config.seed + numbers.start))
+        except Declined as reason:
+            raise Declined(f"{reason} ({data.names[numbers.start]})") from None
         return [filled], seconds
 
     try:
@@ -98,22 +101,25 @@ def upsampling_row(setup: Setup, problem: Problem, group: str, method: Upsamplin
 
 
 def _judged(setup: Setup, name: str, data: Corrupted, store: Store, stamps: Sequence[str]) -> dict[str, Any]:
-    """A protocol's report, and the errors of each scan."""
+    """A protocol's report, or why there is none, and the errors of each scan."""
     protocol, judges = get_protocol(name), setup.judges(name, data.sensor.width)
 
     def judge() -> dict[str, Any]:
         pairs, errors = Pairs(protocol, classes_of(judges.networks), setup.seen(name, data.sensor.width)), []
+        lacking = ""
         for i in range(len(stamps)):
             (truth, known), filled = data[i], emptied(store.image(i))
-            pairs.update([filled], [truth])
-            hidden = reconstruction_errors(filled, truth, ~known)
-            errors.append([pairs.errors[-1].range_mae, pairs.errors[-1].reflectance_mae,
-                           hidden.range_mae, hidden.reflectance_mae])  # fmt: skip
+            try:
+                pairs.update([filled], [truth])
+            except ValueError as error:  # a scan of which the protocol says nothing, such as of no point
+                lacking = lacking or f"{data.names[i]}: {error}"
+            both = [reconstruction_errors(filled, truth, where) for where in (None, ~known)]
+            errors.append([error for e in both for error in (e.range_mae, e.reflectance_mae)])
             if setup.on_images:
                 setup.on_images("judge", i + 1, len(stamps))
-        report = pairs.report(judges.missing, judges.weights).to_dict()
+        report = {"reason": lacking} if lacking else pairs.report(judges.missing, judges.weights).to_dict()
         columns = dict(zip(ERRORS, map(list, zip(*errors, strict=True)), strict=True))
         return {"report": report, "errors": {k: v for k, v in columns.items() if pairs.lit or "reflectance" not in k}}
 
     key = [definition(protocol), list(stamps), judges.weights, GATHERED]
-    return store.report(key, judge)
+    return store.report(key, judge, lambda judged: "values" in judged["report"])

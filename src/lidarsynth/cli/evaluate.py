@@ -25,6 +25,7 @@ def evaluate(
     """Judge samples against a reference under a named protocol; killed at any moment, the same command goes on."""
     from lidarsynth.cli.terminal import image_bar
     from lidarsynth.evaluation import evaluate as evaluation
+    from lidarsynth.evaluation.parts import notes_of
 
     at_least(1, {"batch-size": batch_size})
     at_least(0, {"seed": seed})
@@ -37,6 +38,8 @@ def evaluate(
         if part is not None:
             more = (device, on_images, side, reference, intensity)
             evaluation.gather_part(samples, part, out, protocol, sensor, batch_size, *more)
+            for note in notes_of([out]):
+                say(f"note: {note}")
         elif reference is not None:
             evaluation.check_out(out)
             more = (device, on_images, intensity)

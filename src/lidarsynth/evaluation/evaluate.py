@@ -32,7 +32,7 @@ from lidarsynth.evaluation.notes import (
     upside_down,
 )
 from lidarsynth.evaluation.pairs import Pairs, classes_of
-from lidarsynth.evaluation.parts import ENDING, merged, statistics_files
+from lidarsynth.evaluation.parts import ENDING, merged, notes_of, statistics_files
 from lidarsynth.evaluation.protocol import EvaluationProtocol
 from lidarsynth.evaluation.protocols import get_protocol
 from lidarsynth.evaluation.report import DEFINITIONS, Report, report_of
@@ -153,8 +153,9 @@ class _Run:
 
     def pairs(self, judged: ImageSet, truth: ImageSet, sensor: Sensor, loaded: Loaded) -> Pairs:
         """All images beside their truths; stopped, the next call goes on."""
-        pairs, projection = Pairs(self.protocol, classes_of(loaded.networks)), self.protocol.projection
+        pairs, projection = Pairs(self.protocol, classes_of(loaded.networks)), self.projection(sensor)
         identity = [definition(self.protocol), sensor.to_dict(), judged.stamp, truth.stamp, loaded.weights, GATHERED]
+        identity += [projection]  # before, always the protocol's own
         key = sha256(repr(identity).encode()).hexdigest()[:16]
         stamped = judged.stamp and truth.stamp
         unfinished = cache_folder() / "statistics" / f"unfinished-{self.protocol.name}-{key}.json" if stamped else None
@@ -229,6 +230,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
     judged = None if files else run.images(samples)  # first: what is wrong with these is said first
     if real_files:
         real, warnings = merged(real_files, run.protocol)
+        warnings += notes_of(real_files)
         told["reference"] = ", ".join(map(str, real_files))
     else:
         truth = run.images(reference)
@@ -240,7 +242,7 @@ def _judge_sets(run: _Run, samples: Samples, reference: Samples, seed: int) -> R
     loaded = Loaded()
     if judged is None:
         fake, more = merged(files, run.protocol)
-        told["samples"], warnings = ", ".join(map(str, files)), warnings + more
+        told["samples"], warnings = ", ".join(map(str, files)), warnings + more + notes_of(files)
         if truth:
             loaded = run.networks(fake.sensor)
     else:
@@ -301,6 +303,7 @@ def gather_part(
     """Write the statistics of part `i/n` of the samples to a `.safetensors` file; returns the SHA-256 of its content.
 
     `evaluate` merges such files, of several machines too; so does this, into one file, given files and the part 1/1.
+    What is unlike in the images is kept in the file, which `parts.notes_of` tells, and so do reports.
     side       what the images are: samples to judge, or a reference
     reference  what they will be judged against, if it is here: tells the sensor of points, as in `evaluate`
     intensity  as in `evaluate`
@@ -321,8 +324,9 @@ def gather_part(
     if files := statistics_files(samples):
         statistics, lacking = merged(files, record)
         if lacking or part != "1/1":
-            raise ValueError(*lacking or [f"expected the part 1/1 to merge files of statistics, found {part}"])
-        return save_statistics(out, statistics, {"source": ", ".join(map(str, files)), "part": part})
+            raise ValueError("; ".join(lacking) or f"expected the part 1/1 to merge files of statistics, found {part}")
+        kept = {"source": ", ".join(map(str, files)), "part": part, "notes": json.dumps(notes_of(files))}
+        return save_statistics(out, statistics, kept)
     if side == "reference" and 0 in (record.real, record.real_bev):
         raise ValueError(f"{record.title} takes as many of the reference as there are samples: expected it to be "
                          "gathered with them, found it alone")  # fmt: skip
@@ -332,8 +336,10 @@ def gather_part(
         raise ValueError(f"expected the sensor of the images, or none, found another: {unused[0]}")
     spec = run.sensor_of(images, run.sensor_like(reference))
     role: Role = "real" if side == "reference" else "samples"
+    notes = run.notes(*((None, images) if role == "real" else (images, None)), spec)
+    notes += unlike_names(record, images.names) if role == "real" else ()
     statistics, _ = run.statistics(images, spec, role, run.networks(spec), part=part)
-    return save_statistics(out, statistics, {"source": images.source, "part": part})
+    return save_statistics(out, statistics, {"source": images.source, "part": part, "notes": json.dumps(notes)})
 
 
 def _single(samples: Samples) -> Samples:

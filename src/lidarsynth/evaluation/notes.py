@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from torch import Tensor
@@ -56,12 +57,14 @@ def unlike_sensors(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
 
 
 def out_of_images(sides: Sides, drawn: Sensor) -> tuple[str, ...]:
-    """Notes where points of a side, by some scans of a sensor that is not known, are above or below the view of the
-    one whose images they are drawn into, or on none of its lowest beams; not of points in another frame."""
+    """Notes where points of a side, by some scans, are above or below the view of the sensor whose images they are
+    drawn into, or on none of its lowest beams; not of points in another frame, nor where both sensors are known, of
+    which `unlike_sensors` tells."""
     notes = []
     for side, images in sides.items():
         scans = [scan for scan in _some(images) if isinstance(scan, Scan)] if images else []
-        unknown = [scan for scan in scans if recognise(scan)[0] is None and not check_frame(scan).faults]
+        own = drawn.name not in WORDS
+        unknown = [scan for scan in scans if (own or recognise(scan)[0] is None) and not check_frame(scan).faults]
         told = [text for scan in unknown if (text := out_of_view(scan.xyz, drawn))]
         if told and 2 * len(told) > len(scans):
             notes.append(f"expected points of {side} that {drawn.name} sees, whose images they are drawn into, found "
@@ -234,7 +237,8 @@ def one_set(
     protocol: EvaluationProtocol,
     unlike: int = 0,
 ) -> tuple[str, ...]:
-    """A note where both sides are the same images: of one place, or copies, by the hashes of what was read.
+    """A note where both sides are the same images: of one place, or copies, by the hashes of what was read; or where
+    some of their files are, as of a folder within the other.
 
     unlike  how many are compared with another image, by a protocol of pairs
     """
@@ -243,7 +247,7 @@ def one_set(
     apart = p.reproject or ("samples" in p.gated) != ("real" in p.gated) or (p.clouds and p.clouds.redrawn)
     copies = one[:2] == other[:2] if apart else one == other  # a copy that was damaged since has the same index, too
     if not (copies and one[0]) and hashes["samples"] != hashes["reference"]:
-        return ()
+        return _shared_files(judged, truth)
     if unlike and hashes["samples"] == hashes["reference"]:
         return (f"{same} in another order: {unlike} of {len(judged or ())} are compared with another image",)
     if apart:
@@ -251,3 +255,21 @@ def one_set(
             f"{same}, and {p.title} takes the reference otherwise than samples: distances are what that costs, or 0",
         )
     return (f"{same}: distances are 0, or as far as chance goes",)
+
+
+def _shared_files(judged: ImageSet | None, truth: ImageSet | None) -> tuple[str, ...]:
+    """A note where some samples lie in files that the reference has, too."""
+    if not judged or not truth:
+        return ()
+    real = set(_files_of(truth))
+    if not (shared := sum(file in real for file in _files_of(judged))):
+        return ()
+    return (f"{shared} of {len(judged)} samples are scans of the reference, too: the sets look nearer than they are",)
+
+
+def _files_of(images: ImageSet) -> Iterator[tuple[Path, str]]:
+    """The file of each image, whatever links lead there, and its number in a batch; of lists and caches none."""
+    for name in images.names:
+        file, _, number = name.rpartition("[") if name.endswith("]") else (name, "", "")  # no scan's file ends so
+        if Path(file).is_file():
+            yield Path(file).resolve(), number

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lidarsynth.evaluation.protocol import EvaluationProtocol
-from lidarsynth.evaluation.statistics import GATHERED, Statistics, load_statistics
+from lidarsynth.evaluation.statistics import GATHERED, Statistics, load_metadata, load_statistics
 
 ENDING = ".safetensors"  # of a file of statistics
 NAMED = 8  # parts that lack, of a note
@@ -58,6 +59,23 @@ def merged(files: Sequence[Path], protocol: EvaluationProtocol) -> tuple[Statist
         more = f" and {len(lacking) - NAMED} more" if len(lacking) > NAMED else ""
         return total, (f"expected all parts of the images, found none of {', '.join(lacking[:NAMED])}{more}", *told)
     return total, told
+
+
+def notes_of(files: Sequence[str | Path]) -> tuple[str, ...]:
+    """What was unlike in the images that files of statistics were gathered of, as each keeps it; every note once.
+
+    Raises ValueError for what is no such file.
+    """
+    found: dict[str, None] = {}
+    for file in files:
+        try:
+            notes = json.loads(load_metadata(Path(file)).get("notes", "[]"))  # files of before keep none
+        except json.JSONDecodeError:
+            notes = None
+        if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+            raise ValueError(f"{file}: expected notes as a list of texts, found another thing")
+        found |= dict.fromkeys("".join(c if c.isprintable() else " " for c in note) for note in notes)
+    return tuple(found)
 
 
 def _by_other_rules(metadata: Mapping[str, str]) -> bool:

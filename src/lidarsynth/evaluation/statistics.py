@@ -324,14 +324,11 @@ def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> t
     Raises ValueError for another kind of file, another protocol or version, or a content that is not the one hashed.
     """
     try:
-        check_regular(path, LARGEST_WEIGHTS)
+        metadata = load_metadata(path)
         with safe_open(path, "pt") as file:
-            metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict
     except (OSError, SafetensorError) as error:
         raise ValueError(f"{path}: expected a file of statistics, found {error!s:.100}") from None
-    if metadata.get("format") != FORMAT:
-        raise ValueError(f"{path}: expected {FORMAT!r}, found {metadata.get('format')!r:.40}")
     protocol = protocol or get_protocol(metadata.get("protocol", ""))
     if metadata.get("definition") != definition(protocol):
         raise ValueError(f"{path}: expected statistics of {protocol.title} as defined here, found those of "
@@ -346,6 +343,19 @@ def load_statistics(path: Path, protocol: EvaluationProtocol | None = None) -> t
     except (KeyError, TypeError, RuntimeError) as error:  # made by other hands
         raise ValueError(f"{path}: expected the fields of {FORMAT!r}, found other ones: {error!s:.80}") from None
     return statistics, metadata
+
+
+def load_metadata(path: Path) -> dict[str, str]:
+    """What `save_statistics` wrote beside the numbers, which are not read. Raises ValueError for no such file."""
+    try:
+        check_regular(path, LARGEST_WEIGHTS)
+        with safe_open(path, "pt") as file:
+            metadata = dict(file.metadata() or {})
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"{path}: expected a file of statistics, found {error!s:.100}") from None
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected {FORMAT!r}, found {metadata.get('format')!r:.40}")
+    return metadata
 
 
 def definition(protocol: EvaluationProtocol) -> str:

@@ -157,13 +157,20 @@ def _square(confusion: np.ndarray) -> np.ndarray:
     return counts
 
 
+def _check_classes(without: tuple[int, ...], classes: int) -> None:
+    """Raises ValueError for a class that is none: -1, by which others mark pixels to ignore, would be the last one."""
+    if other := [number for number in without if not 0 <= number < classes]:
+        raise ValueError(f"expected classes 0-{classes - 1} to leave out, found {other[0]}")
+
+
 def class_iou(confusion: np.ndarray, without: tuple[int, ...] = ()) -> np.ndarray:
     """(C,) float64 intersection over union of each class, 0 for classes that do not occur.
 
     without  classes whose pixels do not count, in the truth or as predicted, as in the RangeNet repository's (0,)
-    Raises ValueError for what is no confusion matrix.
+    Raises ValueError for what is no confusion matrix, and for classes that it does not have.
     """
     counts = _square(confusion).astype(np.float64)
+    _check_classes(without, len(counts))
     counts[list(without)] = 0
     counts[:, list(without)] = 0
     hit = counts.diagonal()
@@ -171,8 +178,14 @@ def class_iou(confusion: np.ndarray, without: tuple[int, ...] = ()) -> np.ndarra
 
 
 def mean_iou(confusion: np.ndarray, without: tuple[int, ...] = (0,)) -> float:
-    """Mean of `class_iou` over the classes not in `without`, absent ones as 0 (RangeNet repository)."""
-    return float(np.delete(class_iou(confusion, without), list(without)).mean())
+    """Mean of `class_iou` over the classes not in `without`, absent ones as 0 (RangeNet repository).
+
+    Raises ValueError as `class_iou`, and where no class is left.
+    """
+    left = np.delete(class_iou(confusion, without), list(without))
+    if not len(left):
+        raise ValueError(f"expected at least one class to judge, found all {len(confusion)} left out")
+    return float(left.mean())
 
 
 def weighted_iou(confusion: np.ndarray) -> float:
@@ -186,6 +199,11 @@ def weighted_iou(confusion: np.ndarray) -> float:
 
 
 def accuracy(confusion: np.ndarray, without: tuple[int, ...] = (0,)) -> float:
-    """Share of the pixels predicted right, pixels of the classes `without` left out on both sides."""
-    left = np.delete(np.delete(_square(confusion), list(without), 0), list(without), 1)
+    """Share of the pixels predicted right, pixels of the classes `without` left out on both sides.
+
+    Raises ValueError as `class_iou`.
+    """
+    counts = _square(confusion)
+    _check_classes(without, len(counts))
+    left = np.delete(np.delete(counts, list(without), 0), list(without), 1)
     return float(left.trace() / max(left.sum(), 1))
