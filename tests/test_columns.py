@@ -55,7 +55,7 @@ def test_fewer_columns_leave_none_empty_and_lose_no_point():
 
 
 def read_coarsely(firings: int, count: float, beams: int = 24, gone: float = 0.0) -> tuple[Scan, Sensor]:
-    """A round room as a sensor of nobody's fires into it, azimuths cut to whole counts of an encoder, and that sensor."""
+    """A round room as a sensor fires into it whose azimuths are cut to whole counts of an encoder, and that sensor."""
     elevation = np.linspace(5, -20, beams)
     azimuth = np.floor(np.arange(firings) * 360 / firings / count) * count - 180 + count / 3
     ring, turn = np.repeat(np.arange(beams), firings), np.radians(np.tile(azimuth, beams))
