@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ RADAR = "radar_"
 # Of an Argoverse 2 log, in small letters: its other files of such endings, and what is in the name of its map's.
 TABLES = ("annotations.feather", "city_se3_egovehicle.feather", "egovehicle_se3_sensor.feather", "intrinsics.feather")
 HEIGHTS = "_ground_height_surface_"
+MACS, APPLE_DOUBLE = "._", b"\x00\x05\x16\x07"  # before the names, and the bytes, of what macOS keeps beside each file
 LOCK = ".#"  # before the names of links to nothing by which editors lock a file
 
 
@@ -107,7 +109,18 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
                 seen.add(real)
         folders[:] = kept
         own = cache_files(Path(here), files)
-        yield Path(here), folders, [name for name in files if name not in own]
+        yield Path(here), folders, [name for name in files if name not in own and not _macs(Path(here, name))]
+
+
+def _macs(path: Path) -> bool:
+    """Whether a file is what macOS keeps of another one (AppleDouble, RFC 1740): `._scan.pcd` beside `scan.pcd`."""
+    if not path.name.startswith(MACS):
+        return False
+    with suppress(OSError):
+        if path.is_file():
+            with path.open("rb") as file:
+                return file.read(len(APPLE_DOUBLE)) == APPLE_DOUBLE
+    return False
 
 
 def check_readable(folder: Path) -> None:
