@@ -190,7 +190,7 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
             values, high = np.minimum(values, limit), limit
     limit = SCALES[intensity]
     if low < 0 or high > limit:
-        way = f"; {WITHOUT}" if low < 0 else ""  # as of decibels
+        way = f"; {WITHOUT}" if low < 0 or high > SCALES["uint16"] else ""  # as of decibels, of raw counts
         raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}{way}")
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
 
