@@ -218,3 +218,17 @@ def test_scans_of_another_sensor_in_a_data_set_are_told_of(tmp_path: Path):
     assert line is not None and "0000000000.bin: expected points of hdl-64e, found" in line
     assert "2 of 2 scans that were looked at are so, and drawn all the same" in line
     assert unfit("nuscenes", tmp_path, None) is None and unfit("synthetic", tmp_path, None) is None
+
+
+@pytest.mark.parametrize("name", ["drive.pcap", "drive.bag", "drive"])
+def test_of_a_bag_or_capture_data_files_says_how_it_is_read(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+    """It said that a file, or nothing, was found; `evaluate` told what to do."""
+    (tmp_path / "in").mkdir()
+    if name == "drive":
+        (tmp_path / "in" / name).mkdir()
+        (tmp_path / "in" / name / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 9\n")
+    else:
+        (tmp_path / "in" / name).write_bytes(b"")
+    for root, found in ((tmp_path / "in" / name, "a bag or capture"), (tmp_path / "in", "bags or captures in it")):
+        error = refused(["data", "files", root, tmp_path / "cache"], capsys)
+        assert f": of {found} `lidarsynth project {root} --out IMAGES` makes images first" in error

@@ -55,6 +55,16 @@ def test_whole_and_thinned_scans_are_no_few_beams(name: str):
     assert placement(scan, sensor)[0] is None
 
 
+@pytest.mark.parametrize("kept", [slice(6, 15), slice(0, 16, 2)])
+def test_some_beams_of_a_named_sensor_are_no_other_sensors(kept: slice):
+    """Beams two degrees apart are on those of a Pandar64, too, which is recognised of some."""
+    scan = street("vlp-16")
+    some = scan[np.isin(scan.ring, np.arange(16)[kept])]
+    assert placement(some, get_sensor("vlp-16"))[0] is None
+    off = Sensor("own", tuple((np.array(SENSORS["vlp-16"].elevations) + 0.7).tolist()))
+    assert "found them on" in str(placement(some, off)[0])
+
+
 SAID = "points on many beams, found nearly all at {}: nothing tells what is above and below, so that the result is a"
 
 

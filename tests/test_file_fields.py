@@ -86,6 +86,8 @@ def test_single_intensities_above_a_scale_do_not_change_it():
         reflectance_from(np.append(values, np.float32(2)), "unit")
     with pytest.raises(FileError, match="found -30 to 0; --intensity none takes it for 0"):
         reflectance_from(np.linspace(-30, 0, 9, dtype=np.float32))
+    with pytest.raises(FileError, match="found 0 to 800000; --intensity none takes it for 0"):
+        reflectance_from(np.arange(9, dtype=np.uint32) * 100_000)
 
 
 def test_nuscenes_files_that_someone_scaled_stay_so(tmp_path: Path):

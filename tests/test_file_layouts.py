@@ -266,6 +266,20 @@ def test_argoverse_feather(scan: Scan, tmp_path: Path):
         read(tmp_path / "cut.feather")
 
 
+def test_what_lacks_in_a_feather_is_no_number_and_leaves_out_no_column(scan: Scan, tmp_path: Path):
+    feather = pytest.importorskip("pyarrow.feather", reason="pyarrow comes with the extra `data`")
+    pa = pytest.importorskip("pyarrow")
+    lost, light = np.arange(len(scan)) % 7 == 0, np.round(scan.reflectance * 255).astype(np.uint8)
+    gone = {axis: pa.array(scan.xyz[:, i], mask=lost) for i, axis in enumerate("xyz")}
+    more = {"intensity": pa.array(light, mask=lost), "flag": ~lost, "word": ["a"] * len(scan)}
+    feather.write_feather(pa.table(gone | more | {"ring": pa.array(scan.ring, mask=lost)}), str(tmp_path / "a.feather"))
+    found, dropped = read_with_report(tmp_path / "a.feather")
+    assert dropped == lost.sum() and set(found.extra) == {"flag"}
+    np.testing.assert_array_equal(found.xyz, scan.xyz[~lost])
+    np.testing.assert_array_equal(found.ring, scan.ring[~lost])
+    np.testing.assert_array_equal(found.reflectance, (light[~lost] / np.float64(255)).astype(np.float32))
+
+
 def test_fractions_in_a_column_of_whole_numbers_stay(tmp_path: Path):
     rows = [f"{x} 2 3 {light}" for x, light in ((1, 0.25), (2, 0.75), (3, 1))]
     pcd = "FIELDS x y z intensity\nSIZE 4 4 4 1\nTYPE F F F U\nWIDTH 3\nDATA ascii\n"

@@ -51,6 +51,16 @@ def test_links_to_folders_elsewhere_are_gone_through_once(folder: Path, capsys: 
     assert "scans 4 .ply" in said and "passed over 4 .pcap" in said
 
 
+def test_what_macos_keeps_beside_files_is_no_scan(tmp_path: Path):
+    """Each was a broken scan, and the first of its folder in what `info` tells of it."""
+    for name in ("1.ply", "._own.ply"):
+        write(tmp_path / name, full_scan())
+    for name in ("._1.ply", "._drive.pcap"):
+        (tmp_path / name).write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
+    assert [path.name for path in scan_files(tmp_path)] == ["._own.ply", "1.ply"]
+    assert streams_below(tmp_path) == []
+
+
 @contextmanager
 def nobody() -> Iterator[None]:
     """Without the rights of an administrator, whom no folder stops."""

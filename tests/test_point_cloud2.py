@@ -89,6 +89,7 @@ def test_rows_of_an_organised_cloud_become_rings():
     message = packed({k: v.astype("f4") for k, v in values.items()}, (0, 4, 8), 12, "<")
     message.height, message.width = 16, 90
     np.testing.assert_array_equal(decode(message)["ring"], np.repeat(np.arange(16), 90))
+    assert DATATYPE_OF[decode(message)["ring"].dtype.str[1:]] == 4, "uint16, as drivers have it: it is written back"
 
 
 def test_encoding_is_the_inverse():
@@ -127,6 +128,8 @@ def test_times_of_the_drivers_become_seconds():
         "time": np.array([0, 0.05, 0.1], np.float32),
         "timestamp": np.array([1.7e18, 1.7e18 + 5e7, 1.7e18 + 1e8]),  # Livox, nanoseconds since 1970
         "offset_time": np.array([0, 50_000_000, 100_000_000], np.uint32),
+        "time_stamp": np.array([0, 50_000_000, 100_000_000], np.uint32),  # Autoware's PointXYZIRCAEDT
+        "GpsTime": 3e8 + np.array([0, 0.05, 0.1]),  # PDAL
     }.items():
         scan, _ = scan_from_fields({**base, name: values})
         assert scan.time is not None

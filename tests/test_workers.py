@@ -13,6 +13,9 @@ import pytest
 
 from lidarsynth.cli.generate import FEW
 from lidarsynth.cli.main import main
+from lidarsynth.cli.terminal import answer
+from lidarsynth.data.bag_writer import write_bag
+from lidarsynth.data.windows import in_window
 from lidarsynth.files.formats import write
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.systems.cascade.layout import BY_COLUMNS, block
@@ -37,6 +40,30 @@ def test_early_ones_have_imported_it_and_answer_in_order(length: int, tmp_path: 
     done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=100)
     assert done.stderr == ""
     assert done.stdout == f"{[(length == 1, str(tmp_path), i) for i in range(5)]}\n"
+
+
+def gone(item: int) -> None:
+    os._exit(1)
+
+
+def at_work():
+    return gone
+
+
+def test_a_bag_whose_worker_is_gone_is_told_what_goes_on(tmp_path: Path, capsys: Caps):
+    """Bags take no --skip-existing, which was all that the line offered, behind words of the file's."""
+    pytest.importorskip("rosbags", reason="rosbags comes with the extra `ros`")
+
+    def verb():
+        with write_bag(tmp_path / "dense.bag"):
+            list(in_window(at_work, range(9), 2))
+
+    with pytest.raises(SystemExit, match="2"):
+        answer(verb)
+    said = capsys.readouterr().err
+    assert f"{tmp_path}/dense.bag: expected 2 worker processes to stay, found one gone" in said
+    assert "--workers 1 needs the least; into a folder the same command with --skip-existing goes on" in said
+    assert list(tmp_path.iterdir()) == []
 
 
 FORKED = """

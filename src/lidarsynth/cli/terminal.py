@@ -320,6 +320,8 @@ def _of_system(error: OSError) -> str:
     where = f"{error.filename}: " if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{where}expected room to write, found: {error.strerror}; make room and run the same command again"
+    if str(error.strerror).startswith("expected "):  # not the system's: that worker processes are gone
+        return f"{where}{error.strerror}"
     if error.filename:
         return f"{where}expected a file that can be used, found: {error.strerror}"
     return str(error) if error.errno is None else f"expected the system to go along, found: {error.strerror}"

@@ -6,11 +6,14 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
+from lidarsynth.data.bags import is_bag
 from lidarsynth.data.cache_files import cache_files, is_cache
+from lidarsynth.data.capture import is_capture
 from lidarsynth.data.frames import Frame, Frames
 from lidarsynth.files.fields import FileError
 from lidarsynth.files.formats import NAMED_ONLY, READERS
@@ -23,6 +26,7 @@ RADAR = "radar_"
 # Of an Argoverse 2 log, in small letters: its other files of such endings, and what is in the name of its map's.
 TABLES = ("annotations.feather", "city_se3_egovehicle.feather", "egovehicle_se3_sensor.feather", "intrinsics.feather")
 HEIGHTS = "_ground_height_surface_"
+MACS, APPLE_DOUBLE = "._", b"\x00\x05\x16\x07"  # before the names, and the bytes, of what macOS keeps beside each file
 LOCK = ".#"  # before the names of links to nothing by which editors lock a file
 
 
@@ -52,12 +56,14 @@ def scan_files(root: str | Path) -> list[Path]:
     without any."""
     root = Path(root)
     if not root.is_dir():
-        raise ValueError(f"{root}: expected a folder of scans, found {'a file' if root.exists() else 'nothing'}")
+        found = "a file" if root.exists() else "nothing"
+        raise ValueError(f"{root}: expected a folder of scans, found {found}{recorded(root)}")
     paths = scans_below(root)
     if not paths:
         listed = ", ".join(suffix for suffix in READERS if suffix not in NAMED_ONLY)
+        none = f"none{_named_only(root) or recorded(root)}"
         raise ValueError(f"{root}: expected scans ({listed}; {' and '.join(NAMED_ONLY)} by name), found "
-                         f"{'a cache of range images' if is_cache(root) else 'none' + _named_only(root)}")  # fmt: skip
+                         f"{'a cache of range images' if is_cache(root) else none}")  # fmt: skip
     return paths
 
 
@@ -72,6 +78,22 @@ def _named_only(root: Path) -> str:
         f" but {plural(len(tables), 'file')} of text: where they are scans, name them, as '{pattern}'; for a cache "
         f"`lidarsynth project '{pattern}' --out IMAGES` makes images first, which data files takes"
     )
+
+
+def recorded(root: Path) -> str:
+    """What is to be said of a bag or capture, or of those in a folder without scans: how they are read, or nothing."""
+    if not (root.exists() and (_is_stream(root) or (root.is_dir() and _holds_streams(root)))):
+        return ""
+    what = "bags or captures in it" if root.is_dir() and not is_bag(root) else "a bag or capture"
+    return f": of {what} `lidarsynth project {root} --out IMAGES` makes images first, which data files takes"
+
+
+def _is_stream(path: Path) -> bool:
+    return is_bag(path) or is_capture(path)
+
+
+def _holds_streams(root: Path) -> bool:
+    return any(_is_stream(here / name) for here, folders, files in walk(root) for name in (*folders, *files))
 
 
 def scans_below(root: Path, more: tuple[str, ...] = ()) -> list[Path]:
@@ -107,7 +129,18 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
                 seen.add(real)
         folders[:] = kept
         own = cache_files(Path(here), files)
-        yield Path(here), folders, [name for name in files if name not in own]
+        yield Path(here), folders, [name for name in files if name not in own and not _macs(Path(here, name))]
+
+
+def _macs(path: Path) -> bool:
+    """Whether a file is what macOS keeps of another one (AppleDouble, RFC 1740): `._scan.pcd` beside `scan.pcd`."""
+    if not path.name.startswith(MACS):
+        return False
+    with suppress(OSError):
+        if path.is_file():
+            with path.open("rb") as file:
+                return file.read(len(APPLE_DOUBLE)) == APPLE_DOUBLE
+    return False
 
 
 def check_readable(folder: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarsynth.data.cache import shown, write_cache
 from lidarsynth.data.folder import folder as scan_folder
-from lidarsynth.data.folder import scan_files
+from lidarsynth.data.folder import recorded, scan_files
 from lidarsynth.data.frames import Frames, Reader, choose, stamped
 from lidarsynth.data.index import INDEX, REPORT, read_index, report
 from lidarsynth.data.kitti import kitti, kitti_published
@@ -157,7 +157,8 @@ def cache_source(
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
     if not Path(root).is_dir():
-        raise ValueError(f"{root}: expected a folder of scans, found {'a file' if Path(root).exists() else 'nothing'}")
+        found = "a file" if Path(root).exists() else "nothing"
+        raise ValueError(f"{root}: expected a folder of scans, found {found}{recorded(Path(root))}")
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
     reader = _reader(name, Path(root), split, intensity, transform, rings)

@@ -10,6 +10,8 @@ from typing import Any
 
 from lidarsynth.data.workers import keep_memory, pool_of, watch_parent
 
+# A bag appears whole or not at all, and is begun anew.
+GOES_ON = "--workers 1 needs the least; into a folder the same command with --skip-existing goes on"
 _work: list[Callable[[Any], Any]] = []  # of this worker process
 
 
@@ -26,7 +28,7 @@ def in_window(
         yield from map(work, items)
         return
     waiting: deque[Future] = deque()
-    with pool_of(workers, _start, make, "the same command with --skip-existing goes on") as submit:
+    with pool_of(workers, _start, make, GOES_ON) as submit:
         for item in items:
             waiting.append(submit(_do, item))
             if len(waiting) > 2 * workers:

@@ -9,7 +9,8 @@ from lidarsynth.files.fields import MAX_POINTS, Fields, FileError, check_names
 
 def read_feather(data: bytes) -> Fields:
     """The numeric columns under their own names: x y z (float16, metres, vehicle frame), intensity 0-255, laser_number
-    0-63 (two stacked VLP-32C), offset_ns. Raises FileError for anything pyarrow cannot read."""
+    0-63 (two stacked VLP-32C), offset_ns; NaN where a number lacks. Raises FileError for anything pyarrow cannot
+    read."""
     try:
         import pyarrow
         from pyarrow import ipc
@@ -23,10 +24,9 @@ def read_feather(data: bytes) -> Fields:
         if table.num_rows > MAX_POINTS:
             raise FileError(f"expected at most {MAX_POINTS} points of one turn, found {table.num_rows}")
         check_names(table.column_names)
-        numeric = [name for name in table.column_names if table[name].null_count == 0]
-        arrays = {name: table[name].to_numpy() for name in numeric}
+        arrays = {name: table[name].to_numpy() for name in table.column_names}  # numbers that lack are NaN
     except (pyarrow.ArrowException, ValueError, OSError, MemoryError) as error:
         if isinstance(error, FileError):
             raise
         raise FileError(f"expected a feather table, found: {(str(error).splitlines() or [''])[0][:120]}") from None
-    return {name: array for name, array in arrays.items() if array.dtype.kind in "fiu"}
+    return {name: array for name, array in arrays.items() if array.dtype.kind in "biuf"}

@@ -31,9 +31,10 @@ NAMES: dict[str, tuple[str, ...]] = {  # ours -> the usual ones, also behind SCA
     "z": ("z", "points:2", "points_m_xyz:2"),
     "reflectance": ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i"),
     "ring": ("ring", "channel", "line", "laser", "laser_number", "laser_id"),
-    "time": ("time", "timestamp", "t", "offset_time", "offset_ns", "time_offset", "gps_time", "timestamps"),
+    "time": ("time", "timestamp", "t", "offset_time", "offset_ns", "time_offset", "gps_time", "timestamps",
+             "time_stamp", "gpstime"),  # as of Autoware, of PDAL
     "label": ("label", "class"),
-}
+}  # fmt: skip
 SCALAR = "scalar_"  # before the names of fields, as CloudCompare writes them
 
 SCALES: dict[str, float] = {"unit": 1.0, "byte": 255.0, "uint16": 65535.0}  # intensity -> the value of reflectance 1
@@ -189,7 +190,7 @@ def reflectance_from(values: np.ndarray, intensity: str = "auto") -> np.ndarray:
             values, high = np.minimum(values, limit), limit
     limit = SCALES[intensity]
     if low < 0 or high > limit:
-        way = f"; {WITHOUT}" if low < 0 else ""  # as of decibels
+        way = f"; {WITHOUT}" if low < 0 or high > SCALES["uint16"] else ""  # as of decibels, of raw counts
         raise FileError(f"expected an intensity of 0-{limit:.0f} ({intensity}), found {low:.6g} to {high:.6g}{way}")
     return (values if limit == 1 else values / np.float64(limit)).astype(np.float32)
 

@@ -58,7 +58,7 @@ def decode(message: PointCloud2) -> Fields:
               for name in table.dtype.names or ()}  # fmt: skip
     shape = (int(message.height), int(message.width))
     if shape[0] > 1 and (ring := rings_of_grid(fields, shape)) is not None:
-        fields["ring"] = ring
+        fields["ring"] = ring.astype(np.uint16)  # a type of messages; there are 256 at most
     return fields
 
 

@@ -98,7 +98,8 @@ def learn_sensor(scans: Iterable[Scan], name: str) -> LearnedSensor:
         points, rings, row_of = _fitted(kept, guessed)
     steps, depths, grounds, below, above = [], [], [], [], 0
     for scan, ring in kept:
-        steps.append(step_and_whether(scan.xyz, ring))
+        inner = _inner(ring) if guessed else slice(None)
+        steps.append(step_and_whether(scan.xyz[inner], ring[inner]))
         depth = np.linalg.norm(scan.xyz, axis=1)
         depths.append((depth.min(), depth.max()))
         if (found := lowest_plane(scan.xyz)) is not None:
@@ -171,6 +172,13 @@ def _standing(
 def _guessed(scan: Scan) -> bool:
     """Whether nothing but elevations tells the scan's rings."""
     return scan.ring is None and rings_in_order(scan.xyz) is None
+
+
+def _inner(ring: np.ndarray) -> np.ndarray | slice:
+    """The points on rings (N,) other than the first and last, to which guessed ones have whatever lies beyond: steps
+    from one beam's points to another's are no columns. All, where most lie on those two."""
+    inner = (ring > 0) & (ring < ring.max())
+    return inner if 2 * inner.sum() > len(ring) else slice(None)
 
 
 def _beyond(scans: list[Scan], elevations: tuple[float, ...]) -> float:

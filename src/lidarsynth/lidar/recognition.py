@@ -79,8 +79,16 @@ def _ground_below(xyz: np.ndarray) -> bool:
 
 
 def lies_on(scan: Scan, sensor: Sensor) -> bool:
-    """Whether a scan's points lie on a sensor's beams, as `recognise` would have it of a known one."""
-    return recognise(scan, among={sensor.name: sensor})[0] is not None
+    """Whether a scan's points lie on a sensor's beams, as `recognise` would have it of a known one, or its rings on
+    some of them, however few the sensor has."""
+    if recognise(scan, among={sensor.name: sensor})[0] is not None:
+        return True
+    ring = scan.ring if scan.ring is not None else rings_in_order(scan.xyz)
+    if ring is None or not len(ring):
+        return False
+    _, beams = beams_of(scan.xyz, ring)
+    error = _off_beams(beams, sensor) if 2 < len(beams) <= sensor.height > 1 else None
+    return error is not None and error < _nearness(len(beams))
 
 
 def same_kind(name: str, other: str) -> bool:
