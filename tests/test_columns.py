@@ -91,6 +91,28 @@ def test_more_firings_than_columns_push_none_around_the_turn(columns: int):
     np.testing.assert_array_equal(column, pixel_of_points(scan, replace(sensor, width=columns, name="hdl-64e"))[1])
 
 
+@pytest.mark.parametrize(("firings", "returns"), [(2149, 1), (2170, 1), (2170, 2)])
+def test_of_somewhat_more_firings_than_columns_as_of_a_car_that_turns_few_share_one(firings: int, returns: int):
+    scan, sensor = read_coarsely(firings, 0.09)
+    scan, sensor = scan[np.repeat(np.arange(len(scan)), returns)], replace(sensor, width=2149)
+    row, column = pixel_of_points(scan, sensor)
+    even = pixel_of_points(scan, replace(sensor, name="hdl-64e"))[1]
+    assert set(column - even) == {0, 1}
+    assert len(np.unique(row * 2149 + column)) > 0.98 * len(scan) / returns > len(np.unique(row * 2149 + even))
+
+
+def test_a_scan_and_what_was_filled_in_are_drawn_as_the_image_that_was_filled_in():
+    scan, sensor = read_coarsely(2170, 0.09, gone=0.05)
+    image = project(scan, replace(sensor, width=2149))
+    new = ~image.mask & (np.random.default_rng(4).random(image.shape) < 0.7)
+    filled = replace(image, range=np.where(new, np.float32(10), 0), mask=new, xyz=None).to_scan()
+    assert new.sum() > 1000
+    assert scan.ring is not None and filled.ring is not None
+    ring = np.concatenate([scan.ring, filled.ring])
+    both = Scan(np.concatenate([scan.xyz, filled.xyz]), np.full(len(ring), 0.5, np.float32), ring=ring)
+    np.testing.assert_array_equal(project(both, image.sensor).mask, image.mask | new)
+
+
 def test_points_that_tell_no_columns_leave_the_table_as_it_is():
     sensor, rng = SENSORS["os1-64"], np.random.default_rng(1)
     scan = turn(sensor, 2048)

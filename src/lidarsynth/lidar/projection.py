@@ -282,8 +282,9 @@ def _turns(xyz: np.ndarray) -> np.ndarray:
 
 
 def columns_one_by_one(xyz: np.ndarray, row: np.ndarray, width: int) -> np.ndarray:
-    """(N,) columns of points (N, 3) of rows (N,), where one whose column an earlier firing of its row has taken is in
-    the next, and so on where one is free SOON; but for points of more firings than columns, of which many share one.
+    """(N,) columns of points (N, 3) of rows (N,), where of two firings in one column the second is in the next, and so
+    are those after it up to a column that is free, if SOON at most; but for points of more firings than columns, of
+    which many share one.
 
     KITTI's sensor fires every 0.168 degrees and reads its azimuth in 0.09: of its 2,149 columns 6 % would be empty for
     that, and as many points hidden by others.
@@ -292,18 +293,19 @@ def columns_one_by_one(xyz: np.ndarray, row: np.ndarray, width: int) -> np.ndarr
     column = np.minimum((turn * width).astype(np.intp), width - 1)
     order = np.argsort(row + turn.astype(np.float64))
     row, place, first = row[order], turn[order] * width, column[order]
-    begins = np.diff(row, prepend=-2) != 0
-    fires = begins | (np.diff(place, prepend=-width) > ONE_FIRING)
-    shared = fires[1:] & ~begins[1:] & (np.diff(first) == 0)
-    if not shared.any() or shared.mean() > MANY:
+    begins, step = np.diff(row, prepend=-2) != 0, np.diff(first, prepend=-1)
+    fires = np.diff(place, prepend=-width) > ONE_FIRING
+    shares = fires & ~begins & (step == 0)
+    if not shares.any() or shares.mean() > MANY:
         return column
-    firing = np.cumsum(fires)
-    away = row * (2 * (width + len(row)))  # rows apart, so that none pushes the next
-    taken = np.maximum.accumulate(first - firing + away) + firing - away
-    moved = taken > first
-    stretch = np.cumsum(np.diff(moved, prepend=False))
-    moved &= (np.bincount(stretch) <= SOON)[stretch] & (taken < width)
-    column[order] = np.where(moved, taken, first)
+    # Stretches in which each firing has the next column, from one that shares its own; after it comes a column that is
+    # free, or another that is shared, for which nobody is to move: the last of them alone is as good.
+    start = np.flatnonzero(shares | begins | (step > fires))
+    end = np.append(start[1:], len(first)) - 1
+    free = np.append(~shares[start[1:]], True) & (first[end] + 1 < width)
+    fired = np.cumsum(fires)
+    moves = shares[start] & free & (fired[end] - fired[start] < SOON)
+    column[order] = first + np.repeat(moves, end + 1 - start)
     return column
 
 
