@@ -451,6 +451,21 @@ def untold(folder: Path) -> None:
     (folder / "index.json").write_text(json.dumps(index))
 
 
+def test_no_cache_of_a_sensor_of_ones_own_mixes_images_with_those_of_before_each_firing_had_a_column(tmp_path: Path):
+    (tmp_path / "scans").mkdir()
+    write(tmp_path / "scans" / "a.npz", image(0))
+    list(cache_source("files", str(tmp_path / "scans"), tmp_path / "own", sensor=SENSOR))
+    index = read_index(tmp_path / "own")
+    assert SENSOR.name not in SENSORS and index["source"].pop("firings")
+    (tmp_path / "own" / "index.json").write_text(json.dumps(index))
+    with pytest.raises(
+        ValueError, match=r"expected a cache of source \{firings .*\}, found one of \{firings None\}; name"
+    ):
+        list(cache_source("files", str(tmp_path / "scans"), tmp_path / "own", sensor=SENSOR))
+    list(cache_source("files", str(tmp_path / "scans"), tmp_path / "known", sensor="vlp-16"))
+    assert "firings" not in read_index(tmp_path / "known")["source"], "images of known sensors are as they were"
+
+
 def test_no_cache_mixes_two_editions_of_the_streets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("embreex")
     list(cache_synthetic(tmp_path / "new", 1, width=64, seed=3))

@@ -69,6 +69,7 @@ SOURCES: dict[str, Source] = {  # images as in R2DM, section IV-A, where it uses
 
 CHECKED = 8  # scans from everywhere, whether they are in their sensor's frame: 0.3 s
 LOOKED_AT = 16  # scans from everywhere, whether all are of one sensor
+FIRINGS = {"firings": "one a column"}  # of caches of a sensor of one's own since 2026-12-01: none mixes both drawings
 SYNTHETIC = "hdl-64e-kitti"  # the sensor of synthetic streets, unless said otherwise
 
 
@@ -170,6 +171,7 @@ def cache_source(
     source |= {} if intensity == "auto" else {"intensity": intensity}
     source |= {} if transform is None else {"transform": np.asarray(transform).tolist()}
     source |= {} if rings is None else {"rings": list(rings)}
+    source |= {} if spec.name in WORDS else FIRINGS
     source |= {"root": str(Path(root).resolve()), "missing": list(reader.missing)}
     stamp = partial(stamped, reader.frames) if isinstance(reader, Frames | NuScenes) else None
     for done in write_cache(folder, image, len(reader), spec, source, reader.name, _processes(workers), check, stamp):
