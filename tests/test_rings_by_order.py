@@ -74,6 +74,20 @@ def test_rings_of_scans_put_straight_for_motion_stay_those_of_the_file(shared: P
         assert np.array_equal(row, ring)
 
 
+@pytest.mark.parametrize("nod", [0.0, 1.5])
+@pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "hdl-64e-kitti"])
+def test_rings_may_come_from_the_lowest_upwards(name: str, nod: float):
+    """As drivers number them; of a scan that lies on no beams any more the image was upside down."""
+    sensor = ls.get_sensor(name)
+    scan, ring = by_rings(sensor, 0.0, 1)
+    upwards, s, c = np.argsort(-ring, kind="stable"), np.sin(np.radians(nod)), np.cos(np.radians(nod))
+    turned = scan.xyz @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]], np.float32)
+    row, _ = pixel_of_points(ls.Scan(turned[upwards], scan.reflectance), sensor)
+    assert np.mean(row == ring[upwards]) > 0.998
+    row, _ = pixel_of_points(ls.Scan(turned, scan.reflectance), sensor)
+    assert np.mean(row == ring) > 0.998
+
+
 @pytest.mark.parametrize("name", ["vlp-16", "hdl-32e", "hdl-64e-kitti"])
 @pytest.mark.parametrize(
     ("kept", "first"), [(slice(None), 1), (slice(None), 100), (slice(None, -1), 0), (slice(1, None), -1),

@@ -14,6 +14,7 @@ RESIZINGS = ("nearest-exact", "nearest")
 # Rows by the order of points are wrong where more than this share of at most so many points lies on other beams, and
 # points lie on beams, within this share of the usual spacing; those of scans put straight for motion do not.
 OTHERS, SOME, ON_BEAM = 0.1, 10_000, 0.08
+AGAINST = -0.5  # correlation of rows and elevations below which the order is from the lowest ring upwards
 ONE_FIRING, MANY, SOON = 0.4, 0.2, 16  # columns between points of one firing at most; share of the points; firings
 
 
@@ -154,7 +155,20 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     # many goes into the last row, and those before it into the first, as in the published program.
     row = np.where(ring < 0, 0, ring + (sensor.height - count))
     row = np.where(row == -1, sensor.height - 1, np.maximum(row, 0))
+    if method == "auto" and _from_below(scan.xyz, row, sensor):
+        row = sensor.height - 1 - row
     return _rows_by_elevation(scan.xyz, sensor) if method == "auto" and _elsewhere(scan.xyz, row, sensor) else row
+
+
+def _from_below(xyz: np.ndarray, row: np.ndarray, sensor: Sensor) -> bool:
+    """Whether rows (N,), counted by the order of the file, run against the elevations of its points (N, 3): its lowest
+    ring comes first."""
+    part = slice(None, None, max(1, len(row) // SOME))
+    beam = _rows_by_elevation(xyz[part], sensor)
+    if not (seen := beam >= 0).any():
+        return False
+    a, b = (rows[seen] - rows[seen].mean() for rows in (beam, row[part]))
+    return bool((a * b).sum() < AGAINST * np.sqrt((a * a).sum() * (b * b).sum()))
 
 
 def _elsewhere(xyz: np.ndarray, row: np.ndarray, sensor: Sensor) -> bool:
