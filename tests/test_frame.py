@@ -285,6 +285,15 @@ def test_a_turn_by_90_degrees_is_only_a_hint():
     assert frame.faults == () and "as if turned by 90 degrees" in str(frame.warning())
 
 
+@pytest.mark.parametrize("view", [(30, 150), (-150, -30), (-135, 135)])
+def test_what_looks_to_a_side_of_the_road_is_not_taken_for_turned(view: tuple[int, int]):
+    streets = SyntheticStreets(0, 128, SENSORS["os1-64"])
+    for number in range(0, 128, 16):
+        scan = streets[number]
+        azimuth = np.degrees(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]))
+        assert check_frame(scan[(azimuth > view[0]) & (azimuth < view[1])]).hints == ()
+
+
 def test_cones_have_their_axis_height_and_elevations():
     sensor = SENSORS["pandar64"]
     scan = street(sensor.name)

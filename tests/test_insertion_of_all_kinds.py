@@ -166,6 +166,14 @@ def test_boxes_are_those_of_the_file_that_they_lie_beside(place: Path, ending: s
     assert (box.centre[0] > 5) == (ending == "npz"), "an image is in its sensor's frame"
 
 
+def test_an_image_of_a_scan_with_a_label_file_has_the_classes_of_all_its_points(place: Path):
+    write("a.bin", flat_scan())
+    main(["insert", "a.bin", "--add", "car@10/3/20", "--out", "b.npz", *WORDS])
+    found = read("b.npz")
+    assert found.label is not None and set(np.unique(own_of(found).label)) == {CLASS_NUMBER["car"]}
+    assert set(np.unique(own_of(found, 0).label)) == {ROAD}
+
+
 def test_beside_points_that_stand_level_boxes_of_a_tilted_sensor_do_so(place: Path, capsys: pytest.CaptureFixture[str]):
     tilted = replace(FLAT, tilt=(18.0, -20.0))
     level = sensor_pose(tilted, np.zeros(6))

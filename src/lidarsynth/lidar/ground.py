@@ -293,13 +293,15 @@ def road_axis(xyz: np.ndarray) -> float:
     """-1 to 1: how much farther the ground is seen along x (road ahead) than along y; about 0 where neither is.
 
     The mean of cos(2 azimuth) over 72 sectors, each by the farthest ground point in it, up to 50 m; 0 where fewer than
-    a third of them have any.
+    a third of them have any. Of a sensor that looks to a side, less what the sectors with any point have alike.
     """
     below, _ = levels(xyz)
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
     ground = (np.abs(xyz[:, 2] - below.height) < 0.35 + 0.02 * rho) & (rho > 5)
-    sector = ((np.arctan2(xyz[ground, 1], xyz[ground, 0]) / np.pi + 1) * 36).astype(int) % 72
-    far = np.zeros(72)
-    np.maximum.at(far, sector, np.minimum(rho[ground], 50))
-    angle = (np.arange(72) + 0.5) / 36 * np.pi - np.pi
-    return float((far * np.cos(2 * angle)).sum() / far.sum()) if np.count_nonzero(far) >= 24 else 0.0
+    sector = ((np.arctan2(xyz[:, 1], xyz[:, 0]) / np.pi + 1) * 36).astype(int) % 72
+    far, seen = np.zeros(72), np.bincount(sector, minlength=72) > 0
+    np.maximum.at(far, sector[ground], np.minimum(rho[ground], 50))
+    if np.count_nonzero(far) < 24:
+        return 0.0
+    ahead = np.cos(2 * ((np.arange(72) + 0.5) / 36 * np.pi - np.pi))
+    return float((far * ahead).sum() / far.sum() - min(ahead[seen].mean(), 0))

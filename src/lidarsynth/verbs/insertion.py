@@ -16,6 +16,7 @@ from lidarsynth.lidar.boxes import Box
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import project
+from lidarsynth.lidar.removal import own_classes
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.lidar.small_file import LARGEST_INDEX, read_json
@@ -36,7 +37,7 @@ def insert_scan(model: ScanModel, scan: Scan, things: Sequence[Wanted], sensor: 
     from lidarsynth.systems.insertion import INSTANCE, inserted
 
     found = inserted(model.suited_to(scan, sensor), scan, things, np.random.default_rng(seed))
-    image = project(found.scan, sensor)
+    image = project(replace(found.scan, label=own_classes(found.scan)), sensor)
     number = project(replace(found.scan, label=found.scan.extra[INSTANCE]), sensor).label
     image = replace(image, completed=found.scan, instance=number, boxes=found.boxes)
     return Filled(image, lambda: {"measured": project(scan, sensor), "inserted": image}, {}, scan)
