@@ -382,3 +382,19 @@ def test_what_names_insides_alone_starts_as_what_tells_them_from_streets():
     assert_close(both.state_dict()["inside.stem.weight"], first["inside.stem.weight"])
     assert_close(both.state_dict()["indoors.stem.weight"], first["indoors.stem.weight"])
     assert_close(alone.state_dict()["inside.stem.weight"], first["indoors.stem.weight"])
+
+
+def test_a_fill_for_the_least_error_of_other_blocks_does_not_start_from_nothing_unsaid():
+    source = with_fields(TINY, {"model.likeliest": True, "model.likeliest_blocks": (1, 1, 1, 2)})
+    other = with_fields(source, {"model.likeliest_blocks": (1, 1, 1, 1)})
+    none = with_fields(TINY, {"model.likeliest": False})
+    weights, same = build_network(source), build_network(source)
+    transfer(same, source, weights, source, "weights")
+    learned = {name: value for name, value in weights.state_dict().items() if name.startswith("likeliest.down")}
+    assert learned and all(torch.equal(same.state_dict()[name], value) for name, value in learned.items())
+    transfer(build_network(none), none, weights, source, "weights")
+    found = (
+        r"weights: expected .* model.likeliest_blocks \[1, 1, 1, 1\], found \[1, 1, 1, 2\]: .*=\[1, 1, 1, 2\]' goes on"
+    )
+    with pytest.raises(ValueError, match=found):
+        transfer(build_network(other), other, weights, source, "weights")

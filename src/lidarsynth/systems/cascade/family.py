@@ -95,6 +95,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
 
     A fill for the least error, where the weights have none of its own, starts as their only one; so does an observer
     that is as wide. What names insides, where it has to say by itself which scans are of such, starts as what says so.
+    Raises ValueError where their fill for the least error has other blocks: what it learned would be lost.
     """
     assert isinstance(network, Cascade) and isinstance(weights, Cascade)
     for part in ("coarse", "fill", "guide", "columns", "between", "beams", "classes", "judge", "inside", "drawn",
@@ -104,6 +105,11 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
             start = weights.indoors  # the other has seen no streets
         if getattr(network, part) is not None and start is not None:
             load_weights(getattr(network, part), start.state_dict(), name)
+    own, known = experiment.model.likeliest_blocks, source.model.likeliest_blocks
+    if network.likeliest is not None and weights.likeliest is not None and own != known:
+        raise ValueError(f"{name}: expected a fill for the least error of model.likeliest_blocks {list(own)}, found "
+                         f"{list(known)}: --set 'model.likeliest_blocks={list(known)}' goes on with it"
+                         )  # fmt: skip
     _start(network.likeliest, (weights.surest,), name)
     _start(network.observer, (weights.observer, weights.fill), name)
 
