@@ -55,13 +55,11 @@ def scan_files(root: str | Path) -> list[Path]:
     """The scan files under a folder, sorted, but those of BESIDE, radars, other tables and caches. Raises ValueError
     without any."""
     root = Path(root)
-    if not root.is_dir():
-        found = "a file" if root.exists() else "nothing"
-        raise ValueError(f"{root}: expected a folder of scans, found {found}{recorded(root)}")
+    check_folder(root)
     paths = scans_below(root)
     if not paths:
         listed = ", ".join(suffix for suffix in READERS if suffix not in NAMED_ONLY)
-        none = f"none{_named_only(root) or recorded(root)}"
+        none = f"none{_named_only(root) or _recorded(root)}"
         raise ValueError(f"{root}: expected scans ({listed}; {' and '.join(NAMED_ONLY)} by name), found "
                          f"{'a cache of range images' if is_cache(root) else none}")  # fmt: skip
     return paths
@@ -80,7 +78,14 @@ def _named_only(root: Path) -> str:
     )
 
 
-def recorded(root: Path) -> str:
+def check_folder(root: Path) -> None:
+    """Raises ValueError for what is no folder, and says how a bag or capture is read."""
+    if not root.is_dir():
+        found = "a file" if root.exists() else "nothing"
+        raise ValueError(f"{root}: expected a folder of scans, found {found}{_recorded(root)}")
+
+
+def _recorded(root: Path) -> str:
     """What is to be said of a bag or capture, or of those in a folder without scans: how they are read, or nothing."""
     if not (root.exists() and (_is_stream(root) or (root.is_dir() and _holds_streams(root)))):
         return ""

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from lidarsynth.data.cache import shown, write_cache
+from lidarsynth.data.folder import check_folder, scan_files
 from lidarsynth.data.folder import folder as scan_folder
-from lidarsynth.data.folder import recorded, scan_files
 from lidarsynth.data.frames import Frames, Reader, choose, stamped
 from lidarsynth.data.index import INDEX, REPORT, read_index, report
 from lidarsynth.data.kitti import kitti, kitti_published
@@ -157,9 +157,7 @@ def cache_source(
     split, projection = split or own.split, projection or own.projection
     if projection not in PROJECTIONS:
         raise ValueError(f"expected a projection of {', '.join(PROJECTIONS)}, found {projection!r}")
-    if not Path(root).is_dir():
-        found = "a file" if Path(root).exists() else "nothing"
-        raise ValueError(f"{root}: expected a folder of scans, found {found}{recorded(Path(root))}")
+    check_folder(Path(root))
     if Path(root).resolve() == Path(folder).resolve():
         raise ValueError(f"{folder}: expected a folder for the cache other than that of the scans, found the same")
     reader = _reader(name, Path(root), split, intensity, transform, rings)

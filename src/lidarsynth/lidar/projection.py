@@ -155,35 +155,34 @@ def row_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> np.ndarra
     # many goes into the last row, and those before it into the first, as in the published program.
     row = np.where(ring < 0, 0, ring + (sensor.height - count))
     row = np.where(row == -1, sensor.height - 1, np.maximum(row, 0))
-    if method == "auto" and _from_below(scan.xyz, row, sensor):
-        row = sensor.height - 1 - row
-    return _rows_by_elevation(scan.xyz, sensor) if method == "auto" and _elsewhere(scan.xyz, row, sensor) else row
-
-
-def _from_below(xyz: np.ndarray, row: np.ndarray, sensor: Sensor) -> bool:
-    """Whether rows (N,), counted by the order of the file, run against the elevations of its points (N, 3): its lowest
-    ring comes first."""
+    if method != "auto":
+        return row
     part = slice(None, None, max(1, len(row) // SOME))
-    beam = _rows_by_elevation(xyz[part], sensor)
+    beam = _rows_by_elevation(scan.xyz[part], sensor)
+    row = sensor.height - 1 - row if _from_below(row[part], beam) else row
+    return _rows_by_elevation(scan.xyz, sensor) if _elsewhere(scan.xyz[part], row[part], beam, sensor) else row
+
+
+def _from_below(row: np.ndarray, beam: np.ndarray) -> bool:
+    """Whether rows (N,), counted by the order of the file, run against the beams (N,) on which its points lie, -1 on
+    none: its lowest ring comes first."""
     if not (seen := beam >= 0).any():
         return False
-    a, b = (rows[seen] - rows[seen].mean() for rows in (beam, row[part]))
+    a, b = (rows[seen] - rows[seen].mean() for rows in (beam, row))
     return bool((a * b).sum() < AGAINST * np.sqrt((a * a).sum() * (b * b).sum()))
 
 
-def _elsewhere(xyz: np.ndarray, row: np.ndarray, sensor: Sensor) -> bool:
-    """Whether points (N, 3) lie on the sensor's beams, but many not on that of their row (N,), counted by the order of
-    the file: it began elsewhere in the turn than KITTI's, or its last point is already of the next turn."""
-    part = slice(None, None, max(1, len(row) // SOME))
-    x, y, z = np.ascontiguousarray(xyz[part].T)
-    beam = _rows_by_elevation(xyz[part], sensor)
+def _elsewhere(xyz: np.ndarray, row: np.ndarray, beam: np.ndarray, sensor: Sensor) -> bool:
+    """Whether points (N, 3) lie on the sensor's beams (N,), -1 on none, but many not on that of their row (N,), counted
+    by the order of the file: it began elsewhere in the turn than KITTI's, or its last point is already of the next."""
+    x, y, z = np.ascontiguousarray(xyz.T)
     seen = beam >= 0
     if sensor.height < 2 or not seen.any():
         return False
     elevations, lift = np.array(sensor.elevations), np.asarray(sensor.offsets or [0.0] * sensor.height)
     off = np.abs(np.degrees(np.arctan2(z - lift[beam], _length(x, y))) - elevations[beam])[seen]
     spacing = np.median(np.abs(np.diff(elevations)))
-    return bool(np.mean((beam != row[part])[seen]) > OTHERS and np.median(off) < ON_BEAM * spacing)
+    return bool(np.mean((beam != row)[seen]) > OTHERS and np.median(off) < ON_BEAM * spacing)
 
 
 def check_from_top(ring: np.ndarray, xyz: np.ndarray) -> None:
@@ -212,8 +211,9 @@ def pixel_of_points(scan: Scan, sensor: Sensor, method: str = "auto") -> Pixels:
     also where azimuths that are read coarsely would leave another empty.
     """
     row = row_of_points(scan, sensor, method)
-    columns = _columns if sensor.name in WORDS else columns_one_by_one
-    return row, columns(scan.xyz, row, sensor.width)
+    if sensor.name in WORDS:
+        return row, _columns(_turns(scan.xyz), sensor.width)
+    return row, columns_one_by_one(scan.xyz, row, sensor.width)
 
 
 def is_even_grid(sensor: Sensor) -> bool:
@@ -283,8 +283,8 @@ def _rows_of_even_grid(xyz: np.ndarray, sensor: Sensor) -> np.ndarray:
     return np.clip(np.floor(row), 0, height - 1).astype(np.intp)
 
 
-def _columns(xyz: np.ndarray, row: np.ndarray, width: int) -> np.ndarray:
-    return np.minimum((_turns(xyz) * width).astype(np.intp), width - 1)
+def _columns(turn: np.ndarray, width: int) -> np.ndarray:
+    return np.minimum((turn * width).astype(np.intp), width - 1)
 
 
 def _turns(xyz: np.ndarray) -> np.ndarray:
@@ -296,15 +296,15 @@ def _turns(xyz: np.ndarray) -> np.ndarray:
 
 
 def columns_one_by_one(xyz: np.ndarray, row: np.ndarray, width: int) -> np.ndarray:
-    """(N,) columns of points (N, 3) of rows (N,), where of two firings in one column the second is in the next, and so
-    are those after it up to a column that is free, if SOON at most; but for points of more firings than columns, of
-    which many share one.
+    """(N,) int64 columns of points (N, 3) of rows (N,), where of two firings in one column the second is in the next,
+    and so are those after it up to a column that is free, if SOON at most; but for points of more firings than columns,
+    of which many share one.
 
     KITTI's sensor fires every 0.168 degrees and reads its azimuth in 0.09: of its 2,149 columns 6 % would be empty for
     that, and as many points hidden by others.
     """
     turn = _turns(xyz)
-    column = np.minimum((turn * width).astype(np.intp), width - 1)
+    column = _columns(turn, width)
     order = np.argsort(row + turn.astype(np.float64))
     row, place, first = row[order], turn[order] * width, column[order]
     begins, step = np.diff(row, prepend=-2) != 0, np.diff(first, prepend=-1)

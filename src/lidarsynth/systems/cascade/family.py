@@ -108,8 +108,7 @@ def transfer(network: nn.Module, experiment: Experiment, weights: nn.Module, sou
     own, known = experiment.model.likeliest_blocks, source.model.likeliest_blocks
     if network.likeliest is not None and weights.likeliest is not None and own != known:
         raise ValueError(f"{name}: expected a fill for the least error of model.likeliest_blocks {list(own)}, found "
-                         f"{list(known)}: --set 'model.likeliest_blocks={list(known)}' goes on with it"
-                         )  # fmt: skip
+                         f"{list(known)}: --set 'model.likeliest_blocks={list(known)}' goes on with it")  # fmt: skip
     _start(network.likeliest, (weights.surest,), name)
     _start(network.observer, (weights.observer, weights.fill), name)
 
