@@ -188,7 +188,7 @@ def default() -> Experiment:
     """A coarse layout, then one step that fills it in: one model for any sensor, from `--data virtual`."""
     return Experiment(
         "default",
-        data=Data(sensor="hdl-64e-kitti", projection="auto"),
+        data=Data(sensor="hdl-64e-kitti", projection="auto", even=0.5),
         model=Model(
             network="cascade",
             base_channels=64,  # of both stages
@@ -226,7 +226,7 @@ def tuned() -> Experiment:
         start,
         name="tuned",
         base="default",
-        data=replace(start.data, mix=0.7),
+        data=replace(start.data, mix=0.7, even=0.0),
         model=replace(start.model, noisiest=8),  # as the shipped one has learned
         training=replace(
             start.training,
@@ -247,6 +247,7 @@ def kitti() -> Experiment:
     return replace(
         start,
         name="kitti",
+        data=replace(start.data, even=0.5),
         model=replace(start.model, observer_channels=64, own_classes=True),
         training=replace(start.training, steps=11_600),
         card=Card(

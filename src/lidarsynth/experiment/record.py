@@ -27,6 +27,7 @@ class Data:
     mend: bool = True  # mixed pixels that a conditional network makes are put onto the surface beside them
     scale: float = within(0.0, 0, 0.99)  # augmentation of diffusion models: ranges times 1 - scale to 1 + scale
     mix: float = within(0.0, 0, 1)  # augmentation of completion: share of samples with a sector of another image
+    even: float = within(0.0, 0, 1)  # of completion: share of KITTI's images drawn in `hdl-64e`, R2DM's even grid
     fixed: bool = False  # of a model of any sensor: images of that sensor whatever made the scan, as after `into`
     columns: int | None = within(None, 4, 65_536)  # columns to draw scans at, of which `width` are kept; None = width
 

@@ -68,6 +68,7 @@ def _augmentation(data: Data) -> str:
         "mirror": data.mirror,
         f"worlds up to {data.scale:.0%} larger or smaller": data.scale > 0,
         f"a sector of another scan in {data.mix:.0%} of those to be completed": data.mix > 0,
+        f"{data.even:.0%} of KITTI's to be completed drawn in the even grid hdl-64e": data.even > 0,
     }
     return ", ".join(words for words, on in parts.items() if on) or "none"
 

@@ -15,14 +15,15 @@ from torch import Tensor
 from lidarsynth.data.dataset import CachedImages, SeveralCaches
 from lidarsynth.experiment.record import Experiment
 from lidarsynth.lidar.corruption import every_beam
+from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage
-from lidarsynth.lidar.sensor import Sensor
+from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.networks.between_beams import with_between
 from lidarsynth.networks.coarse_unet import COLUMNS, RAY_CHANNELS, ROWS, grid_columns, grid_rays, grid_rows
 from lidarsynth.networks.column_neighbours import known_grid
 from lidarsynth.networks.fill_unet import Known
 from lidarsynth.networks.rays import Rays, rays_of, stacked
-from lidarsynth.streets.hdl64e import hidden, unevenness
+from lidarsynth.streets.hdl64e import hidden, is_kittis, unevenness
 from lidarsynth.streets.kittis_car import outline_of, outlined
 from lidarsynth.systems.cascade.lessons import AS_FAR, FARTHEST, HEIGHT, WIDTH, Lessons, lessons, to_height
 from lidarsynth.systems.cascade.losing import losing
@@ -36,6 +37,7 @@ TALL, WIDE = 2 * ROWS - 1, 160  # of a part of a taller grid
 FIRST = 0.35  # of samples are drawn in 16 beams, of which columns are known: the first pass of generation
 EVERY = 4  # steps from one of the observer to the next: it learns sooner
 LOSING = 0.7  # of what learns the most likely image lack some of their returns
+EVEN = SENSORS["hdl-64e"]
 COUNTED = 64  # images of caches that tell whether there are labels
 SCALE = 0.15  # worlds are up to so much larger or smaller, in the logarithm
 
@@ -94,8 +96,9 @@ def draw(experiment: Experiment, images: Images, indices: list[int], step: int, 
     rngs = [np.random.default_rng(number) for number in seeds]
     crops = []
     for image, rng, position in zip(taken, rngs, positions, strict=True):
-        shown = image if position < samples else _worse(mixed(image, images, experiment.data.mix, rng), rng)
-        crops.append(crop(shown, rng, position < samples, experiment.training.upsampling_share))
+        if position >= samples:
+            image = evenly(_worse(mixed(image, images, experiment.data.mix, rng), rng), experiment.data.even, rng)
+        crops.append(crop(image, rng, position < samples, experiment.training.upsampling_share))
     grids = [grid(image, rng) for image, rng in zip(taken, rngs, strict=True)]
     wide = 4 * COLUMNS if step % 2 and min(image.shape[1] for image in taken) >= 4 * COLUMNS else 2 * COLUMNS
     finer = [grid(image, np.random.default_rng((n, wide)), wide) for image, n in zip(taken, seeds, strict=True)]
@@ -162,6 +165,14 @@ def mixed(image: RangeImage, images: Images, share: float, rng: np.random.Genera
         image.sensor,
         np.where(taken, *(np.zeros(a.shape, int) if a.label is None else a.label for a in (other, image))),
     )
+
+
+def evenly(image: RangeImage, share: float, rng: np.random.Generator) -> RangeImage:
+    """The image; of KITTI's sensor, with the chance `share`, its points as R2DM and others draw them: by elevation in
+    the even grid `hdl-64e`, some of whose rows no laser hits. Not with the surfaces that rays meet, nor instances."""
+    if not share or not is_kittis(image.sensor) or rng.random() >= share:
+        return image
+    return project(image.to_scan(), EVEN, "spherical", image.sensor.width)
 
 
 def crop(
