@@ -255,6 +255,15 @@ def test_a_model_that_was_tuned_to_another_sensor_says_so_where_it_generates(run
     assert [elsewhere(load("kitti").into(own)) for own in ("hdl-64e-kitti", "hdl-64e")] == [None, None]
 
 
+def test_layouts_that_a_sampler_would_ignore_are_refused(run: Run, tmp_path: Path):
+    words = ("generate", "-n", 1, "--no-picture", "--sensor", "vlp-16", "--out", tmp_path / "g", "--layouts")
+    for more, sampler in (("--steps 1", "dpmpp-2m"), ("--sampler ddim --steps 1", "ddim")):
+        told = f"expected 1 layout of the sampler {sampler}, for only columns chooses among them, found 5; leave"
+        refused(run(*words, 5, *more.split()), told)
+        assert not (tmp_path / "g").exists()
+    assert run(*words, 1, "--steps", 1).code == 0
+
+
 def test_a_cascades_folder_records_the_samplers_steps_apart_from_the_fills_and_one_of_before_goes_on(
     run: Run, tmp_path: Path
 ):

@@ -72,7 +72,8 @@ def generate(
     calls, used = loaded.generation_steps(steps, sampler), loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format} | generation.steps_of(loaded, steps, sampler)
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
-    said = {"labels": labels or None, "boxes": boxes or None, "layouts": layouts} | generation.precision_of(loaded)
+    said = {"labels": labels or None, "boxes": boxes or None, "layouts": generation.layouts_of(layouts, used)}
+    said |= generation.precision_of(loaded)
     settings |= {key: value for key, value in said.items() if value is not None}
     with only_writer(out, "generation"):
         generation.claim(out, settings, loaded.sampler_used(steps))
