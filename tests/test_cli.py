@@ -33,6 +33,7 @@ from lidarsynth.lidar.sensor import SENSORS
 from lidarsynth.systems.cascade.layout import block, sampling
 from lidarsynth.systems.cascade.model import CascadeModel
 from lidarsynth.systems.diffusion.model import LidarModel
+from lidarsynth.systems.notes import elsewhere
 from lidarsynth.verbs.generation import cut, processes, steps_of
 from lidarsynth.weights.load import load
 
@@ -244,6 +245,23 @@ def test_a_folder_of_another_sensor_is_refused_by_name_and_one_of_before_goes_on
     assert "0 of them new" in run(*words, "vlp-16").out
     told = "made with {'model': 'default', 'sensor': 'hdl-32e', 'weights': "
     refused(run(*words, "hdl-32e"), told, f"found {{'weights': '{before['weights']}'}}; use")
+
+
+def test_a_model_that_was_tuned_to_another_sensor_says_so_where_it_generates(run: Run, tmp_path: Path):
+    words = ("generate", "-n", 1, "--no-picture", "--steps", 1, "--sensor", "vlp-16", "--out")
+    told = "lidarsynth: kitti was tuned to hdl-64e-kitti, and vlp-16 is another; use --model default\n"
+    assert told in run(*words, tmp_path / "kitti", "--model", "kitti").err
+    assert "was tuned to" not in run(*words, tmp_path / "default").err
+    assert [elsewhere(load("kitti").into(own)) for own in ("hdl-64e-kitti", "hdl-64e")] == [None, None]
+
+
+def test_layouts_that_a_sampler_would_ignore_are_refused(run: Run, tmp_path: Path):
+    words = ("generate", "-n", 1, "--no-picture", "--sensor", "vlp-16", "--out", tmp_path / "g", "--layouts")
+    for more, sampler in (("--steps 1", "dpmpp-2m"), ("--sampler ddim --steps 1", "ddim")):
+        told = f"expected 1 layout of the sampler {sampler}, for only columns chooses among them, found 5; leave"
+        refused(run(*words, 5, *more.split()), told)
+        assert not (tmp_path / "g").exists()
+    assert run(*words, 1, "--steps", 1).code == 0
 
 
 def test_a_cascades_folder_records_the_samplers_steps_apart_from_the_fills_and_one_of_before_goes_on(

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import lidarsynth as ls
+from lidarsynth.cli.main import main
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Confidence, Data, Experiment, Model, with_fields
 from lidarsynth.lidar.corruption import corrupt
@@ -198,6 +199,18 @@ def test_open_columns_want_a_torch_that_writes_them(tmp_path: Path, monkeypatch:
         ):
             export_onnx(cascade(), tmp_path / "x.onnx", open_columns=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_that_was_tuned_to_another_sensor_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    def written(model: CascadeModel, path: Path, sensor: str | None, _: bool) -> Exported:
+        return Exported(path, "completion in one step", 18, ls.get_sensor(sensor or model.sensor), {}, {}, {}, 1)
+
+    monkeypatch.setattr("lidarsynth.verbs.export.export_onnx", written)
+    said = []
+    for model, *sensor in (("kitti", "--sensor", "vlp-16"), ("kitti",), ("default", "--sensor", "vlp-16")):
+        main(["export", model, str(tmp_path / "x.onnx"), *sensor])
+        said.append(capsys.readouterr().err)
+    assert said == ["lidarsynth: kitti was tuned to hdl-64e-kitti, and vlp-16 is another; export default\n", "", ""]
 
 
 @pytest.mark.slow

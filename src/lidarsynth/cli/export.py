@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lidarsynth.cli.arguments import NoSeed, Positional, SensorWord, Source, arg
-from lidarsynth.cli.terminal import load_with_bar, say
+from lidarsynth.cli.terminal import load_with_bar, say, warn
 
 
 def export(
@@ -22,9 +22,14 @@ def export(
 
     It takes a minute, and needs the extra onnx. To run the file, onnxruntime and numpy are enough: docs/onnx.md.
     """
+    from lidarsynth.lidar.sensor import get_sensor
+    from lidarsynth.systems.notes import elsewhere
     from lidarsynth.verbs.export import export_onnx
 
-    done = export_onnx(load_with_bar(model, "cpu"), out, sensor, any_columns)
+    loaded = load_with_bar(model, "cpu")
+    done = export_onnx(loaded, out, sensor, any_columns)
+    if sensor is not None and (told := elsewhere(loaded.into(get_sensor(sensor)))):
+        warn(f"{model} {told}; export default")
     say(f"wrote {done.path}: {done.does}, {done.sensor.name}, opset {done.opset}, {done.size / 1e6:.1f} MB")
     for name, shape in {**done.inputs, **done.outputs}.items():
         kind = "in " if name in done.inputs else "out"

@@ -24,6 +24,7 @@ from lidarsynth.lidar.plural import plural
 
 if TYPE_CHECKING:
     from lidarsynth.lidar.sensor import Sensor
+    from lidarsynth.systems.scan_model import ScanModel
 
 FEW = 8  # scans, as many as are drawn together at least, which one process makes
 
@@ -71,12 +72,12 @@ def generate(
     calls, used = loaded.generation_steps(steps, sampler), loaded.sampler_used(steps, sampler)
     settings = {"weights": fingerprint(loaded), "format": format} | generation.steps_of(loaded, steps, sampler)
     settings |= {"sampler": used, "seed": seed, "model": str(model), "sensor": loaded.sensor.name}
-    said = {"labels": labels or None, "boxes": boxes or None, "layouts": layouts} | generation.precision_of(loaded)
+    said = {"labels": labels or None, "boxes": boxes or None, "layouts": generation.layouts_of(layouts, used)}
+    said |= generation.precision_of(loaded)
     settings |= {key: value for key, value in said.items() if value is not None}
     with only_writer(out, "generation"):
         generation.claim(out, settings, loaded.sampler_used(steps))
-        if sampler is None and used != loaded.sampler_used():
-            warn(f"with steps scans are drawn by {used}, not by {loaded.sampler_used()}, whose are nearer to streets")
+        _caution(loaded, str(model), used if sampler is None else loaded.sampler_used())
         runs, size = generation.missing(out, count, endings), loaded.at_once(batch_size)
         workers = generation.processes(loaded, runs, workers)
         make = partial(generation.generate_into, out, loaded, runs, batch_size, endings, steps, sampler, seed)
@@ -96,6 +97,16 @@ def _begin_early(count: int, workers: int | None, device: str) -> None:
         from lidarsynth.data.workers import begin_early
 
         begin_early("lidarsynth.verbs.generation", "lidarsynth.weights.load")
+
+
+def _caution(model: ScanModel, word: str, used: str | None) -> None:
+    """Says of scans that are less near to streets than they might be why they are."""
+    from lidarsynth.systems.notes import elsewhere
+
+    if used != model.sampler_used():
+        warn(f"with steps scans are drawn by {used}, not by {model.sampler_used()}, whose are nearer to streets")
+    if told := elsewhere(model):
+        warn(f"{word} {told}; use --model default")
 
 
 def _tell(made: str, of_boxes: Sensor | None) -> None:

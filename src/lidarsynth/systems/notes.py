@@ -116,3 +116,11 @@ def stranger(model: Knows, scan: Scan, sensor: Sensor | str | None = None) -> st
         return None
     knows = f"was tuned to {own}" if model.any_sensor else f"knows {own} alone"
     return f"{knows}, and this is a scan of {name}"
+
+
+def elsewhere(model: Knows) -> str | None:
+    """What a model that was tuned to one sensor has to say where it is asked for images of another, or None."""
+    own = model.experiment.card.sensor if model.any_sensor else ""
+    if not own or same_kind(model.sensor.name, own):
+        return None
+    return f"was tuned to {own}, and {model.sensor.name} is another"

@@ -26,6 +26,7 @@ from lidarsynth.lidar.whole_file import sweep, write_whole
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
 from lidarsynth.pictures.render import save_png
+from lidarsynth.systems.cascade.layout import BY_COLUMNS
 from lidarsynth.systems.cascade.model import FILL_STEPS, CascadeModel
 from lidarsynth.systems.cascade.request import warn_of_height
 from lidarsynth.systems.scan_model import OnStep, ScanModel
@@ -57,6 +58,15 @@ def steps_of(model: ScanModel, steps: int | None = None, sampler: str | None = N
 def precision_of(model: ScanModel) -> dict[str, str]:
     """What a folder records of a model's products, where these are not in float32: scans differ by it."""
     return {"precision": model.precision} if isinstance(model, CascadeModel) and model.precision != "fp32" else {}
+
+
+def layouts_of(layouts: int | None, sampler: str | None) -> int | None:
+    """What a folder records of the layouts that were asked for. Raises ValueError for several of a sampler that would
+    ignore them: those of columns alone are judged."""
+    if layouts not in (None, 1) and sampler != BY_COLUMNS:
+        raise ValueError(f"expected 1 layout of the sampler {sampler}, for only {BY_COLUMNS} chooses among them, found "
+                         f"{layouts}; leave --layouts out")  # fmt: skip
+    return layouts
 
 
 def claim(folder: Path, settings: dict[str, Any], sampler: str | None = None) -> None:
