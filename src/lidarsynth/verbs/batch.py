@@ -97,11 +97,11 @@ class Job:
     def beside(self) -> tuple[str, ...]:
         """Endings of the files that a .bin or .npy of this job may get beside it, as far as the job tells."""
         marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample", "insert") else ()
-        return (*marks, LABEL) if self.labels or self.reads_labels else marks
+        return (*marks, LABEL) if self.labels or self.needs_labels else marks
 
     @property
-    def reads_labels(self) -> bool:
-        """Whether a `.label` file of a scan's own is read, and its words go on with the points."""
+    def needs_labels(self) -> bool:
+        """Whether a `.label` file of a scan's own that does not fit is refused; `label` alone reads none."""
         return self.verb in ("realise", "insert") or self.how.removed is not None
 
     def recipe(self, weights: str | None = None) -> dict[str, Any]:
@@ -371,10 +371,12 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         check_boxes(target, source, len(loaded.scan) + loaded.dropped)
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
-    if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
+    if target.suffix.lower() == ".npz":
         content: RangeImage | Scan = image
     else:
-        placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
+        placed = image.to_scan()
+        if isinstance(done, Filled) and not done.errors:
+            placed = back_in_place(placed, loaded, job.transform)
         if target.suffix.lower() in BARE:
             beside = tuple(f".{name}" for name in BESIDE if name in placed.extra)
             beside += (LABEL,) if placed.label is not None or "raw_label" in placed.extra else ()
