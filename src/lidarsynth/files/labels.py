@@ -15,10 +15,6 @@ WORDS = 1 << 32  # that 4 bytes tell apart
 MOST_INSTANCES = (1 << 16) - 1
 
 
-class OfOtherPoints(FileError):
-    """A `.label` file that has not a word for each point of its scan."""
-
-
 def read_labels(path: str | Path, n: int) -> np.ndarray:
     """(n,) int32 training classes 0-19 of a SemanticKITTI `.label` file, in the point order of its `.bin`.
 
@@ -38,7 +34,7 @@ def read_words(path: str | Path, n: int) -> np.ndarray:
     except OSError as error:
         raise FileError(f"{path}: expected a readable .label file, found: {error.strerror}") from None
     if len(data) != 4 * n:
-        raise OfOtherPoints(f"{path}: expected {4 * n} bytes, one label of 4 for each of {n} points, found {len(data)}")
+        raise FileError(f"{path}: expected {4 * n} bytes, one label of 4 for each of {n} points, found {len(data)}")
     return np.frombuffer(data, "<u4")
 
 

@@ -24,7 +24,7 @@ from lidarsynth.files.fields import (
     written_names,
 )
 from lidarsynth.files.formats import holds_image, left_out, read_with_report, sensor_in
-from lidarsynth.files.labels import OfOtherPoints, labels_of
+from lidarsynth.files.labels import labels_of
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
 from lidarsynth.lidar.plural import plural, was
@@ -133,15 +133,14 @@ class FileInput:
     def _read_with(self, words: Path | None) -> tuple[tuple[Scan, int], list[str]]:
         """The scan with the words of its labels, how many points were dropped, and what is to be said of labels that do
         not fit."""
+        how = self.path, self.reading.intensity, None
         try:
-            return read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings), []
-        except OfOtherPoints as error:
-            if self.reading.needed:
+            return read_with_report(*how, words, self.reading.rings), []
+        except FileError as error:
+            if words is None or self.reading.needed:
                 raise
-            why = str(error).removeprefix(f"{words}: ")
-        return read_with_report(self.path, self.reading.intensity, rings=self.reading.rings), [
-            f"{words} left out: {why}"
-        ]
+            told = f"{words} left out: {str(error).removeprefix(f'{words}: ')}"
+        return read_with_report(*how, None, self.reading.rings), [told]  # raises what else is wrong
 
 
 @dataclass(frozen=True)
