@@ -23,7 +23,7 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution, filled_before
+from lidarsynth.lidar.unseen import caution, darkness, filled_before
 from lidarsynth.lidar.view import placement
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
@@ -204,6 +204,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         done, note = _made(job, model, work, loaded.scan, on_step)
         more = loaded.left_out, beyond, _caution(loaded.scan, job, work, model, alone=warning is None)
         more = (*more, _few_beams(loaded.scan, job, model))
+        more = (*more, darkness(loaded.scan) if work.check and job.verb != "realise" else None)
         warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside, picture, other = None, (), None, None
         if work.target is None:
