@@ -126,7 +126,9 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     except FileError as error:
         if WITHOUT not in str(error):
             raise
-        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | NO_INTENSITY
+        lines, why = scan_lines(*read_with_report(path, "none", rings=reading.rings), reading), str(error)
+        unfit = {"reflectance": why.removeprefix(f"{path}: ")}
+        return lines | (NO_INTENSITY if "expected an intensity field" in why else unfit)
 
 
 def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
