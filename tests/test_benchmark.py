@@ -611,6 +611,18 @@ def test_scans_are_completed_again_where_the_file_of_their_sensor_says_something
     assert found[0]["voxel IoU"] != found[1]["voxel IoU"]
 
 
+def test_all_sensors_of_the_images_are_named(tmp_path: Path):
+    """Each is judged as an image of its own sensor; the page named the first one's alone."""
+    sensors = SENSOR, replace(SENSOR, name="other", elevations=tuple(np.linspace(10, -40, 16)))
+    config = written(tmp_path / "b.toml", f'data = "{tmp_path}/two"\nprotocol = "iln-2022"\n{METHODS}')
+    (tmp_path / "two").mkdir()
+    for number, sensor in enumerate(sensors):
+        write(tmp_path / "two" / f"{number}.npz", street(number, sensor))
+    text = benchmark("upsampling", config, tmp_path / "out", no_model)
+    assert f"two, {SENSOR.name}, other, {SENSOR.height} x {SENSOR.width}\n" in text
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["data"]["sensor"] == f"{SENSOR.name}, other"
+
+
 def test_scans_of_another_sensor_than_the_images_they_are_drawn_into_are_told(tmp_path: Path):
     """Of a file that names no sensor, images are the protocol's, and of the scans' beams little is in them."""
     (tmp_path / "scans").mkdir()

@@ -103,11 +103,12 @@ def benchmark(
 def upsampling(setup: Setup, config: Upsampling) -> Outcome:
     """Every method fills the same scans. Raises ValueError for data that cannot be used."""
     data = corrupted(config, setup.folder, setup.on_images)
-    problem = Problem(config, data, data.stamps(setup.progress("read", len(data))), data.shown(config.figure))
+    stamps, sensors = data.stamps(setup.progress("read", len(data)))
+    problem = Problem(config, data, stamps, data.shown(config.figure))
     found = [upsampling_row(setup, problem, group, method) for group, method in rows(config.method)]
-    (_, known), sensor = data[problem.shown], data.sensor
+    (_, known), size = data[problem.shown], f"{data.sensor.height} x {data.sensor.width}"
     about = {
-        "scans": f"{len(data)} of {config.data}, {sensor.name}, {sensor.height} x {sensor.width}",
+        "scans": f"{len(data)} of {config.data}, {', '.join(sensors)}, {size}",
         "hidden": f"{config.corruption}, {1 - known.mean():.0%} of the pixels",
         "seed": str(config.seed),
     }
@@ -118,7 +119,7 @@ def upsampling(setup: Setup, config: Upsampling) -> Outcome:
         )
     if told := data.notes(config.sensor):
         about["note"] = in_the_file("; ".join(told))
-    record = {"source": data.images.source, "names": list(data.names), "sensor": sensor.name, "scans": len(data),
+    record = {"source": data.images.source, "names": list(data.names), "sensor": ", ".join(sensors), "scans": len(data),
               "notes": list(told), "sha256": sha256("".join(problem.stamps.values()).encode()).hexdigest()}  # fmt: skip
     return Outcome(found, about, record, *_filled_pictures(setup, problem, found))
 

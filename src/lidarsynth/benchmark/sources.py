@@ -71,18 +71,19 @@ class Corrupted:
         """Of the images, `sequence/frame` where they are of a cache."""
         return self.images.names[: self.count]
 
-    def stamps(self, on_image: Callable[[int], object] | None = None) -> dict[int, str]:
+    def stamps(self, on_image: Callable[[int], object] | None = None) -> tuple[dict[int, str], tuple[str, ...]]:
         """What is told and what is to be found, scan by scan: 16 hex digits of the truth, the known pixels, and the
-        sensor, as its file says it now."""
-        found = {}
+        sensor, as its file says it now; and the names of all their sensors, of images their own."""
+        found, sensors = {}, {}
         for i in range(len(self)):
             truth, known = self[i]
             content = [np.ascontiguousarray(v).tobytes() for v in (truth.range, truth.reflectance, truth.mask, known)]
             told = json.dumps(truth.sensor.to_dict()).encode()
+            sensors[truth.sensor.name] = None
             found[i] = blake2b(b"".join([*content, told]), digest_size=8).hexdigest()
             if on_image:
                 on_image(i + 1)
-        return found
+        return found, tuple(sensors)
 
     def notes(self, named: str | None) -> tuple[str, ...]:
         """What is unlike in the scans and the images that they are taken as, as `evaluate` says it of a reference.

@@ -79,7 +79,7 @@ def work_through(job: Job, paths: list[Path], out: Path, many: Many, intensity: 
     check_workers(many.workers)
     transform = read_transform(many.transform, many.mount, many.axes)
     rings = parse_rings(many.rings)
-    reading = Reading(intensity, many.topic, many.metadata, transform, job.reads_labels, rings)
+    reading = Reading(intensity, many.topic, many.metadata, transform, job.verb != "label", job.needs_labels, rings)
     inputs = inputs_of(paths, reading, out)
     if inputs.below:
         names = ", ".join(path.name for path in inputs.below[:NAMED]) + (", ..." if inputs.below[NAMED:] else "")

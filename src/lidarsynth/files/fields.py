@@ -61,8 +61,9 @@ def check_names(names: Sequence[str]) -> None:
 def scan_from_fields(fields: Fields, intensity: str = "auto", rings: tuple[int, int] | None = None) -> tuple[Scan, int]:
     """The scan of N columns, and how many points it lost.
 
-    Points with a non-finite coordinate, or at exactly (0, 0, 0) (no return), are dropped and counted; an intensity that
-    is not finite is 0. Columns of no point at all give a scan of none; of points that are all dropped there is no scan.
+    Points with a non-finite coordinate, or where nothing returned (see `_returned`), are dropped and counted; an
+    intensity that is not finite is 0. Columns of no point at all give a scan of none; of points that are all dropped
+    there is no scan.
     `intensity`: see `reflectance_from`; "auto" takes the field SCALED where there is one. `rings`: see `on_rings`.
     Ring numbers that do not count from the top, and times that are no seconds, stay among the further fields as the
     file has them. Raises FileError (without the path) for anything that is not one LiDAR turn.
@@ -126,7 +127,11 @@ def dropped_points(count: int) -> str:
 
 
 def _returned(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    return np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
+    """(N,) bool: finite points that are not where a file puts rays without a return: the origin, or, of several such,
+    (-1, -1, -1), as of the images that RangeNet++ makes of SemanticKITTI."""
+    there = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
+    empty = (x == -1) & (y == -1) & (z == -1)
+    return there & ~empty if np.count_nonzero(empty) > 1 else there
 
 
 def on_rings(fields: Fields, first: int, last: int) -> Fields:
@@ -300,7 +305,7 @@ def rings_of_grid(fields: Fields, shape: tuple[int, int]) -> np.ndarray | None:
     x, y, z = (fields[str(name)].astype(np.float32) for name in names)
     with np.errstate(all="ignore"):  # organised clouds are full of NaN
         elevation = np.arctan2(z, np.hypot(x, y))
-    good = np.isfinite(elevation) & (elevation != 0)
+    good = _returned(x, y, z) & (elevation != 0)
     index = np.arange(len(x))
     for count, ring in ((shape[0], index // shape[1]), (shape[1], index % shape[1])):
         if not 8 <= count <= 256 or good.sum() < 2 * count:

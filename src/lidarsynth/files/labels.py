@@ -39,7 +39,8 @@ def read_words(path: str | Path, n: int) -> np.ndarray:
 
 
 def words_of(scan: Scan) -> np.ndarray | None:
-    """(N,) uint32 words of a scan's `.label` file: its `extra["raw_label"]`, else its classes' raw ids, with its
+    """(N,) uint32 words of a scan's `.label` file: its `extra["raw_label"]`, and the raw ids of its classes where these
+    say nothing, as of points that were filled in; of a scan without such words those of all its classes, with its
     `extra["instance"]` in the upper half where all of these are numbers of 0-65535; None where it has neither. Raises
     FileError (without the path) for what is no such word, or no class."""
     if "raw_label" in scan.extra:
@@ -49,7 +50,11 @@ def words_of(scan: Scan) -> np.ndarray | None:
             raise FileError(f"expected whole numbers as raw labels, found {words.dtype}")
         if (found := stray(words, WORDS - 1)) is not None:
             raise FileError(f"expected raw labels of 0-{WORDS - 1}, found {found}")
-        return words.astype("<u4")
+        words = words.astype("<u4")
+        if scan.label is None:
+            return words
+        said = (words == 0) & (scan.label > 0) & (scan.label < len(RAW))
+        return np.where(said, RAW[scan.label * said], words).astype("<u4")
     if scan.label is None:
         return None
     if (found := stray(scan.label, len(RAW) - 1)) is not None:
@@ -65,3 +70,8 @@ def label_path(scan: Path) -> Path:
     """Where the labels of a scan file belong: of NN/velodyne/a.bin NN/labels/a.label, as published, else beside it."""
     folder = scan.parent.with_name("labels") if scan.parent.name == "velodyne" else scan.parent
     return folder / f"{scan.stem}.label"
+
+
+def labels_of(scan: Path) -> Path | None:
+    """The labels that lie where those of a scan file belong, or beside it; None where there are none."""
+    return next((at for at in (label_path(scan), scan.with_suffix(".label")) if at.is_file()), None)

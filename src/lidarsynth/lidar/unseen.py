@@ -19,6 +19,7 @@ FEW = 0.15  # share of the usual points of a degree that are hardly any
 # Elevations that tell hardly anything, tenths of a degree that are one, and the share of points there: of real scans,
 # their near and far parts too, at most 0.76 are, of every fourth beam of a VLP-16 0.79.
 BEAMS, TENTHS, NEARLY = 3, 10, 0.9
+DARK = 1 / 16  # of the most there is, above which any real scan's brightest point is: 12 bits, taken for 16, are not
 
 
 def caution(
@@ -56,6 +57,16 @@ def filled_before(scan: Scan) -> str | None:
         return None
     return (f"expected measured points, found {before} of {len(scan)} that were filled in before (new = 1): they are "
             "taken as they are, and stay marked")  # fmt: skip
+
+
+def darkness(scan: Scan) -> str | None:
+    """That no point of a scan is bright, as where intensities were taken for those of a wider scale than theirs, in one
+    line; or None, as of scans without reflectance, and of few points."""
+    most = float(scan.reflectance.max(initial=0))
+    if len(scan) < SPARSE or not 0 < most < DARK:
+        return None
+    return (f"expected bright points among others, found no reflectance above {most:.2g}: intensities of another scale "
+            "than 0-1, 0-255 and 0-65535, such as 0-4095, are to be divided by it before")  # fmt: skip
 
 
 def few_beams(xyz: np.ndarray, sensor: Sensor | None = None) -> str | None:

@@ -15,6 +15,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.sensor import Sensor, get_sensor, same_rays
 from lidarsynth.systems.denser import TIMES, denser, spread
 from lidarsynth.systems.filling import Filling, whole
+from lidarsynth.systems.known_pixels import with_own_classes
 from lidarsynth.systems.notes import IN_PYTHON, Points, taken
 from lidarsynth.systems.scan_model import OnStep, ScanModel
 
@@ -93,7 +94,7 @@ class AnySensorModel(ScanModel, ABC):
         sparse = sparse if beams == own else self.into(beams).image_of(scan)
         model = self.into(dense)
         image, known = spread(sparse, dense, every)
-        filled = model.fill(image, known, how, on_step)
+        filled = with_own_classes(model.fill(image, known, how, on_step), image)
         loose = replace(scan, ring=None)
         pixels = pixel_of_points(loose, filled.sensor, "spherical")
         return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))

@@ -23,9 +23,10 @@ def spread(sparse: RangeImage, sensor: Sensor, times: int) -> tuple[RangeImage, 
 
     known = np.zeros((sensor.height, sensor.width), bool)
     known[::times] = (sparse.mask.mean(1) > ANSWERS)[:, None]  # a beam that hardly answers may not be there
-    xyz, sure, new = (None if part is None else rows(part) for part in (sparse.xyz, sparse.confidence, sparse.new))
+    more = sparse.label, sparse.xyz, sparse.confidence, sparse.new
+    label, xyz, sure, new = (None if part is None else rows(part) for part in more)
     kept = rows(sparse.range), rows(sparse.reflectance), rows(sparse.mask)
-    return RangeImage(*kept, sensor, xyz=xyz, confidence=sure, new=new), known
+    return RangeImage(*kept, sensor, label, xyz, confidence=sure, new=new), known
 
 
 def beam_step(sparse: RangeImage) -> tuple[int, int]:

@@ -88,6 +88,14 @@ def with_known(filled: RangeImage, image: RangeImage, known: np.ndarray, keep_re
     )
 
 
+def with_own_classes(filled: RangeImage, image: RangeImage) -> RangeImage:
+    """The filled image, where its pixels that `image` has measured keep the classes that they have there, if any."""
+    if image.label is None:
+        return filled
+    others = 0 if filled.label is None else filled.label
+    return replace(filled, label=np.where(image.mask, image.label, others))
+
+
 def _points(image: RangeImage, filled: RangeImage, measured: np.ndarray) -> np.ndarray | None:
     """(H, W, 3) points of measured pixels and of filled ones, where either image has its own; 0 where it has none."""
     if image.xyz is None and filled.xyz is None:

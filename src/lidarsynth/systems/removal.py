@@ -17,7 +17,7 @@ from lidarsynth.lidar.scan import RangeImage, Scan, check_seen
 from lidarsynth.lidar.semantic_kitti import CLASS_NUMBER
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.systems.filling import Filling, OnStep
-from lidarsynth.systems.known_pixels import known_pixels
+from lidarsynth.systems.known_pixels import known_pixels, with_own_classes
 
 
 class Fills(Protocol):
@@ -91,5 +91,6 @@ def _filled(
 ) -> RangeImage:
     """What is left, filled where it is not `told` (H, W) bool; `away` (H, W) bool, pixels of `image` that are gone."""
     count = int(image.mask.sum())
-    filled = model.fill(check_seen(left.keep(told), count), told, how, on_step)
+    left = check_seen(left.keep(told), count)
+    filled = with_own_classes(model.fill(left, told, how, on_step), left)
     return filled.keep(~in_the_way(filled, image, away & ~told))

@@ -26,7 +26,7 @@ from lidarsynth.systems.description import Description, described
 from lidarsynth.systems.filling import Filling, OnStep, check_counts, whole
 from lidarsynth.systems.hub import checked_repository, push
 from lidarsynth.systems.insertion import Inserted, inserted
-from lidarsynth.systems.known_pixels import known_pixels, of_rays, sensor_that_made, sparse_image
+from lidarsynth.systems.known_pixels import known_pixels, of_rays, sensor_that_made, sparse_image, with_own_classes
 from lidarsynth.systems.model_card import card_text
 from lidarsynth.systems.notes import Points, made_by, noted, stranger, taken
 from lidarsynth.systems.removal import emptied
@@ -259,12 +259,13 @@ class ScanModel(ABC):
         if how.removed is not None:
             return emptied(self, scan, how, known, on_step)
         if known is not None or isinstance(scan, RangeImage):
-            image = self.image_of(scan)
-            known = known_pixels(image, known)
-            return self.fill(check_seen(image.keep(known), int(image.mask.sum())), known, how, on_step)
+            known = known_pixels(image := self.image_of(scan), known)
+            image = check_seen(image.keep(known), int(image.mask.sum()))
+            return with_own_classes(self.fill(image, known, how, on_step), image)
         pixels = pixel_of_points(scan, self.sensor, self.experiment.data.projection)
         image = check_seen(self.image_of(scan, pixels), len(scan))
-        filled = self.fill(image, image.mask | occupied(scan, self.sensor, pixels), how, on_step)
+        known = image.mask | occupied(scan, self.sensor, pixels)
+        filled = with_own_classes(self.fill(image, known, how, on_step), image)
         return replace(filled, completed=with_measured(scan, image.mask, filled, pixels))
 
     def upsampled(
@@ -287,7 +288,7 @@ class ScanModel(ABC):
         loose = replace(scan, ring=None)  # its rings are not the model's
         pixels = pixel_of_points(loose, self.sensor, "spherical")
         known |= occupied(loose, self.sensor, pixels)
-        filled = self.fill_beams(scan, sensor_in, sparse, known, how, on_step)
+        filled = with_own_classes(self.fill_beams(scan, sensor_in, sparse, known, how, on_step), sparse)
         return replace(filled, completed=with_measured(scan, sparse.mask, filled, pixels))
 
     def check(self, how: Filling) -> None:

@@ -23,7 +23,7 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.projection import project
 from lidarsynth.lidar.scan import RangeImage, Scan, check_seen, with_points
 from lidarsynth.lidar.sensor import WORDS, Sensor, get_sensor
-from lidarsynth.lidar.unseen import caution, filled_before
+from lidarsynth.lidar.unseen import caution, darkness, filled_before
 from lidarsynth.lidar.view import placement
 from lidarsynth.pictures.figure import in_the_way
 from lidarsynth.pictures.portrait import portrait
@@ -97,11 +97,11 @@ class Job:
     def beside(self) -> tuple[str, ...]:
         """Endings of the files that a .bin or .npy of this job may get beside it, as far as the job tells."""
         marks = tuple(f".{name}" for name in BESIDE) if self.verb in ("complete", "upsample", "insert") else ()
-        return (*marks, LABEL) if self.labels or self.reads_labels else marks
+        return (*marks, LABEL) if self.labels or self.needs_labels else marks
 
     @property
-    def reads_labels(self) -> bool:
-        """Whether a `.label` file of a scan's own is read, and its words go on with the points."""
+    def needs_labels(self) -> bool:
+        """Whether a `.label` file of a scan's own that does not fit is refused; `label` alone reads none."""
         return self.verb in ("realise", "insert") or self.how.removed is not None
 
     def recipe(self, weights: str | None = None) -> dict[str, Any]:
@@ -204,6 +204,7 @@ def _one(job: Job, model: ScanModel | None, on_step: OnStep, work: Work) -> Resu
         done, note = _made(job, model, work, loaded.scan, on_step)
         more = loaded.left_out, beyond, _caution(loaded.scan, job, work, model, alone=warning is None)
         more = (*more, _few_beams(loaded.scan, job, model))
+        more = (*more, darkness(loaded.scan) if work.check and job.verb != "realise" else None)
         warning = _in_one_line(work.item.path, warning, *more)  # of what was made: not said where nothing is
         cloud, beside, picture, other = None, (), None, None
         if work.target is None:
@@ -371,10 +372,12 @@ def _store(target: Path, source: Path, done: Filled | RangeImage, loaded: Loaded
         check_boxes(target, source, len(loaded.scan) + loaded.dropped)
     target.parent.mkdir(parents=True, exist_ok=True)
     image = done if isinstance(done, RangeImage) else done.image
-    if isinstance(done, RangeImage) or target.suffix.lower() == ".npz":
+    if target.suffix.lower() == ".npz":
         content: RangeImage | Scan = image
     else:
-        placed = done.points if done.errors else back_in_place(done.points, loaded, job.transform)
+        placed = image.to_scan()
+        if isinstance(done, Filled) and not done.errors:
+            placed = back_in_place(placed, loaded, job.transform)
         if target.suffix.lower() in BARE:
             beside = tuple(f".{name}" for name in BESIDE if name in placed.extra)
             beside += (LABEL,) if placed.label is not None or "raw_label" in placed.extra else ()

@@ -39,6 +39,7 @@ from lidarsynth.lidar.plural import plural
 from lidarsynth.lidar.recognition import recognise
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import from_dict, get_sensor
+from lidarsynth.lidar.unseen import darkness
 from lidarsynth.verbs.expansion import has_scans, streams_below
 from lidarsynth.verbs.inputs import OF_METADATA, Reading
 from lidarsynth.verbs.json_kinds import json_lines
@@ -125,7 +126,9 @@ def _scan_file(path: Path, reading: Reading) -> Lines:
     except FileError as error:
         if WITHOUT not in str(error):
             raise
-        return scan_lines(*read_with_report(path, "none", rings=reading.rings), reading) | NO_INTENSITY
+        lines, why = scan_lines(*read_with_report(path, "none", rings=reading.rings), reading), str(error)
+        unfit = {"reflectance": why.removeprefix(f"{path}: ")}
+        return lines | (NO_INTENSITY if "expected an intensity field" in why else unfit)
 
 
 def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
@@ -138,10 +141,11 @@ def scan_lines(scan: Scan, dropped: int, reading: Reading) -> Lines:
         return {"points": "0", "fields": fields}
     name, reason = recognise(scan)
     depth, light = np.linalg.norm(scan.xyz, axis=1), scan.reflectance
+    shades = f"{light.min():.2f} to {light.max():.2f}, mean {light.mean():.3f}"
     lines = {
         "points": f"{len(scan)}" + (f" ({dropped} without a return dropped)" if dropped else ""),
         "range": f"{depth.min():.2f} to {depth.max():.2f} m, median {np.median(depth):.2f} m",
-        "reflectance": f"{light.min():.2f} to {light.max():.2f}, mean {light.mean():.3f}",
+        "reflectance": "; ".join(filter(None, (shades, darkness(scan)))),
         "fields": fields,
         "sensor": f"{name} ({reason})" if name else reason,
     }

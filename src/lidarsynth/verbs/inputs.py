@@ -23,11 +23,12 @@ from lidarsynth.files.fields import (
     scan_from_fields,
     written_names,
 )
-from lidarsynth.files.formats import left_out, read_with_report, sensor_in
-from lidarsynth.files.labels import label_path
+from lidarsynth.files.formats import holds_image, left_out, read_with_report, sensor_in
+from lidarsynth.files.labels import labels_of
 from lidarsynth.lidar.frame import transformed
 from lidarsynth.lidar.marks import MARKS
 from lidarsynth.lidar.plural import plural, was
+from lidarsynth.lidar.removal import own_classes
 from lidarsynth.lidar.scan import Scan
 from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.verbs.earlier_results import earlier_results
@@ -54,7 +55,9 @@ class Reading:
     metadata   `.json` of the Ouster of a capture, or of packets in a bag, then also another bag that holds it; angle
                correction `.csv` of the Hesai of a capture; None = what the bag tells, or the only one beside it
     transform  (4, 4) that brings the points into the sensor's frame, or None
-    labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`
+    labels     whether the words of a `.label` file that belongs to a scan are kept in `extra["raw_label"]`, and their
+               classes as `label`
+    needed     whether such a file that does not fit is refused; else it is left out, and a line says so
     rings      of a file of several sensors, the first and last ring to read, as it numbers them; None = all
     """
 
@@ -63,6 +66,7 @@ class Reading:
     metadata: Path | None = None
     transform: np.ndarray | None = None
     labels: bool = False
+    needed: bool = False
     rings: tuple[int, int] | None = None
 
     @property
@@ -118,11 +122,25 @@ class FileInput:
 
     def read(self) -> Loaded:
         """The scan. Raises FileError."""
-        words = label_path(self.path) if self.reading.labels else None
-        words = words if words is not None and words.is_file() else None
-        read = read_with_report(self.path, self.reading.intensity, None, words, self.reading.rings)
-        sensor, told = None if self.reading.moves else sensor_in(self.path), left_out(self.path, *read)
-        return replace(_loaded(*read, self.reading), sensor=sensor, left_out="; ".join(told) or None)
+        words = labels_of(self.path) if self.reading.labels and not holds_image(self.path) else None
+        (scan, dropped), misfit = self._read_with(words)
+        told = [*left_out(self.path, scan, dropped), *misfit]
+        if self.reading.labels and scan.label is None:
+            scan = replace(scan, label=own_classes(scan))
+        sensor = None if self.reading.moves else sensor_in(self.path)
+        return replace(_loaded(scan, dropped, self.reading), sensor=sensor, left_out="; ".join(told) or None)
+
+    def _read_with(self, words: Path | None) -> tuple[tuple[Scan, int], list[str]]:
+        """The scan with the words of its labels, how many points were dropped, and what is to be said of labels that do
+        not fit."""
+        how = self.path, self.reading.intensity, None
+        try:
+            return read_with_report(*how, words, self.reading.rings), []
+        except FileError as error:
+            if words is None or self.reading.needed:
+                raise
+            told = f"{words} left out: {str(error).removeprefix(f'{words}: ')}"
+        return read_with_report(*how, None, self.reading.rings), [told]  # raises what else is wrong
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 from lidarsynth.data.bag_writer import FORMATS
 from lidarsynth.data.bags import is_bag
 from lidarsynth.files.formats import READERS, WRITERS
+from lidarsynth.files.labels import labels_of
 from lidarsynth.verbs.batch import EVERY, FIRST, Work
 from lidarsynth.verbs.companions import LABEL, check_companions, check_labels
 from lidarsynth.verbs.file_kinds import STREAMS
@@ -52,8 +53,8 @@ def works(
                 skipped.append(file)
             continue
         check_companions(file, item.path, beside)
-        if LABEL not in beside and item.path.suffix.lower() == ".bin":  # whose points bring none
-            check_labels(file)
+        if LABEL not in beside and item.path.suffix.lower() == ".bin" and labels_of(item.path) is None:
+            check_labels(file)  # whose points bring none
         yield Work(item, file, looked_at(number), number)
 
 
