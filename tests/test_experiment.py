@@ -156,6 +156,8 @@ def test_experiments_that_cannot_be_built_say_why(changes, message):
         ("lidargen", {"model.base_channels": 1}, "model.base_channels: expected at least 2 for refinenet, found 1"),
         ("lidargen", {"score.sigma_min": 0}, "score.sigma_min, score.sigma_max: expected .*, found 0 and 50"),
         ("lidargen", {"score.sigma_max": 0.4}, "score.sigma_min, score.sigma_max: expected .*, found 0.01 and 0.4"),
+        ("lidargen", {"data.width": 1023}, "refinenet: expected images of an even number .*, found 64 x 1023"),
+        ("r2dm-refinenet", {"data.height": 4}, "refinenet: expected images .*, 8 at least, found 4 x 1024"),
         ("dusty-v1", {"data.width": 16}, "dusty-v1: expected images whose sides .*, found 64 x 16"),
         ("dusty-v2", {"data.width": 40}, "dusty-v2: expected images whose sides .*, found 64 x 40"),
         ("lidar-sr", {"upsampling.factor": [1, 1]}, r"upsampling.factor: expected .*, found \[1, 1\]"),

@@ -20,13 +20,13 @@ from safetensors.torch import load_file
 
 import lidarsynth as ls
 from lidarsynth.cli.main import main
-from lidarsynth.data.dataset import write_cache
+from lidarsynth.data.dataset import CachedImages, write_cache
 from lidarsynth.experiment.presets import preset
 from lidarsynth.experiment.record import Card, Experiment, with_fields
 from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.lidar.sensor import SENSORS, Sensor
 from lidarsynth.systems.model_card import card_text
-from lidarsynth.systems.table import build_network, transfer
+from lidarsynth.systems.table import build_network, task_of, transfer
 from lidarsynth.systems.table import load_folder as load
 from lidarsynth.training import monitor
 from lidarsynth.training.checkpoint import checkpoints
@@ -456,6 +456,37 @@ def test_the_licence_is_the_user_s_else_that_of_the_weights(cache: Path, tmp_pat
         list(run(experiment, cache, out, str(tmp_path / "first"), options=QUIET))
         assert load(out)[0].card.licence == expected
         assert ("license: other" in card_text(load(out)[0], ls.load(out).description)) == bool(expected)
+
+
+def test_images_of_fewer_beams_than_the_grid_has_teach_completion_alone(tmp_path):
+    few = Sensor("few", (5.0, 0.0, -5.0, -10.0), width=128)
+    list(write_cache(tmp_path / "few", lambda i: noise_image(i, few), 1, few, {"name": "few"}))
+    from_cache = resolve("default", ("training.batch_size=1",), data=tmp_path / "few")
+    with pytest.raises(ValueError, match=r"at least 16 beams to learn to generate from, found 4; `tuned` learns"):
+        list(run(from_cache, tmp_path / "few", tmp_path / "run", options=QUIET))
+    assert not (tmp_path / "run").exists(), "refused before anything is written"
+    task_of(preset("tuned")).suits(preset("tuned"), CachedImages(tmp_path / "few"), True)
+
+
+def test_a_preset_s_own_licence_takes_no_terms_of_the_weights_away(tmp_path: Path):
+    streets, weights = tmp_path / "streets", preset("tuned")
+    list(write_cache(streets, noise_image, 1, SENSOR, {"name": "synthetic", "seed": 3}))
+    terms = "for what was learned from the scans, their own terms; for the rest, MIT"
+    source = replace(weights, card=Card(licence=terms))
+    kitti, own = preset("kitti"), preset("kitti").card.licence
+    assert not training_verb._given(kitti) and not training_verb._given(preset("tiny"))
+    chosen = replace(kitti, card=replace(kitti.card, licence="ours alone"))
+    for experiment, expected in (
+        (kitti, f"for what was learned from the scans, their own terms; for the rest, {own}"),
+        (chosen, "ours alone"),
+    ):
+        given = bool(training_verb._given(experiment))
+        card = training_verb._gone_on(source, "runs/mine", experiment.card, streets, given)
+        assert card.licence == expected
+        shipped = replace(source, card=Card(licence="MIT"))
+        assert training_verb._gone_on(shipped, "default", experiment.card, streets, given).licence == (
+            own if experiment is kitti else expected
+        )
 
 
 def test_completions_are_drawn_of_images_with_something_to_go_on_from(cache: Path):

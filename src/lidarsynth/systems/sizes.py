@@ -11,6 +11,7 @@ from lidarsynth.networks.gan.dcgan import LEVELS as GAN_LEVELS
 LEVELS = 4  # of R2DM's U-Net, which halves the image at three of them
 GAN_STEP = 2**GAN_LEVELS  # rows and columns of an image for one at the coarsest map of a GAN, of DUSty v2's, too
 SR_STEP = 16  # and of LiDAR-SR
+REFINENET_LEAST = 8  # rows and columns that LiDARGen's network needs
 
 
 def check_unet(model: Model) -> None:
@@ -48,6 +49,14 @@ def check_stem(model: Model, sensor: Sensor) -> None:
             near = " or ".join(str(n) for n in (size // step * step, (size // step + 1) * step) if n)
             raise ValueError(f"data.{name} must be divisible by {step}, as model.stem is {list(model.stem)}: expected "
                              f"{near}, found {size}")  # fmt: skip
+
+
+def check_refinenet(word: str, sensor: Sensor) -> None:
+    """Raises ValueError for an image that LiDARGen's network cannot halve, or is too small for it."""
+    sides = sensor.height, sensor.width
+    if any(side % 2 for side in sides) or min(sides) < REFINENET_LEAST:
+        raise ValueError(f"{word}: expected images of an even number of rows and columns, {REFINENET_LEAST} at least, "
+                         f"found {sides[0]} x {sides[1]}")  # fmt: skip
 
 
 def check_gan(word: str, sensor: Sensor) -> None:

@@ -17,7 +17,7 @@ from lidarsynth.data.index import read_index
 from lidarsynth.diffusion.denoiser import KINDS, LOSSES
 from lidarsynth.diffusion.schedule import SCHEDULES
 from lidarsynth.experiment.folder import read_experiment
-from lidarsynth.experiment.presets import preset
+from lidarsynth.experiment.presets import PRESETS, preset
 from lidarsynth.experiment.record import WEIGHTS, Card, Experiment, with_fields
 from lidarsynth.experiment.sensor import build_sensor
 from lidarsynth.files.lock import only_writer
@@ -219,13 +219,13 @@ def _begin(
     if weights and not saved:
         source, trained = load_parts(weights)
         transfer(network, experiment, trained, source, weights)
-        card = _gone_on(source, weights, card, data)
+        card = _gone_on(source, weights, card, data, bool(_given(experiment)))
     state = start(experiment, network, task_of(experiment), accelerator.scaler)
     if saved:
         card = _same_experiment(saved, experiment).card
         note = "; ".join(filter(None, (note, check_start(out, begun, card))))
         # The history's last line is this run's, written anew at each checkpoint.
-        card = replace(card, history=card.history[:-1], licence=experiment.card.licence or card.licence)
+        card = replace(card, history=card.history[:-1], licence=_given(experiment) or card.licence)
         load_run(saved / STATE, state)
         if state.step > experiment.training.steps:
             raise ValueError(f"{out}: expected training.steps of at least {state.step}, which are done, "
@@ -239,12 +239,22 @@ def _begin(
     return replace(experiment, card=card), state, "; ".join(filter(None, notes))
 
 
-def _gone_on(source: Experiment, weights: str, card: Card, data: str | Path) -> Card:
-    """The card of a run that begins with the `weights` of `source`: what both learned from, and under which terms."""
+def _given(experiment: Experiment) -> str:
+    """The licence that the user gave; "" where it is the preset's own, or none."""
+    name, licence = experiment.name, experiment.card.licence
+    return "" if name in PRESETS and licence == preset(name).card.licence else licence
+
+
+def _gone_on(source: Experiment, weights: str, card: Card, data: str | Path, given: bool = True) -> Card:
+    """The card of a run that begins with the `weights` of `source`: what both learned from, and under which terms.
+
+    given  whether a licence of the card is the user's: a preset's takes no terms away that the weights have
+    """
     licence, scans = card.licence or source.card.licence, _holds_scans(data)
     told = source.card.data.removesuffix(UNTRUE_NOW) if scans else source.card.data
     before = f"what `{weights}` learned from" if weights in shipped() else told
-    if scans and licence and not card.licence and not licence.startswith(TERMS):
+    theirs = (scans and not card.licence) or (not given and source.card.licence.startswith(TERMS))
+    if theirs and licence and not licence.startswith(TERMS):
         licence = f"{TERMS}; for the rest, {licence}"
     learned = ", then ".join(filter(None, (before, card.data)))
     history = *source.card.history, f"from {source.name}"

@@ -20,7 +20,7 @@ from lidarsynth.lidar.scan import RangeImage
 from lidarsynth.networks.between_beams import BetweenBeams
 from lidarsynth.networks.between_columns import BetweenColumns
 from lidarsynth.networks.cascade import Cascade
-from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, CoarseUNet
+from lidarsynth.networks.coarse_unet import BINS, COLUMNS, LOWEST, ROWS, CoarseUNet
 from lidarsynth.networks.column_neighbours import Grid, known_grid, spoilt
 from lidarsynth.networks.column_transformer import ColumnTransformer
 from lidarsynth.networks.drafts import LEARNED, drafted
@@ -42,6 +42,7 @@ from lidarsynth.systems.cascade.scores import (
 )
 from lidarsynth.systems.cascade.speckle import calmed
 from lidarsynth.systems.diffusion.validation import strips
+from lidarsynth.training.examples import OF_ANY, Streets, TrainingImages
 from lidarsynth.training.randomness import sample_rng
 from lidarsynth.training.task import Images, Phase, Task
 
@@ -291,9 +292,16 @@ def pictures(
 
 
 def _suits(experiment: Experiment, images: Images, learned: bool) -> None:
-    """Raises ValueError where classes are to be learned from images that have none."""
+    """Raises ValueError where classes are to be learned from images that have none, and where samples are to be
+    drawn in the beams of the grid from images that have fewer."""
     if learned and experiment.model.own_classes:
         check_labelled(images)
+    if not learned or not isinstance(images, TrainingImages) or experiment.training.generation_share == 0:
+        return
+    of_any = isinstance(images, Streets) and not OF_ANY.isdisjoint(images.words)  # which have as many
+    if not of_any and images.sensor.height < ROWS:
+        raise ValueError(f"expected images of at least {ROWS} beams to learn to generate from, found "
+                         f"{images.sensor.height}; `tuned` learns to complete any")  # fmt: skip
 
 
 CASCADE = Task(

@@ -12,7 +12,7 @@ from lidarsynth.lidar.sensor import Sensor
 from lidarsynth.networks.conditional import CANDIDATES, ConditionalUNet
 from lidarsynth.networks.efficient_unet import EfficientUNet
 from lidarsynth.networks.refinenet import RefineNet, geometric_sigmas
-from lidarsynth.systems.sizes import check_stem, check_unet
+from lidarsynth.systems.sizes import check_refinenet, check_stem, check_unet
 
 
 def efficient_unet(
@@ -48,6 +48,7 @@ def refinenet(experiment: Experiment, sensor: Sensor) -> RefineNet:
     _check_score(score)
     if width < 2:  # channels are normalised by how their means differ
         raise ValueError(f"model.base_channels: expected at least 2 for refinenet, found {width}")
+    check_refinenet(experiment.model.network, sensor)
     divide = experiment.diffusion.kind == "score"
     network = RefineNet(2, width, score.levels, unit_range=False, divide=divide)
     network.sigmas.copy_(geometric_sigmas(score.levels, score.sigma_max, score.sigma_min))
